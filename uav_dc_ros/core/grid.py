@@ -1,0 +1,109 @@
+"""The grid of cells that the UAV moves on, and the seven moves.
+
+A cell is three indices, east, north and up. Cell (0, 0, 0) has its centre at the map's origin, at
+the lowest altitude. Frames are ENU: x east, y north, z up.
+"""
+
+from enum import IntEnum
+from typing import Annotated
+
+import msgspec
+
+from uav_dc_ros.core.arrays import Array, array_namespace, constant
+
+
+class Action(IntEnum):
+    """The action space (eq. 6), in the paper's order; the value is the network's output index."""
+
+    LEFT = 0  # -x, west
+    RIGHT = 1  # +x, east
+    FORWARD = 2  # +y, north
+    BACKWARD = 3  # -y, south
+    UPWARD = 4
+    DOWNWARD = 5
+    HOVER = 6
+
+    @property
+    def label(self) -> str:
+        """The name that travels in messages: `left`, `right`, ..."""
+        return self.name.lower()
+
+
+ACTION_LABELS: tuple[str, ...] = tuple(action.label for action in Action)
+
+# Cells moved east, north and up by each action, in the order of Action.
+MOVES: tuple[tuple[int, int, int], ...] = (
+    (-1, 0, 0),
+    (1, 0, 0),
+    (0, 1, 0),
+    (0, -1, 0),
+    (0, 0, 1),
+    (0, 0, -1),
+    (0, 0, 0),
+)
+
+
+class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Extent and spacing of the cells.
+
+    Attributes:
+        n_x, n_y, n_z: number of cells east, north and up.
+        cell_m: horizontal distance between neighbouring centres, metres.
+        altitude_min_m: altitude of the lowest layer, metres above the users.
+        altitude_step_m: distance between layers, metres.
+    """
+
+    n_x: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+    n_y: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+    n_z: Annotated[int, msgspec.Meta(ge=1, le=100)]
+    cell_m: Annotated[float, msgspec.Meta(gt=0)]
+    altitude_min_m: Annotated[float, msgspec.Meta(gt=0)]
+    altitude_step_m: Annotated[float, msgspec.Meta(gt=0)]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of cells east, north and up."""
+        return self.n_x, self.n_y, self.n_z
+
+    def move(self, cell: Array, action: Array) -> Array:
+        """The cell after one move; a move off the grid leaves the UAV where it is.
+
+        Args:
+            cell: indices, integers `[..., 3]`.
+            action: value of an `Action`, integers `[...]`.
+
+        Returns:
+            Indices, `[..., 3]`.
+        """
+        xp = array_namespace(cell)
+        target = cell + xp.take(constant(MOVES, cell), xp.reshape(action, (-1,)), axis=0).reshape(cell.shape)
+        # A move changes one index by one, so to stay is to be clipped.
+        return xp.minimum(xp.maximum(target, xp.zeros_like(target)), constant(self.shape, cell) - 1)
+
+    def centre_m(self, cell: Array, like: Array) -> Array:
+        """Position of a cell's centre.
+
+        Args:
+            cell: indices, integers `[..., 3]`.
+            like: an array whose floating-point type and device the result takes.
+
+        Returns:
+            x, y, altitude, metres, `[..., 3]`.
+        """
+        xp = array_namespace(cell)
+        spacing = xp.astype(constant((self.cell_m, self.cell_m, self.altitude_step_m), like), like.dtype)
+        origin = xp.astype(constant((0.0, 0.0, self.altitude_min_m), like), like.dtype)
+        return origin + xp.astype(cell, like.dtype) * spacing
+
+    def cell_at(self, position_m: tuple[float, float, float]) -> tuple[int, int, int] | None:
+        """The cell whose centre is at `position_m` (x, y, altitude, metres), or None."""
+        x_m, y_m, z_m = position_m
+        steps = (
+            x_m / self.cell_m,
+            y_m / self.cell_m,
+            (z_m - self.altitude_min_m) / self.altitude_step_m,
+        )
+        cell = (round(steps[0]), round(steps[1]), round(steps[2]))
+        on_centre = all(abs(s - i) < 1e-6 for s, i in zip(steps, cell, strict=True))
+        inside = all(0 <= i < n for i, n in zip(cell, self.shape, strict=True))
+        return cell if on_centre and inside else None

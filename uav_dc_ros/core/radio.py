@@ -1,0 +1,108 @@
+"""The uplink: distance, path gain, SINR and rate. Equation numbers are those of the paper.
+
+The radio knows nothing of missions: who is served is decided in `mission`.
+"""
+
+import math
+from typing import Literal, TypeAlias, get_args
+
+from uav_dc_ros.core.arrays import Array, array_namespace
+
+Interference: TypeAlias = Literal["all", "associated", "none"]
+
+
+def distance(uav_m: Array, users_m: Array) -> Array:
+    """3D distance between the UAV and users on the ground (eq. 1).
+
+    Args:
+        uav_m: UAV position x, y, altitude, metres, `[..., 3]`.
+        users_m: user positions x, y, metres, `[..., U, 2]`.
+
+    Returns:
+        Distance, metres, `[..., U]`.
+    """
+    xp = array_namespace(uav_m, users_m)
+    uav_m = uav_m[..., None, :]
+    dx = uav_m[..., 0] - users_m[..., 0]
+    dy = uav_m[..., 1] - users_m[..., 1]
+    return xp.sqrt(dx * dx + dy * dy + uav_m[..., 2] * uav_m[..., 2])
+
+
+def path_gain(distance_m: Array, ref_gain: float, exponent: float = 2.0) -> Array:
+    """Channel power gain of a line-of-sight link, `beta_0 d^-exponent` (eq. 2).
+
+    Args:
+        distance_m: distance, metres, any shape; must be above zero.
+        ref_gain: gain at 1 m, linear.
+        exponent: path-loss exponent; the paper's free space is 2.
+
+    Returns:
+        Gain, linear, the shape of `distance_m`.
+    """
+    return ref_gain * distance_m**-exponent
+
+
+def sinr(
+    gain: Array,
+    power_w: float | Array,
+    noise_w: float,
+    interference: Interference = "all",
+    served: Array | None = None,
+) -> Array:
+    """Signal over interference and noise of every user at the UAV (the fraction in eq. 3).
+
+    Args:
+        gain: channel power gain, linear, `[..., U]`.
+        power_w: transmit power, watts, a number or `[..., U]`.
+        noise_w: noise power, watts.
+        interference: who transmits. `all`: every user, at every step (the paper's equation as
+            written). `associated`: only the users in `served`; the others have SINR 0. `none`:
+            orthogonal channels, noise only.
+        served: which users are associated, bool `[..., U]`; needed for `associated` only.
+
+    Returns:
+        SINR, linear, `[..., U]`.
+
+    Raises:
+        ValueError: unknown `interference`, or `associated` without `served`.
+    """
+    xp = array_namespace(gain)
+    received_w = power_w * gain
+    if interference == "none":
+        return received_w / noise_w
+    if interference == "associated":
+        if served is None:
+            raise ValueError("interference='associated' needs `served`, bool [..., U]; got None")
+        received_w = xp.where(served, received_w, 0.0)
+    elif interference != "all":
+        raise ValueError(
+            f"interference is {interference!r}; expected one of {', '.join(get_args(Interference))}"
+        )
+    return received_w / (_sum_of_others(received_w) + noise_w)
+
+
+def rate_bps(sinr: Array, bandwidth_hz: float) -> Array:
+    """Achievable rate `B log2(1 + SINR)`, bit/s (eq. 3).
+
+    Args:
+        sinr: linear, any shape.
+        bandwidth_hz: bandwidth B, hertz.
+
+    Returns:
+        Rate, bit/s, the shape of `sinr`.
+    """
+    # log1p keeps the digits that 1 + sinr would drop for a user far below the noise.
+    return (bandwidth_hz / math.log(2.0)) * array_namespace(sinr).log1p(sinr)
+
+
+def _sum_of_others(received_w: Array) -> Array:
+    """For each user, the sum over every other one, `[..., U]`.
+
+    Sums of what lies before and behind each user, not the total less its own share: beside a user
+    ten thousand times stronger that difference would keep only half of its digits.
+    """
+    xp = array_namespace(received_w)
+    zero = xp.zeros_like(received_w[..., :1])
+    before = xp.cumulative_sum(received_w[..., :-1], axis=-1)
+    behind = xp.flip(xp.cumulative_sum(xp.flip(received_w[..., 1:], axis=-1), axis=-1), axis=-1)
+    return xp.concat([zero, before], axis=-1) + xp.concat([behind, zero], axis=-1)

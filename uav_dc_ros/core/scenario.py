@@ -1,0 +1,260 @@
+"""A scenario: every value of a world, frozen and read strictly.
+
+`parse` takes the text of a TOML file; `uav_dc_ros.scenarios.load` finds the file. An unknown key, a
+wrong type and a value out of range are errors that name the key, the value and what was expected.
+"""
+
+import difflib
+import hashlib
+import math
+import re
+import tomllib
+from functools import cached_property
+from typing import Annotated, Any, Literal, TypeAlias
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.grid import Grid
+from uav_dc_ros.core.radio import Interference
+from uav_dc_ros.core.reward import RewardForm, RPlus
+from uav_dc_ros.errors import ScenarioError
+
+EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
+
+Positive: TypeAlias = Annotated[float, Meta(gt=0)]
+NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
+
+
+class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the scenario file: unknown keys are errors."""
+
+
+class Users(_Section, frozen=True):
+    """The users on the ground.
+
+    Attributes:
+        cluster_centres_m: centre x, y of each of the M clusters, metres.
+        users_per_cluster: users K in a cluster.
+        cluster_radius_m: radius C of the disc in which a cluster's users start, metres.
+        v_max_mps: greatest speed v of the random walk, m/s.
+    """
+
+    cluster_centres_m: Annotated[tuple[tuple[float, float], ...], Meta(min_length=1, max_length=1000)]
+    users_per_cluster: Annotated[int, Meta(ge=1, le=100_000)]
+    cluster_radius_m: Positive
+    v_max_mps: NotNegative
+
+
+class Mission(_Section, frozen=True):
+    """Where the UAV flies from and to, and what counts.
+
+    Attributes:
+        start_m: start x, y, altitude, metres; the centre of a cell.
+        dock_m: destination x, y, metres; the centre of a cell.
+        step_s: duration of a step, seconds.
+        max_steps: steps T_cons that the battery allows.
+        d_cons_m: greatest 3D distance at which a user can be served, metres.
+        r_min_bits: data after which a user is collected, bit.
+        episode_end: `at_time_limit`: every mission flies `max_steps` steps, and has landed if it ends
+            over the dock. `on_arrival`: it ends at the dock, or after `max_steps` without landing.
+    """
+
+    start_m: tuple[float, float, float]
+    dock_m: tuple[float, float]
+    step_s: Positive
+    max_steps: Annotated[int, Meta(ge=1, le=1_000_000)]
+    d_cons_m: Positive
+    r_min_bits: Positive
+    episode_end: EpisodeEnd
+
+
+class Radio(_Section, frozen=True):
+    """The uplink.
+
+    Attributes:
+        bandwidth_hz: bandwidth B, hertz.
+        tx_power_w: transmit power p of a user, watts.
+        noise_power_dbm: noise power alpha^2, dBm.
+        ref_gain_db: channel power gain beta_0 at 1 m, dB.
+        path_loss_exponent: exponent of the path loss.
+        interference: who transmits, see `radio.sinr`.
+    """
+
+    bandwidth_hz: Positive
+    tx_power_w: Positive
+    noise_power_dbm: Annotated[float, Meta(ge=-300, le=100)]
+    ref_gain_db: Annotated[float, Meta(ge=-200, le=100)]
+    path_loss_exponent: Annotated[float, Meta(ge=1, le=10)]
+    interference: Interference
+
+    @property
+    def noise_power_w(self) -> float:
+        """Noise power, watts."""
+        return 10.0 ** (self.noise_power_dbm / 10.0) * 1e-3
+
+    @property
+    def ref_gain(self) -> float:
+        """Channel power gain at 1 m, linear."""
+        return 10.0 ** (self.ref_gain_db / 10.0)
+
+
+class Reward(_Section, frozen=True):
+    """The trade-off game.
+
+    Attributes:
+        beta: weight of the data collected.
+        zeta: weight of the trajectory reward.
+        r_plus: trajectory reward, see `reward.r_plus`.
+        form: reward of a step, see `reward.earned`.
+        data_scale_bits: data of a user that counts as 1 in the reward, bit.
+    """
+
+    beta: NotNegative
+    zeta: NotNegative
+    r_plus: RPlus
+    form: RewardForm
+    data_scale_bits: Positive
+
+
+class Scenario(_Section, frozen=True, dict=True):
+    """Every value of a world. `U` below is the number of users, M K."""
+
+    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
+    grid: Grid
+    users: Users
+    mission: Mission
+    radio: Radio
+    reward: Reward
+
+    @property
+    def n_clusters(self) -> int:
+        """Clusters M."""
+        return len(self.users.cluster_centres_m)
+
+    @property
+    def n_users(self) -> int:
+        """Users U = M K."""
+        return self.n_clusters * self.users.users_per_cluster
+
+    @cached_property
+    def user_cluster(self) -> Array:
+        """Cluster index of each user, integers `[U]`: users of a cluster stand together."""
+        return np.repeat(np.arange(self.n_clusters), self.users.users_per_cluster)
+
+    @cached_property
+    def user_centres_m(self) -> Array:
+        """Centre of each user's cluster, metres, `[U, 2]`."""
+        return np.asarray(self.users.cluster_centres_m, dtype=np.float64)[self.user_cluster]
+
+    @cached_property
+    def start_cell(self) -> tuple[int, int, int]:
+        """Cell in which a mission starts."""
+        cell = self.grid.cell_at(self.mission.start_m)
+        assert cell is not None, "checked by parse()"
+        return cell
+
+    @cached_property
+    def dock_cell(self) -> tuple[int, int]:
+        """Indices east and north of the dock's column of cells."""
+        cell = self.grid.cell_at((*self.mission.dock_m, self.grid.altitude_min_m))
+        assert cell is not None, "checked by parse()"
+        return cell[:2]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """First 12 hex digits of the SHA-256 of all values: equal for equal worlds only."""
+        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()[:12]
+
+
+def parse(text: str, source: str) -> Scenario:
+    """A scenario from the text of a TOML file.
+
+    Args:
+        text: the file's content.
+        source: what to call it in errors: a path or a name.
+
+    Raises:
+        ScenarioError: not TOML, an unknown key, a wrong type, a value out of range, or values that
+            do not fit together.
+    """
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{source}: not a TOML file: {error}") from None
+    return from_values(values, source)
+
+
+def from_values(values: dict[str, Any], source: str) -> Scenario:
+    """A scenario from plain values, as TOML or JSON hold them; see `parse`."""
+    try:
+        scenario = msgspec.convert(values, Scenario)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(f"{source}: {_explain(str(error), values)}") from None
+    _check_finite(msgspec.to_builtins(scenario), source)
+    _check_together(scenario, source)
+    return scenario
+
+
+def _explain(message: str, values: dict[str, Any]) -> str:
+    """msgspec's message, with the key and the value in front."""
+    expected, _, path = message.partition(" - at `")
+    keys = re.findall(r"[^.\[\]`$]+", path)
+    table: Any = values
+    for key in keys:
+        table = table[int(key)] if isinstance(table, list) else table[key]
+    if unknown := re.fullmatch(r"Object contains unknown field `(.+)`", expected):
+        key = unknown[1]
+        struct = {"grid": Grid, "users": Users, "mission": Mission, "radio": Radio, "reward": Reward}
+        known = struct[keys[0]].__struct_fields__ if keys else Scenario.__struct_fields__
+        close = difflib.get_close_matches(key, known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
+        return f"unknown key {'.'.join([*keys, key])} = {table[key]!r}; {hint}"
+    if missing := re.fullmatch(r"Object missing required field `(.+)`", expected):
+        return f"missing key {'.'.join([*keys, missing[1]])}"
+    expected = expected.replace("`", "").removeprefix("Expected ")
+    return f"{'.'.join(keys)} = {table!r}; expected {expected}"
+
+
+def _check_finite(values: Any, source: str, key: str = "") -> None:
+    """TOML knows `nan` and `inf`; a world does not, and no range above refuses them."""
+    if isinstance(values, dict):
+        for name, value in values.items():
+            _check_finite(value, source, f"{key}.{name}" if key else name)
+    elif isinstance(values, list | tuple):
+        for value in values:
+            _check_finite(value, source, key)
+    elif isinstance(values, float) and not math.isfinite(values):
+        raise ScenarioError(f"{source}: {key} = {values}; expected a finite number")
+
+
+def _check_together(scenario: Scenario, source: str) -> None:
+    """What one value alone cannot show."""
+    grid, mission = scenario.grid, scenario.mission
+    top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
+    extent = (
+        f"x 0 to {(grid.n_x - 1) * grid.cell_m:g} and y 0 to {(grid.n_y - 1) * grid.cell_m:g} m "
+        f"in steps of {grid.cell_m:g}"
+    )
+    if grid.cell_at(mission.start_m) is None:
+        raise ScenarioError(
+            f"{source}: mission.start_m = {list(mission.start_m)}; expected the centre of a cell: "
+            f"{extent}, altitude {grid.altitude_min_m:g} to {top_m:g} m in steps of {grid.altitude_step_m:g}"
+        )
+    if grid.cell_at((*mission.dock_m, grid.altitude_min_m)) is None:
+        raise ScenarioError(
+            f"{source}: mission.dock_m = {list(mission.dock_m)}; expected the centre of a cell: {extent}"
+        )
+    away = sum(abs(a - b) for a, b in zip(scenario.start_cell[:2], scenario.dock_cell, strict=True))
+    if away > mission.max_steps:
+        raise ScenarioError(
+            f"{source}: mission.max_steps = {mission.max_steps}; expected at least {away}, "
+            "the moves from start to dock"
+        )
+    if grid.altitude_min_m > mission.d_cons_m:
+        raise ScenarioError(
+            f"{source}: mission.d_cons_m = {mission.d_cons_m:g}; expected at least "
+            f"grid.altitude_min_m = {grid.altitude_min_m:g}, or nobody can ever be served"
+        )

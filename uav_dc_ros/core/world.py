@@ -1,0 +1,189 @@
+"""The whole world as a value and two functions: `initial` and `step`.
+
+Within a step, in this order: the UAV moves, the users walk, then rates hold for the whole step and
+data is booked. The ROS nodes compose the same functions, split over processes.
+"""
+
+from dataclasses import dataclass
+
+from uav_dc_ros.core import mission, mobility, radio, reward
+from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.scenario import Scenario
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """What the channel gives in one step. `U` is the number of users.
+
+    Attributes:
+        sinr: linear, `[..., U]`.
+        rate_bps: achievable rate of each user, bit/s, `[..., U]`.
+        served: P(m, k), bool `[..., U]`.
+        sum_rate_bps: sum of the rates of the served users, bit/s, `[...]`.
+    """
+
+    sinr: Array
+    rate_bps: Array
+    served: Array
+    sum_rate_bps: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """A world between two steps.
+
+    Attributes:
+        step: steps flown, integers `[...]`.
+        cell: the UAV's cell, integers `[..., 3]`.
+        users_m: users' positions, metres, `[..., U, 2]`.
+        data_bits: data collected from each user, bit, `[..., U]`.
+        collected: bool `[..., U]`.
+        total_reward: r^t (eq. 7), `[...]`.
+    """
+
+    step: Array
+    cell: Array
+    users_m: Array
+    data_bits: Array
+    collected: Array
+    total_reward: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a step brought, each `[...]`.
+
+    Attributes:
+        reward: what the agent is paid.
+        terminated: the mission is over.
+        truncated: the mission was cut off (`on_arrival`: out of steps before the dock).
+        landed: the mission is over and the UAV is over the dock.
+        link: the channel during the step.
+    """
+
+    reward: Array
+    terminated: Array
+    truncated: Array
+    landed: Array
+    link: Link
+
+
+def initial(scenario: Scenario, draws: Array) -> State:
+    """The world before the first step.
+
+    Args:
+        scenario: the world's values.
+        draws: uniform in [0, 1), `[..., U, 2]`; their library, dtype and device carry over.
+    """
+    xp = array_namespace(draws)
+    cell = constant(scenario.start_cell, draws)
+    nothing = xp.zeros_like(draws[..., 0])
+    zero = xp.sum(nothing, axis=-1)
+    return State(
+        step=xp.astype(zero, cell.dtype),
+        cell=xp.broadcast_to(cell, (*zero.shape, 3)),
+        users_m=place_users(scenario, draws),
+        data_bits=nothing,
+        collected=nothing > 0.0,
+        total_reward=zero,
+    )
+
+
+def place_users(scenario: Scenario, draws: Array) -> Array:
+    """Users at their start, metres, `[..., U, 2]`; draws as in `initial`."""
+    xp = array_namespace(draws)
+    centres_m = xp.astype(constant(scenario.user_centres_m, draws), draws.dtype)
+    return mobility.scatter(centres_m, scenario.users.cluster_radius_m, draws)
+
+
+def walk_users(scenario: Scenario, users_m: Array, draws: Array) -> Array:
+    """Users one step later, metres, `[..., U, 2]`; draws as in `initial`."""
+    return mobility.walk(users_m, scenario.users.v_max_mps, scenario.mission.step_s, draws)
+
+
+def measure(scenario: Scenario, uav_m: Array, users_m: Array, collected: Array) -> Link:
+    """The channel with the UAV at `uav_m` `[..., 3]` and the users at `users_m` `[..., U, 2]`, metres."""
+    values = scenario.radio
+    distance_m = radio.distance(uav_m, users_m)
+    served = mission.served(distance_m, collected, scenario.mission.d_cons_m)
+    sinr = radio.sinr(
+        radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent),
+        values.tx_power_w,
+        values.noise_power_w,
+        values.interference,
+        served,
+    )
+    rate_bps = radio.rate_bps(sinr, values.bandwidth_hz)
+    return Link(sinr=sinr, rate_bps=rate_bps, served=served, sum_rate_bps=mission.sum_rate(served, rate_bps))
+
+
+def collect(scenario: Scenario, link: Link, data_bits: Array, collected: Array) -> tuple[Array, Array]:
+    """`data_bits` and `collected` after a step over `link`, `[..., U]`."""
+    return mission.collect(
+        data_bits,
+        collected,
+        link.served,
+        link.rate_bps,
+        scenario.mission.step_s,
+        scenario.mission.r_min_bits,
+    )
+
+
+def total_reward(scenario: Scenario, cell: Array, data_bits: Array) -> Array:
+    """r^t (eq. 7) of a UAV in `cell` `[..., 3]` that holds `data_bits` `[..., U]`; shape `[...]`."""
+    values = scenario.reward
+    distance = mission.dock_distance_cells(cell, scenario.dock_cell, like=data_bits)
+    return reward.total(
+        data_bits, reward.r_plus(distance, values.r_plus), values.beta, values.zeta, values.data_scale_bits
+    )
+
+
+def ends(scenario: Scenario, step: Array, cell: Array) -> tuple[Array, Array, Array]:
+    """Whether the mission has terminated, was truncated, and has landed, bool `[...]` each.
+
+    Under `at_time_limit` the last step is the mission's own end, so it is termination: the value of
+    a state behind it is zero, not unknown.
+    """
+    docked = mission.at_dock(cell, scenario.dock_cell)
+    out_of_steps = step >= scenario.mission.max_steps
+    if scenario.mission.episode_end == "on_arrival":
+        return docked, out_of_steps & ~docked, docked
+    return out_of_steps, out_of_steps & ~out_of_steps, out_of_steps & docked
+
+
+def step(scenario: Scenario, state: State, action: Array, draws: Array) -> tuple[State, Outcome]:
+    """One step of the world.
+
+    Args:
+        scenario: the world's values.
+        state: the world before the step.
+        action: value of a `grid.Action`, integers `[...]`.
+        draws: uniform in [0, 1), `[..., U, 2]`.
+
+    Returns:
+        The world after the step, and what the step brought.
+    """
+    cell = scenario.grid.move(state.cell, action)
+    users_m = walk_users(scenario, state.users_m, draws)
+    uav_m = scenario.grid.centre_m(cell, like=users_m)
+    link = measure(scenario, uav_m, users_m, state.collected)
+    data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
+    total = total_reward(scenario, cell, data_bits)
+    n_steps = state.step + 1
+    terminated, truncated, landed = ends(scenario, n_steps, cell)
+    after = State(
+        step=n_steps,
+        cell=cell,
+        users_m=users_m,
+        data_bits=data_bits,
+        collected=collected,
+        total_reward=total,
+    )
+    outcome = Outcome(
+        reward=reward.earned(total, state.total_reward, scenario.reward.form),
+        terminated=terminated,
+        truncated=truncated,
+        landed=landed,
+        link=link,
+    )
+    return after, outcome

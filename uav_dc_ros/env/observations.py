@@ -1,0 +1,76 @@
+"""What an agent sees: encodings of the mission as a vector of numbers, mostly in [0, 1].
+
+position   the UAV's cell (the paper's state, eq. 5)
+mission    position, steps that remain, and how far each cluster's collection has come
+map        mission, and the way from the UAV to each cluster's centre and to the dock
+
+The encodings are made from what the nodes know, so that training and flying see the same vector.
+"""
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.scenario import Scenario
+
+Observation: TypeAlias = Literal["position", "mission", "map"]
+
+
+def size(kind: Observation, scenario: Scenario) -> int:
+    """Length D of the encoding."""
+    position, remaining, clusters = 3, 1, 2 * scenario.n_clusters
+    mission = position + remaining + clusters
+    return {"position": position, "mission": mission, "map": mission + clusters + 2}[kind]
+
+
+def encode(
+    kind: Observation,
+    scenario: Scenario,
+    *,
+    cell: Array,
+    step: Array,
+    data_bits: Array,
+    collected: Array,
+) -> Array:
+    """The observation of a mission.
+
+    Args:
+        kind: which encoding.
+        scenario: the world's values.
+        cell: the UAV's cell, integers `[..., 3]`.
+        step: steps flown, integers `[...]`.
+        data_bits: data collected from each user, bit, `[..., U]`.
+        collected: bool `[..., U]`.
+
+    Returns:
+        float32 `[..., D]` with D = `size(kind, scenario)`.
+    """
+    xp = array_namespace(cell)
+    cell_f = xp.astype(cell, xp.float32)
+    parts = [cell_f / _span(scenario, cell_f)]
+    if kind != "position":
+        max_steps = scenario.mission.max_steps
+        parts.append(xp.astype(max_steps - step, xp.float32)[..., None] / max_steps)
+        parts.append(_cluster_means(scenario, xp.astype(collected, xp.float32)))
+        progress = xp.astype(data_bits, xp.float32) / scenario.mission.r_min_bits
+        parts.append(_cluster_means(scenario, xp.minimum(progress, xp.ones_like(progress))))
+    if kind == "map":
+        goals_m = np.asarray([*scenario.users.cluster_centres_m, scenario.mission.dock_m], dtype=np.float32)
+        goals = constant(goals_m / np.float32(scenario.grid.cell_m), cell_f)
+        way = (goals - cell_f[..., None, :2]) / _span(scenario, cell_f)[:2]
+        parts.append(xp.reshape(way, (*cell.shape[:-1], -1)))
+    return xp.concat(parts, axis=-1)
+
+
+def _span(scenario: Scenario, like: Array) -> Array:
+    """Highest index in each direction, at least 1, `[3]`."""
+    xp = array_namespace(like)
+    return xp.astype(constant([max(n - 1, 1) for n in scenario.grid.shape], like), like.dtype)
+
+
+def _cluster_means(scenario: Scenario, per_user: Array) -> Array:
+    """Mean over the users of each cluster: `[..., U]` to `[..., M]`."""
+    xp = array_namespace(per_user)
+    shape = (*per_user.shape[:-1], scenario.n_clusters, scenario.users.users_per_cluster)
+    return xp.mean(xp.reshape(per_user, shape), axis=-1)
