@@ -4,6 +4,7 @@ A cell is three indices, east, north and up. Cell (0, 0, 0) has its centre at th
 the lowest altitude. Frames are ENU: x east, y north, z up.
 """
 
+import math
 from enum import IntEnum
 from typing import Annotated
 
@@ -103,6 +104,8 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             y_m / self.cell_m,
             (z_m - self.altitude_min_m) / self.altitude_step_m,
         )
+        if not all(map(math.isfinite, steps)):  # a spacing so small that the division overflows
+            return None
         cell = (round(steps[0]), round(steps[1]), round(steps[2]))
         on_centre = all(abs(s - i) < 1e-6 for s, i in zip(steps, cell, strict=True))
         inside = all(0 <= i < n for i, n in zip(cell, self.shape, strict=True))

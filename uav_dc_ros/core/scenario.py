@@ -6,11 +6,13 @@ wrong type and a value out of range are errors that name the key, the value and 
 
 import difflib
 import hashlib
+import json
 import math
 import re
+import reprlib
 import tomllib
 from functools import cached_property
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -122,7 +124,7 @@ class Reward(_Section, frozen=True):
 class Scenario(_Section, frozen=True, dict=True):
     """Every value of a world. `U` below is the number of users, M K."""
 
-    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
+    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}\Z")]
     grid: Grid
     users: Users
     mission: Mission
@@ -182,13 +184,15 @@ def parse(text: str, source: str) -> Scenario:
     """
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
+        # ValueError: bad TOML, but also an integer of more digits than Python reads.
         raise ScenarioError(f"{source}: not a TOML file: {error}") from None
     return from_values(values, source)
 
 
 def from_values(values: dict[str, Any], source: str) -> Scenario:
     """A scenario from plain values, as TOML or JSON hold them; see `parse`."""
+    _check_known(values, Scenario, source)
     try:
         scenario = msgspec.convert(values, Scenario)
     except msgspec.ValidationError as error:
@@ -198,24 +202,46 @@ def from_values(values: dict[str, Any], source: str) -> Scenario:
     return scenario
 
 
-def _explain(message: str, values: dict[str, Any]) -> str:
-    """msgspec's message, with the key and the value in front."""
-    expected, _, path = message.partition(" - at `")
-    keys = re.findall(r"[^.\[\]`$]+", path)
-    table: Any = values
-    for key in keys:
-        table = table[int(key)] if isinstance(table, list) else table[key]
-    if unknown := re.fullmatch(r"Object contains unknown field `(.+)`", expected):
-        key = unknown[1]
-        struct = {"grid": Grid, "users": Users, "mission": Mission, "radio": Radio, "reward": Reward}
-        known = struct[keys[0]].__struct_fields__ if keys else Scenario.__struct_fields__
-        close = difflib.get_close_matches(key, known, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
-        return f"unknown key {'.'.join([*keys, key])} = {table[key]!r}; {hint}"
+def _check_known(values: Any, struct: type, source: str, table: str = "") -> None:
+    """Unknown keys come first: a typo is the likeliest mistake, and has the best answer."""
+    if not isinstance(values, dict):
+        return
+    known = get_type_hints(struct)
+    for key, value in values.items():
+        # Quoted as in TOML when it is no bare key.
+        name = table + (key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key))
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
+            raise ScenarioError(f"{source}: unknown key {name} = {reprlib.repr(value)}; {hint}")
+        if _is_table(known[key]):
+            _check_known(value, known[key], source, f"{key}.")
+
+
+def _is_table(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+def _explain(message: str, values: Any) -> str:
+    """msgspec's message, with the key and the value in front. The keys are known ones."""
+    expected, _, path = message.partition(" - at `$.")
+    path = path.removesuffix("`")
+    kind: Any = Scenario
+    for key in re.findall(r"\w+", path):
+        if key.isdecimal():
+            values = values[int(key)]
+        else:
+            kind, values = get_type_hints(kind)[key], values[key]
     if missing := re.fullmatch(r"Object missing required field `(.+)`", expected):
-        return f"missing key {'.'.join([*keys, missing[1]])}"
-    expected = expected.replace("`", "").removeprefix("Expected ")
-    return f"{'.'.join(keys)} = {table!r}; expected {expected}"
+        key = f"{path}.{missing[1]}" if path else missing[1]
+        kind = get_type_hints(kind)[missing[1]]
+        return f"missing {'table' if _is_table(kind) else 'key'} {key}"
+    if expected.startswith("Invalid enum value"):
+        expected = f"one of {', '.join(get_args(kind))}"
+    elif expected == "Number out of range":
+        expected = "a finite number"
+    expected = expected.replace("`", "").removeprefix("Expected ").replace("object", "table")
+    return f"{path or 'scenario'} = {reprlib.repr(values)}; expected {expected}"
 
 
 def _check_finite(values: Any, source: str, key: str = "") -> None:
@@ -224,8 +250,8 @@ def _check_finite(values: Any, source: str, key: str = "") -> None:
         for name, value in values.items():
             _check_finite(value, source, f"{key}.{name}" if key else name)
     elif isinstance(values, list | tuple):
-        for value in values:
-            _check_finite(value, source, key)
+        for i, value in enumerate(values):
+            _check_finite(value, source, f"{key}[{i}]")
     elif isinstance(values, float) and not math.isfinite(values):
         raise ScenarioError(f"{source}: {key} = {values}; expected a finite number")
 

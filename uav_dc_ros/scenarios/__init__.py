@@ -26,12 +26,12 @@ def load(name_or_path: str | Path) -> Scenario:
     if wanted in names():
         return parse((files(__package__) / f"{wanted}.toml").read_text("utf-8"), wanted)
     path = Path(name_or_path)
-    if not path.is_file():
-        raise ScenarioError(
-            f"scenario {wanted!r}: no such name or file; expected one of {', '.join(names())}, "
-            "or the path of a TOML file"
-        )
     try:
-        return parse(path.read_text("utf-8"), wanted)
+        if path.is_file():
+            return parse(path.read_text("utf-8"), wanted)
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{wanted}: cannot be read: {error}") from None
+    raise ScenarioError(
+        f"scenario {wanted!r}: no such name or file; expected one of {', '.join(names())}, "
+        "or the path of a TOML file"
+    )
