@@ -29,8 +29,12 @@ class BagError(UavDcError):
     """A bag that cannot be written or read."""
 
 
-class RosMissingError(UavDcError):
-    """ROS 2 cannot be imported."""
+class ParameterError(UavDcError):
+    """A ROS parameter of a node, or an option of a command, that makes no sense."""
+
+
+class NodeError(UavDcError):
+    """A node that failed, or never appeared, while a mission needed it."""
 
 
 class TrainingError(UavDcError):

@@ -1,0 +1,4 @@
+"""MCAP bags without a ROS installation.
+
+write   a rosbag2 folder from serialised messages
+"""

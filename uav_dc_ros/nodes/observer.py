@@ -1,0 +1,155 @@
+"""run_all's own eyes: follows the missions, for the progress display and the summary."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from uav_dc_ros import messages
+from uav_dc_ros.core import mission as core_mission
+from uav_dc_ros.core import reward as core_reward
+from uav_dc_ros.core import world as core
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.nodes import convert, runtime
+
+
+class Summary(msgspec.Struct, frozen=True, kw_only=True):
+    """One mission, as `--summary` writes it.
+
+    Attributes:
+        scenario, policy: names.
+        seed: seed of the mission's users.
+        outcome: `landed`, `timeout` or `aborted`.
+        steps: steps flown.
+        users_collected, users_total: users.
+        data_bits: data collected from all users, bit.
+        sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
+        distance_m: length of the path flown, metres.
+        reward: sum of the rewards of all steps.
+        bag: folder of the bag, or null.
+    """
+
+    scenario: str
+    policy: str
+    seed: int
+    outcome: messages.Phase
+    steps: int
+    users_collected: int
+    users_total: int
+    data_bits: float
+    sum_rate_bps: float
+    distance_m: float
+    reward: float
+    bag: str | None
+
+
+@dataclass(kw_only=True)
+class MissionSoFar:
+    """A mission so far."""
+
+    mission: int = 0
+    seed: int
+    step: int = 0
+    users_collected: int = 0
+    data_bits: float = 0.0
+    sum_rate_bps: float = 0.0  # of this step
+    dock_distance_m: float = 0.0
+    distance_m: float = 0.0
+    reward: float = 0.0
+    sum_of_sum_rates_bps: float = 0.0
+
+
+class Observer(runtime.MissionNode):
+    """Follows `mission` and `rates`.
+
+    Args:
+        scenario: the world that is flown.
+        peers: nodes of the mission.
+        on_step: called after each step.
+        on_end: called when a mission has come to its end, with how.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        peers: list[str],
+        on_step: Callable[[MissionSoFar], None],
+        on_end: Callable[[MissionSoFar, messages.Phase], None],
+    ) -> None:
+        self._given_peers = peers
+        super().__init__("observer")
+        self.scenario = scenario
+        self.mission: MissionSoFar | None = None
+        self._on_step, self._on_end = on_step, on_end
+        self._steps: runtime.StepJoin[messages.Stepped] = runtime.StepJoin("mission", "rates")
+        self.listen()
+
+    def _peers_parameter(self) -> list[str]:
+        return [peer for peer in self._given_peers if peer != "observer"]
+
+    def on_mission(self, payload: messages.Mission) -> None:
+        """Follow the vehicle."""
+        convert.check_world(payload, self.scenario)
+        self._join("mission", payload)
+
+    def on_rates(self, payload: messages.Rates) -> None:
+        """Follow the collection."""
+        convert.collection(payload, self.scenario)
+        self._join("rates", payload)
+
+    def _join(self, part: str, payload: messages.Stepped) -> None:
+        whole = self._steps.add(part, payload.mission, payload.step, payload)
+        if whole is None:
+            return
+        mission, rates = whole["mission"], whole["rates"]
+        assert isinstance(mission, messages.Mission)
+        assert isinstance(rates, messages.Rates)
+        self._follow(mission, rates)
+
+    def _follow(self, mission: messages.Mission, rates: messages.Rates) -> None:
+        now = self.mission
+        data_bits, collected = convert.collection(rates, self.scenario)
+        cell = np.asarray(mission.cell)
+        position_m = self.scenario.grid.centre_m(cell, like=data_bits)
+        total = float(core.total_reward(self.scenario, cell, data_bits))
+        if now is None or now.mission != mission.mission:
+            now = MissionSoFar(mission=mission.mission, seed=mission.seed)
+            self._total, self._position_m = 0.0, position_m
+        elif mission.step <= now.step:
+            return  # a repeated step
+        else:
+            now.sum_of_sum_rates_bps += rates.sum_rate_bps
+            now.reward += float(core_reward.earned(total, self._total, self.scenario.reward.form))
+            now.distance_m += float(np.linalg.norm(position_m - self._position_m))
+            self._total, self._position_m = total, position_m
+        self.mission = now
+        now.step = mission.step
+        now.users_collected = int(collected.sum())
+        now.data_bits = float(data_bits.sum())
+        now.sum_rate_bps = rates.sum_rate_bps
+        away = core_mission.dock_distance_cells(cell, self.scenario.dock_cell, like=data_bits)
+        now.dock_distance_m = float(away) * self.scenario.grid.cell_m
+        self._on_step(now)
+        if mission.phase.is_over:
+            self._on_end(now, mission.phase)
+
+
+def summary(
+    now: MissionSoFar, outcome: messages.Phase, scenario: Scenario, policy: str, bag: str | None
+) -> Summary:
+    """The mission in numbers."""
+    return Summary(
+        scenario=scenario.name,
+        policy=policy,
+        seed=now.seed,
+        outcome=outcome,
+        steps=now.step,
+        users_collected=now.users_collected,
+        users_total=scenario.n_users,
+        data_bits=now.data_bits,
+        sum_rate_bps=now.sum_of_sum_rates_bps / max(now.step, 1),
+        distance_m=now.distance_m,
+        reward=now.reward,
+        bag=bag,
+    )

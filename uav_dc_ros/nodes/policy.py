@@ -1,0 +1,59 @@
+"""The policy: answers each step that the vehicle is ready for with a move. Needs no torch.
+
+It is the same node in simulation and on an aircraft: it knows the vehicle by `mission` only.
+"""
+
+import numpy as np
+
+from uav_dc_ros import messages, scenarios
+from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core.grid import Action
+from uav_dc_ros.nodes import convert, runtime
+
+
+class Policy(runtime.MissionNode):
+    """Flies a trained policy."""
+
+    def __init__(self) -> None:
+        super().__init__("policy")
+        self.policy = policies.load(
+            self.parameter("policy", "five_clusters_dueling", "name of a shipped policy, or its folder")
+        )
+        scenario = self.parameter("scenario", "", "scenario of the mission; empty: the policy's own")
+        self.scenario = self.policy.scenario if not scenario else scenarios.load(scenario)
+        self.policy.check(self.scenario)
+        self._steps: runtime.StepJoin[messages.Stepped] = runtime.StepJoin("mission", "rates")
+        self.listen()
+
+    def on_mission(self, payload: messages.Mission) -> None:
+        """Note a step that the vehicle is ready for."""
+        convert.check_world(payload, self.scenario)
+        if payload.phase is messages.Phase.READY:
+            self._join("mission", payload)
+
+    def on_rates(self, payload: messages.Rates) -> None:
+        """Note what has been collected by a step."""
+        convert.collection(payload, self.scenario)  # refuse another scenario's rates before they wait
+        self._join("rates", payload)
+
+    def _join(self, part: str, payload: messages.Stepped) -> None:
+        whole = self._steps.add(part, payload.mission, payload.step, payload)
+        if whole is None:
+            return
+        mission, rates = whole["mission"], whole["rates"]
+        assert isinstance(mission, messages.Mission)
+        assert isinstance(rates, messages.Rates)
+        data_bits, collected = convert.collection(rates, self.scenario)
+        observation = self.policy.observe(
+            self.scenario,
+            cell=np.asarray(mission.cell),
+            step=np.asarray(self.scenario.mission.max_steps - mission.remaining_steps),
+            data_bits=data_bits,
+            collected=collected,
+        )
+        action = Action(int(self.policy.act(observation)))
+        self.say("move", messages.Move(mission=mission.mission, step=mission.step, action=action.label))
+
+
+if __name__ == "__main__":
+    runtime.main(Policy)

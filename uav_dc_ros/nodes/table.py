@@ -1,0 +1,59 @@
+"""The nodes, one row each: the only list. Topics are those of `topics.TOPICS`."""
+
+from dataclasses import dataclass
+
+from uav_dc_ros.topics import TOPICS
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeRow:
+    """A node.
+
+    Attributes:
+        name: its name in the ROS graph.
+        publishes, subscribes: names of topics.
+        process: is it a process of its own, `python -m uav_dc_ros.nodes.NAME`?
+        stop_rank: run_all stops nodes of a lower rank first; the world says how the mission ended, the
+            recorder must still hear it.
+    """
+
+    name: str
+    publishes: tuple[str, ...]
+    subscribes: tuple[str, ...]
+    process: bool = True
+    stop_rank: int = 1
+
+
+NODES: dict[str, NodeRow] = {
+    row.name: row
+    for row in (
+        NodeRow(
+            name="world",
+            publishes=("pose", "users", "mission", "target"),
+            subscribes=("move", "ready"),
+            stop_rank=0,
+        ),
+        NodeRow(
+            name="channel_monitor",
+            publishes=("rates", "ready"),
+            subscribes=("pose", "users"),
+        ),
+        NodeRow(
+            name="policy",
+            publishes=("move", "ready"),
+            subscribes=("mission", "rates"),
+        ),
+        NodeRow(
+            name="recorder",
+            publishes=("ready",),
+            subscribes=tuple(topic.name for topic in TOPICS.values() if topic.recorded),
+            stop_rank=2,
+        ),
+        NodeRow(
+            name="observer",
+            publishes=("ready",),
+            subscribes=("mission", "rates"),
+            process=False,
+        ),
+    )
+}

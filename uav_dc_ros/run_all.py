@@ -1,0 +1,104 @@
+"""Fly recorded missions: start the nodes, watch the flight, close the bag, print a summary.
+
+python -m uav_dc_ros.run_all --scenario five_clusters --seed 3
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from uav_dc_ros import __version__
+from uav_dc_ros.errors import UavDcError
+
+WATCHABLE_PACE = 90.0  # a mission of sixty steps of 15 s in ten seconds
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    options = argparse.ArgumentParser(
+        prog="python -m uav_dc_ros.run_all",
+        description="Fly recorded missions with a trained policy: world, channel monitor, policy and "
+        "recorder as separate ROS 2 nodes.",
+    )
+    options.add_argument(
+        "--scenario",
+        default="five_clusters",
+        metavar="NAME|FILE",
+        help="shipped scenario, or a TOML file (default: %(default)s)",
+    )
+    options.add_argument(
+        "--policy",
+        metavar="NAME|DIR",
+        help="shipped policy, or its folder (default: the scenario's name with '_dueling')",
+    )
+    options.add_argument(
+        "--seed", type=_whole(0), default=0, metavar="N", help="seed of the users (default: %(default)s)"
+    )
+    options.add_argument(
+        "--missions",
+        type=_whole(1),
+        default=1,
+        metavar="N",
+        help="missions, with seeds N, N+1, ... (default: %(default)s)",
+    )
+    options.add_argument(
+        "--pace",
+        type=_pace,
+        default=WATCHABLE_PACE,
+        metavar="lockstep|FACTOR",
+        help="as fast as the nodes can, or how many times faster than real time (default: %(default)g)",
+    )
+    recording = options.add_mutually_exclusive_group()
+    recording.add_argument(
+        "--bag", type=Path, metavar="DIR", help="folder of the new bag (default: a dated one in bags/)"
+    )
+    recording.add_argument("--no-record", action="store_true", help="fly without a bag")
+    options.add_argument("--summary", type=Path, metavar="FILE", help="write the summary as JSON")
+    options.add_argument("--version", action="version", version=__version__)
+    return options
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = parser().parse_args(arguments)
+    # Before ROS is imported: nobody else on the network should see these nodes unless the user says so.
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    from uav_dc_ros.nodes.flight import Flight
+
+    try:
+        flight = Flight(options)
+    except UavDcError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return flight.run()
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    def whole(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value < 2**62:
+            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number of at least {least}")
+        return value
+
+    return whole
+
+
+def _pace(text: str) -> str | float:
+    if text == "lockstep":
+        return text
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 0.0 < factor <= 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected 'lockstep' or a number above 0, at most 1e6")
+    return factor
+
+
+if __name__ == "__main__":
+    sys.exit(main())
