@@ -1,0 +1,67 @@
+"""The rules that hold for every file: style, types, directions of imports, length, docstrings, layout."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "uav_dc_ros"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+LONGEST = 350
+
+CHECKS = {
+    "ruff check": ["-m", "ruff", "check", "."],
+    "ruff format": ["-m", "ruff", "format", "--check", "."],
+    "mypy": ["-m", "mypy"],
+    # import-linter has no __main__.
+    "import contracts": ["-c", "import importlinter.cli as cli; cli.lint_imports_command()"],
+}
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_tool_has_nothing_to_say(check):
+    done = subprocess.run(
+        [sys.executable, *CHECKS[check]], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{check}:\n{done.stdout}{done.stderr}"
+
+
+def test_the_modules_were_found():
+    assert {"radio.py", "world.py", "scenario.py"} <= {path.name for path in MODULES}
+
+
+def test_a_file_can_be_read_in_one_sitting():
+    lines = {str(path.relative_to(ROOT)): len(path.read_text("utf-8").splitlines()) for path in MODULES}
+    assert {name: n for name, n in lines.items() if n > LONGEST} == {}
+
+
+def undocumented(tree, prefix=""):
+    """Names of public modules, classes, functions and methods without a docstring."""
+    if isinstance(tree, ast.Module) and not ast.get_docstring(tree):
+        yield "the module"
+    for node in tree.body:
+        if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if node.name.startswith("_"):
+            continue
+        name = f"{prefix}{node.name}"
+        if not ast.get_docstring(node):
+            yield name
+        if isinstance(node, ast.ClassDef):
+            yield from undocumented(node, f"{name}.")
+
+
+def test_everything_public_has_a_docstring():
+    missing = {
+        str(path.relative_to(ROOT)): list(undocumented(ast.parse(path.read_text("utf-8"))))
+        for path in MODULES
+    }
+    assert {name: names for name, names in missing.items() if names} == {}
+
+
+def test_the_check_for_docstrings_finds_what_is_missing():
+    source = "def f(): 1\nclass C:\n    'doc'\n    def m(self): 1\n    def _p(self): 1\n"
+    assert list(undocumented(ast.parse(source))) == ["the module", "f", "C.m"]
