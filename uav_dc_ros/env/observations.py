@@ -24,6 +24,18 @@ def size(kind: Observation, scenario: Scenario) -> int:
     return {"position": position, "mission": mission, "map": mission + clusters + 2}[kind]
 
 
+def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
+    """Lowest and highest value of each entry of the encoding, float32 `[D]` each."""
+    low, high = np.zeros(size(kind, scenario), np.float32), np.ones(size(kind, scenario), np.float32)
+    if kind == "map":
+        goals = _goals_cells(scenario)
+        span = np.asarray(_spans(scenario)[:2], np.float32)
+        start = size("mission", scenario)
+        low[start:] = ((goals - span) / span).reshape(-1)
+        high[start:] = (goals / span).reshape(-1)
+    return low, high
+
+
 def encode(
     kind: Observation,
     scenario: Scenario,
@@ -56,17 +68,25 @@ def encode(
         progress = xp.astype(data_bits, xp.float32) / scenario.mission.r_min_bits
         parts.append(_cluster_means(scenario, xp.minimum(progress, xp.ones_like(progress))))
     if kind == "map":
-        goals_m = np.asarray([*scenario.users.cluster_centres_m, scenario.mission.dock_m], dtype=np.float32)
-        goals = constant(goals_m / np.float32(scenario.grid.cell_m), cell_f)
-        way = (goals - cell_f[..., None, :2]) / _span(scenario, cell_f)[:2]
+        way = (constant(_goals_cells(scenario), cell_f) - cell_f[..., None, :2]) / _span(scenario, cell_f)[:2]
         parts.append(xp.reshape(way, (*cell.shape[:-1], -1)))
     return xp.concat(parts, axis=-1)
 
 
+def _spans(scenario: Scenario) -> list[int]:
+    """Highest index in each direction, at least 1."""
+    return [max(n - 1, 1) for n in scenario.grid.shape]
+
+
 def _span(scenario: Scenario, like: Array) -> Array:
-    """Highest index in each direction, at least 1, `[3]`."""
-    xp = array_namespace(like)
-    return xp.astype(constant([max(n - 1, 1) for n in scenario.grid.shape], like), like.dtype)
+    """`_spans` as an array of the library and dtype of `like`, `[3]`."""
+    return array_namespace(like).astype(constant(_spans(scenario), like), like.dtype)
+
+
+def _goals_cells(scenario: Scenario) -> Array:
+    """The clusters' centres and the dock, in cells from the grid's origin, float32 numpy `[M + 1, 2]`."""
+    goals_m = np.asarray([*scenario.users.cluster_centres_m, scenario.mission.dock_m], dtype=np.float32)
+    return goals_m / np.float32(scenario.grid.cell_m)
 
 
 def _cluster_means(scenario: Scenario, per_user: Array) -> Array:

@@ -1,0 +1,272 @@
+"""A trained policy: a folder, and what flies from it. Needs numpy only.
+
+A policy is a folder of three files: `config.json` (a `PolicyConfig`), `model.safetensors` (the
+parameters of the network) and `README.md` (the card: what it is, how it was made, how it does).
+"""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import msgspec
+import numpy as np
+import safetensors.numpy
+from msgspec import Meta
+from safetensors import SafetensorError
+
+from uav_dc_ros import resources
+from uav_dc_ros.agents import network
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.scenario import Scenario, from_values
+from uav_dc_ros.env import observations
+from uav_dc_ros.env.observations import Observation
+from uav_dc_ros.errors import PolicyError, ScenarioError
+
+CONFIG, MODEL, CARD = "config.json", "model.safetensors", "README.md"
+
+Algorithm: TypeAlias = Literal["dqn", "dueling_dqn"]
+Count: TypeAlias = Annotated[int, Meta(ge=1)]
+Probability: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
+
+
+class Hyperparameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How a policy learns; the defaults are the paper's where it gives one.
+
+    Attributes:
+        gamma: discount.
+        epsilon: probability of the greedy action.
+        batch_size: transitions in a mini-batch.
+        learning_rate: of Adam.
+        target_every: iterations between two copies to the target network (open in the paper: often
+            enough to follow, and ten missions of sixty steps apart by the number of samples).
+        buffer_size: transitions that the replay buffer holds (open in the paper).
+        episodes: missions flown to learn.
+    """
+
+    gamma: Probability = 0.9
+    epsilon: Probability = 0.9
+    batch_size: Count = 32
+    learning_rate: Annotated[float, Meta(gt=0)] = 1e-3
+    target_every: Count = 500
+    buffer_size: Count = 50_000
+    episodes: Count = 2000
+
+
+class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Everything about a policy but its parameters.
+
+    Attributes:
+        format: version of this file's layout.
+        name: the policy's name.
+        algorithm: `dqn` or `dueling_dqn`.
+        aggregation: what the dueling network subtracts from the advantage; without meaning for `dqn`.
+        observation: what the policy sees, see `env.observations`.
+        hidden: units of each hidden layer.
+        actions: labels of the actions, in the order of the network's outputs.
+        hyperparameters: how it learnt.
+        seed: seed of its run.
+        episode: episode after which these parameters were taken.
+        version: version of the package that made it.
+        scenario: the world it learnt in, as plain values.
+    """
+
+    format: Literal[1] = 1
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    algorithm: Algorithm
+    aggregation: network.Aggregation = "mean"
+    observation: Observation
+    hidden: Annotated[tuple[network.Width, ...], Meta(min_length=1, max_length=16)]
+    actions: tuple[str, ...] = ACTION_LABELS
+    hyperparameters: Hyperparameters
+    seed: Annotated[int, Meta(ge=0)]
+    episode: Annotated[int, Meta(ge=0)]
+    version: str
+    scenario: dict[str, Any]
+
+    def architecture(self, scenario: Scenario) -> network.Architecture:
+        """Sizes of its network for the world it learnt in."""
+        return network.Architecture(
+            n_inputs=observations.size(self.observation, scenario),
+            hidden=self.hidden,
+            n_actions=len(self.actions),
+            dueling=self.aggregation if self.algorithm == "dueling_dqn" else None,
+        )
+
+
+class Policy:
+    """A trained policy, ready to fly.
+
+    Attributes:
+        name: its name.
+        folder: where it was loaded from.
+        config: everything about it but its parameters.
+        scenario: the world it learnt in.
+        sha256: of its config and its model, in hex: names exactly what flew.
+    """
+
+    def __init__(
+        self,
+        *,
+        folder: Path,
+        config: PolicyConfig,
+        scenario: Scenario,
+        parameters: Mapping[str, Array],
+        sha256: str,
+    ) -> None:
+        self.name = config.name
+        self.folder = folder
+        self.config = config
+        self.scenario = scenario
+        self.sha256 = sha256
+        self._architecture = config.architecture(scenario)
+        # In float64 the last digit of a product, which depends on how many missions are asked about at
+        # once, is too small to decide between two actions.
+        self._parameters = {name: np.asarray(values, np.float64) for name, values in parameters.items()}
+
+    def observe(
+        self, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
+    ) -> Array:
+        """What this policy sees of a mission, float32 `[..., D]`; see `env.observations.encode`."""
+        return observations.encode(
+            self.config.observation,
+            scenario,
+            cell=cell,
+            step=step,
+            data_bits=data_bits,
+            collected=collected,
+        )
+
+    def q_values(self, observation: Array) -> Array:
+        """Q(s, a) of observations `[..., D]`, float64 `[..., A]`."""
+        rows = np.asarray(observation, np.float64).reshape(-1, self._architecture.n_inputs)
+        values = network.q_values(self._architecture, self._parameters, rows)
+        return values.reshape(*observation.shape[:-1], self._architecture.n_actions)
+
+    def act(self, observation: Array) -> Array:
+        """The greedy action for observations `[..., D]`: values of `core.grid.Action`, `[...]`."""
+        return np.argmax(self.q_values(observation), axis=-1)
+
+    def check(self, scenario: Scenario) -> None:
+        """Refuses a world in which this policy's inputs or outputs mean something else.
+
+        Raises:
+            PolicyError: another grid, another number of clusters (unless it sees its position only),
+                or other actions.
+        """
+        mine, flown = self.scenario, scenario
+        facts: list[tuple[str, object, object]] = [
+            ("the grid's number of cells east, north, up", mine.grid.shape, flown.grid.shape)
+        ]
+        if self.config.observation != "position":
+            facts.append(("the number of clusters", mine.n_clusters, flown.n_clusters))
+        for what, expected, value in facts:
+            if value != expected:
+                raise PolicyError(
+                    f"policy {self.name!r} does not fit scenario {flown.name!r}: {what} is {value}; "
+                    f"expected {expected}, as in {mine.name!r}, where it learnt"
+                )
+
+
+def names() -> list[str]:
+    """Names of the shipped policies."""
+    root = resources.folder("policies")
+    return sorted(path.parent.name for path in root.glob(f"*/{CONFIG}"))
+
+
+def load(name_or_path: str | Path) -> Policy:
+    """The policy with a shipped name, or in the folder at a path.
+
+    Raises:
+        PolicyError: no such policy, a file that is missing or damaged, or a config and a model that do
+            not fit together.
+    """
+    wanted = str(name_or_path)
+    folder = resources.folder("policies") / wanted if wanted in names() else Path(name_or_path)
+    if not folder.is_dir():
+        raise PolicyError(
+            f"policy {wanted!r}: no such name or folder; expected one of {', '.join(names()) or '(none)'}, "
+            f"or the path of a folder with {CONFIG} and {MODEL}"
+        )
+    config_bytes, model_bytes = _read(folder / CONFIG), _read(folder / MODEL)
+    try:
+        config = msgspec.json.decode(config_bytes, type=PolicyConfig)
+        scenario = from_values(config.scenario, f"{folder / CONFIG}: scenario")
+    except msgspec.MsgspecError as error:
+        raise PolicyError(f"{folder / CONFIG}: {error}") from None
+    except ScenarioError as error:
+        raise PolicyError(str(error)) from None
+    if config.actions != ACTION_LABELS:
+        raise PolicyError(
+            f"{folder / CONFIG}: actions = {list(config.actions)}; expected {list(ACTION_LABELS)}"
+        )
+    parameters = _parameters(model_bytes, config.architecture(scenario), folder / MODEL)
+    sha256 = hashlib.sha256(config_bytes + model_bytes).hexdigest()
+    return Policy(folder=folder, config=config, scenario=scenario, parameters=parameters, sha256=sha256)
+
+
+def save(
+    folder: Path, config: PolicyConfig, parameters: Mapping[str, Array], card: Callable[[Policy], str]
+) -> None:
+    """Writes a policy's folder: under another name first, so that it is there in full or not at all.
+
+    Args:
+        folder: the folder to make.
+        config: everything but the parameters.
+        parameters: arrays as named by `network.shapes`.
+        card: gives the text of README.md, from the policy as it was read back.
+
+    Raises:
+        PolicyError: `folder` exists or cannot be written, or what was written cannot be loaded.
+    """
+    refuse_existing(folder)
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in parameters.items()}
+        (partial / MODEL).write_bytes(safetensors.numpy.save(arrays))
+        (partial / CONFIG).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2) + b"\n")
+        (partial / CARD).write_text(card(load(partial)), "utf-8")
+        partial.rename(folder)
+    except OSError as error:
+        raise PolicyError(f"policy {str(folder)!r} cannot be written: {error}") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def refuse_existing(folder: Path) -> None:
+    """Raises PolicyError when `folder` exists: a policy is never overwritten."""
+    if folder.exists():
+        raise PolicyError(f"{str(folder)!r} exists; expected a new folder, a policy is never overwritten")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _parameters(model: bytes, architecture: network.Architecture, path: Path) -> dict[str, Array]:
+    """The arrays in a model file, which must be exactly those of the architecture."""
+    try:
+        arrays = safetensors.numpy.load(model)
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise PolicyError(f"{path}: damaged or not a safetensors file: {error}") from None
+    expected = network.shapes(architecture)
+    for name in sorted(expected.keys() | arrays.keys()):
+        if name not in arrays:
+            raise PolicyError(f"{path}: tensor {name!r} is missing; expected shape {expected[name]}")
+        if name not in expected:
+            raise PolicyError(f"{path}: unexpected tensor {name!r}; expected {', '.join(expected)}")
+        if arrays[name].shape != expected[name] or arrays[name].dtype != np.float32:
+            raise PolicyError(
+                f"{path}: tensor {name!r} is {arrays[name].dtype} {arrays[name].shape}; "
+                f"expected float32 {expected[name]}"
+            )
+        if not np.isfinite(arrays[name]).all():
+            raise PolicyError(f"{path}: tensor {name!r} holds values that are not finite numbers")
+    return arrays

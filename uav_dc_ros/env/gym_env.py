@@ -1,0 +1,157 @@
+"""The world as a Gymnasium environment."""
+
+from pathlib import Path
+from typing import Any, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import InvalidAction, ResetNeeded
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.core import mission, world
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.grid import ACTION_LABELS, Action
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.env import observations
+from uav_dc_ros.env.batch import observe
+from uav_dc_ros.env.observations import Observation
+from uav_dc_ros.env.render import Track, picture
+
+RENDER_MODES = ("rgb_array",)
+ACTIONS_TEXT = ", ".join(f"{action.value} {action.label}" for action in Action)
+
+
+class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
+    """A UAV collects data from users on the ground, and lands before its battery is spent.
+
+    Action:
+        `Discrete(7)`: 0 left (-x), 1 right (+x), 2 forward (+y), 3 backward (-y), 4 upward, 5 downward,
+        6 hover. One move is one cell; a move off the grid leaves the UAV where it is.
+
+    Observation:
+        `Box`, float32. `observation="position"`: the UAV's cell, each index scaled to [0, 1].
+        `"mission"` (default): also the remaining steps and how far each cluster is collected. `"map"`:
+        also the way to each cluster and to the dock. The exact layout is in `env.observations`.
+
+    Reward:
+        From r^t = beta * (data collected so far, mean over users, scaled) + zeta * R_plus (eq. 7):
+        either its change in this step (`reward.form = "immediate"`) or r^t itself (`"episode"`).
+
+    Start:
+        The UAV in the scenario's start cell; users uniform in their clusters' discs. In each step the
+        UAV moves, then the users walk, then data is collected at rates that hold for the step.
+
+    End:
+        `episode_end = "at_time_limit"`: terminates after `max_steps`; it has landed if it is over the
+        dock then. `"on_arrival"`: terminates over the dock, truncates after `max_steps`.
+
+    Randomness:
+        `reset` draws `np_random.random((U, 2))`, then every `step` the same, and nothing else does.
+
+    Info:
+        step, cell `[3]`, users_m `[U, 2]`, data_bits `[U]`, collected `[U]`, landed, dock_distance_m
+        (horizontal), and of the last step (zero before the first): served `[U]`, sinr `[U]` linear,
+        rate_bps `[U]`, sum_rate_bps.
+
+    Args:
+        scenario: a shipped name, the path of a TOML file, or a Scenario.
+        observation: `position`, `mission` or `map`.
+        render_mode: None, or `rgb_array`: a picture of the mission so far, `[H, W, 3]` uint8.
+
+    Raises:
+        ScenarioError: a scenario that cannot be used.
+        InvalidAction, ResetNeeded: of `step`, for an action outside the space, or outside an episode.
+    """
+
+    # Gymnasium declares it as a variable of the instance.
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 6}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: str | Path | Scenario = "five_clusters",
+        observation: Observation = "mission",
+        render_mode: str | None = None,
+    ) -> None:
+        self.scenario, self.observation, self.render_mode = checked(scenario, observation, render_mode)
+        self.observation_space, self.action_space = spaces_of(self.scenario, self.observation)
+        self._state: world.State | None = None
+        self._track = Track(self.scenario)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Starts a mission; `options` are not used."""
+        super().reset(seed=seed)
+        self._state = world.initial(self.scenario, self._draws())
+        self._track = Track(self.scenario)
+        self._track.add(self._state)
+        return observe(self.observation, self.scenario, self._state), info(self.scenario, self._state)
+
+    def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Flies one step; see the class."""
+        if self._state is None:
+            raise ResetNeeded("step() outside an episode; expected a call of reset() first")
+        if not self.action_space.contains(action):
+            raise InvalidAction(f"action is {action!r}; expected an integer: {ACTIONS_TEXT}")
+        state, outcome = world.step(self.scenario, self._state, np.asarray(action), self._draws())
+        self._track.add(state, outcome.link)
+        terminated, truncated = bool(outcome.terminated), bool(outcome.truncated)
+        self._state = None if terminated or truncated else state
+        seen = observe(self.observation, self.scenario, state)
+        return seen, float(outcome.reward), terminated, truncated, info(self.scenario, state, outcome)
+
+    def render(self) -> Array | None:
+        """The mission so far as a picture `[H, W, 3]`, uint8; None without a render mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() without a render mode; expected render_mode='rgb_array'")
+            return None
+        if not self._track.cells:
+            raise ResetNeeded("render() before the first mission; expected a call of reset() first")
+        return picture(self._track)
+
+    def _draws(self) -> Array:
+        return self.np_random.random((self.scenario.n_users, 2))
+
+
+def checked(
+    scenario: str | Path | Scenario, observation: Observation, render_mode: str | None
+) -> tuple[Scenario, Observation, str | None]:
+    """The arguments of an environment, with the scenario loaded.
+
+    Raises:
+        ScenarioError: a scenario that cannot be used.
+        ValueError: an unknown observation or render mode.
+    """
+    if observation not in get_args(Observation):
+        raise ValueError(f"observation is {observation!r}; expected {', '.join(get_args(Observation))}")
+    if render_mode not in (None, *RENDER_MODES):
+        raise ValueError(f"render_mode is {render_mode!r}; expected None or {', '.join(RENDER_MODES)}")
+    loaded = scenario if isinstance(scenario, Scenario) else scenarios.load(scenario)
+    return loaded, observation, render_mode
+
+
+def spaces_of(scenario: Scenario, observation: Observation) -> tuple[spaces.Box, spaces.Discrete]:
+    """Observation and action space of one environment."""
+    low, high = observations.bounds(observation, scenario)
+    return spaces.Box(low, high, dtype=np.float32), spaces.Discrete(len(ACTION_LABELS))
+
+
+def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None = None) -> dict[str, Any]:
+    """What `reset` and `step` tell beside the observation, with the batch dimensions of `state`."""
+    distance = mission.dock_distance_cells(state.cell, scenario.dock_cell, like=state.data_bits)
+    nothing, nobody = np.zeros_like(state.data_bits), np.zeros_like(state.collected)
+    link = outcome.link if outcome else None
+    return {
+        "step": state.step,
+        "cell": state.cell,
+        "users_m": state.users_m,
+        "data_bits": state.data_bits,
+        "collected": state.collected,
+        "landed": outcome.landed if outcome else nobody[..., 0],
+        "dock_distance_m": distance * scenario.grid.cell_m,
+        "served": link.served if link else nobody,
+        "sinr": link.sinr if link else nothing,
+        "rate_bps": link.rate_bps if link else nothing,
+        "sum_rate_bps": link.sum_rate_bps if link else nothing[..., 0],
+    }

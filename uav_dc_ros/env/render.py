@@ -1,0 +1,153 @@
+"""A picture of a mission: the field from above, and its course over the steps."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import CircleCollection, LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from uav_dc_ros.core import mission, world
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+
+INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
+WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
+PATH_COLOURS = "viridis"
+
+
+class Track:
+    """What a picture needs of one mission, step by step.
+
+    Attributes:
+        scenario: the world's values.
+        cells: the UAV's cell after each step, the start first.
+        n_collected: users collected after each step.
+        sum_rate_bps: sum-rate of each step, 0 for the start.
+        state: the world now.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.cells: list[Array] = []
+        self.n_collected: list[int] = []
+        self.sum_rate_bps: list[float] = []
+        self.state: world.State | None = None
+
+    def add(self, state: world.State, link: world.Link | None = None) -> None:
+        """Appends the start, or the next step, of one mission without batch dimensions."""
+        self.cells.append(state.cell)
+        self.n_collected.append(int(np.sum(state.collected)))
+        self.sum_rate_bps.append(float(link.sum_rate_bps) if link else 0.0)
+        self.state = state
+
+
+def picture(track: Track) -> Array:
+    """The mission so far, `[H, W, 3]` uint8."""
+    canvas = FigureCanvasAgg(_figure(track, dpi=100))
+    canvas.draw()  # type: ignore[no-untyped-call]
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
+
+
+def save_picture(track: Track, path: Path) -> None:
+    """Writes the mission so far as an image; the path's ending names the kind."""
+    FigureCanvasAgg(_figure(track, dpi=150)).figure.savefig(path)
+
+
+def _figure(track: Track, dpi: int) -> Figure:
+    figure = Figure(figsize=(7.2, 8.7), dpi=dpi, facecolor=PAPER)
+    field, course = figure.add_axes((0.1, 0.235, 0.81, 0.67)), figure.add_axes((0.1, 0.06, 0.81, 0.115))
+    _draw_field(field, track)
+    _draw_course(course, track)
+    step, n_steps = len(track.cells) - 1, track.scenario.mission.max_steps
+    docked = bool(mission.at_dock(track.cells[-1], track.scenario.dock_cell))
+    where = "over the dock" if docked else f"sum-rate {track.sum_rate_bps[-1] / 1e6:.2f} Mbit/s"
+    title = f"{track.n_collected[-1]} of {track.scenario.n_users} users collected"
+    facts = f"{track.scenario.name}   ·   step {step} of {n_steps}   ·   {where}"
+    figure.text(0.1, 0.952, title, color=INK, size=15, weight="bold")
+    figure.text(0.1, 0.926, facts, color=INK, size=9.5)
+    return figure
+
+
+def _draw_field(axes: Axes, track: Track) -> None:
+    """The field from above; the path is coloured by step, and a dot grows with the time spent at it."""
+    scenario, state = track.scenario, track.state
+    assert state is not None, "a picture is made of a mission that has started"
+    cell_m = scenario.grid.cell_m
+    path_m = np.stack(track.cells)[:, :2] * cell_m
+    when = np.arange(len(path_m))
+    limits = (0, scenario.mission.max_steps)
+
+    for centre_m in scenario.users.cluster_centres_m:
+        axes.add_patch(Circle(centre_m, scenario.users.cluster_radius_m, fc="#e9e4d6", zorder=1))
+    for done, colour, size in ((False, WAITING, 20), (True, COLLECTED, 26)):
+        x_m, y_m = state.users_m[state.collected == done].T
+        label = "collected" if done else "waiting"
+        axes.scatter(x_m, y_m, s=size, c=colour, edgecolors=PAPER, linewidths=0.6, zorder=3, label=label)
+
+    axes.plot(path_m[:, 0], path_m[:, 1], color=PAPER, lw=5, solid_capstyle="round", zorder=4)
+    pieces = np.stack([path_m[:-1], path_m[1:]], axis=1)
+    line = LineCollection(list(pieces), cmap=PATH_COLOURS, lw=2.6, capstyle="round", zorder=5)
+    line.set_array(when[1:])
+    line.set_clim(*limits)
+    axes.add_collection(line)
+    spots, first, stays = np.unique(path_m, axis=0, return_index=True, return_counts=True)
+    dots = CircleCollection(
+        list(12.0 * stays), offsets=spots, offset_transform=axes.transData, cmap=PATH_COLOURS, zorder=6
+    )
+    dots.set_array(first)
+    dots.set_clim(*limits)
+    dots.set_edgecolor(PAPER)
+    axes.add_collection(dots)
+
+    (start_x_m, start_y_m, _), (dock_x_m, dock_y_m) = scenario.mission.start_m, scenario.mission.dock_m
+    axes.scatter(start_x_m, start_y_m, s=70, facecolors="none", edgecolors=INK, lw=1.6, zorder=7)
+    axes.scatter(dock_x_m, dock_y_m, marker="s", s=130, c=DOCK, edgecolors=PAPER, lw=1.2, zorder=7)
+    for text, x_m, y_m in (("start", start_x_m, start_y_m), ("dock", dock_x_m, dock_y_m)):
+        axes.annotate(text, (x_m, y_m), (0, -20), textcoords="offset points", color=INK, size=9, ha="center")
+
+    altitude_m = float(scenario.grid.centre_m(track.cells[-1], like=state.users_m)[2])
+    reach_m = np.sqrt(max(scenario.mission.d_cons_m**2 - altitude_m**2, 0.0))
+    x_m, y_m = path_m[-1]
+    axes.add_patch(Circle((x_m, y_m), reach_m, fill=False, ec=INK, lw=0.9, ls=(0, (5, 4)), zorder=2))
+    axes.scatter(x_m, y_m, marker="^", s=90, c="#f2c14e", edgecolors=INK, lw=1.1, zorder=8, label="UAV")
+
+    wide_m, high_m = (scenario.grid.n_x - 1) * cell_m, (scenario.grid.n_y - 1) * cell_m
+    axes.set(xlim=(-0.8 * cell_m, wide_m + 0.8 * cell_m), ylim=(-0.8 * cell_m, high_m + 0.8 * cell_m))
+    axes.set_aspect("equal")
+    axes.set_xticks(np.arange(0, wide_m + 1, 2 * cell_m))
+    axes.set_yticks(np.arange(0, high_m + 1, 2 * cell_m))
+    axes.set_xlabel("east, m", color=INK, size=9)
+    axes.set_ylabel("north, m", color=INK, size=9)
+    axes.legend(loc="upper left", frameon=False, fontsize=9, labelcolor=INK, handletextpad=0.2)
+    _dress(axes)
+
+
+def _draw_course(axes: Axes, track: Track) -> None:
+    """Altitude and users collected over the steps."""
+    scenario = track.scenario
+    steps = np.arange(len(track.cells))
+    axes.fill_between(steps, track.n_collected, color=COLLECTED, alpha=0.25, lw=0, step="post")
+    axes.step(steps, track.n_collected, color=COLLECTED, lw=1.6, where="post")
+    axes.set(xlim=(0, scenario.mission.max_steps), ylim=(0, scenario.n_users * 1.08))
+    axes.set_xlabel("step", color=INK, size=9)
+    axes.set_ylabel("users\ncollected", color=COLLECTED, size=9)
+    _dress(axes)
+    height = axes.twinx()
+    altitudes_m = scenario.grid.altitude_min_m + np.stack(track.cells)[:, 2] * scenario.grid.altitude_step_m
+    top_m = scenario.grid.altitude_min_m + (scenario.grid.n_z - 1) * scenario.grid.altitude_step_m
+    height.step(steps, altitudes_m, color=INK, lw=1.3, where="post")
+    height.set_ylim(0, top_m * 1.2)
+    height.set_ylabel("altitude, m", color=INK, size=9)
+    _dress(height)
+
+
+def _dress(axes: Axes) -> None:
+    axes.set_facecolor("none")
+    axes.tick_params(colors=INK, labelsize=8, length=0)
+    axes.grid(color=FAINT, lw=0.5, alpha=0.6)
+    axes.set_axisbelow(True)
+    for spine in axes.spines.values():
+        spine.set_color(FAINT)

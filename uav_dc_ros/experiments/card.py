@@ -1,0 +1,86 @@
+"""The card of a policy: what it is, how it was made, how it does."""
+
+from uav_dc_ros import __version__
+from uav_dc_ros.agents.policy import Policy, PolicyConfig
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.experiments.evaluate import TEST_SEEDS, evaluate, rows
+
+_ALGORITHMS = {"dqn": "DQN", "dueling_dqn": "Dueling DQN"}
+_LIMITS = {
+    "position": """\
+It sees its cell and nothing else: it cannot know what it has collected or how much time is left, so its
+greedy mission is one fixed path, and where it stays for one step it stays for good.""",
+    "mission": "It sees how far each cluster is collected, but not where single users are.",
+    "map": "It sees where the clusters are, but it has met no other map than this one.",
+}
+
+
+def card(policy: Policy, scenario: Scenario, command: str, n_runs: int, seconds: float, score: float) -> str:
+    """Text of a policy's README.md.
+
+    Args:
+        policy: the policy, as read back.
+        scenario: the world to evaluate in: the one that the command names, without its overrides.
+        command: the exact command that made the policy.
+        n_runs: runs that were trained side by side.
+        seconds: wall time of the training.
+        score: its score on the validation missions.
+    """
+    config, values = policy.config, policy.config.hyperparameters
+    hidden = " and ".join(map(str, config.hidden))
+    first, last = TEST_SEEDS[0], TEST_SEEDS[-1]
+    algorithm, n_users = _ALGORITHMS[config.algorithm], scenario.n_users
+    table = "\n".join(f"| {' | '.join(row)} |" for row in rows(evaluate(policy, scenario)))
+    return f"""# {config.name}
+
+{algorithm} for the scenario `{scenario.name}`, with the `{config.observation}` observation,
+hidden layers of {hidden} units and {len(config.actions)} actions.
+
+## How it was made
+
+```
+{command}
+```
+
+- uav_dc_ros {__version__}; {seconds / 60:.1f} minutes for {n_runs} run(s) of {values.episodes} episodes
+- chosen among all runs and checkpoints by validation missions, which share no seed with those below: the run
+  with seed {config.seed} after episode {config.episode}, which brought {score:.2f} of {n_users} users home
+- gamma {values.gamma:g}, epsilon {values.epsilon:g} (probability of the greedy action)
+- batches of {values.batch_size}, learning rate {values.learning_rate:g}
+- target network copied every {values.target_every} iterations, replay buffer of {values.buffer_size}
+- the reward it learnt from: {_reward(policy.scenario)}
+
+## How it does
+
+{len(TEST_SEEDS)} missions, seeds {first} to {last}, flown greedily, each with a fresh layout of its users.
+Rewards are those of the scenario as it is shipped: {_reward(scenario)}.
+The arrival step is over missions that landed.
+
+| | mean | least | greatest |
+| --- | --- | --- | --- |
+{table}
+
+## Limits
+
+{_LIMITS[config.observation]}
+It knows one field: another layout of clusters on the same grid would be flown as if it were this one. It has
+met slowly walking users and a line-of-sight channel, in simulation only: no wind, no fading, no lost packets.
+"""
+
+
+def checkpoint_card(config: PolicyConfig, score: float, command: str) -> str:
+    """Text of the README.md of a policy that was saved on the way."""
+    return f"""# {config.name}, checkpoint
+
+The best policy until episode {config.episode}, from the run with seed {config.seed}. In validation it brought
+{score:.2f} users home; it is not evaluated yet. Made by
+
+```
+{command}
+```
+"""
+
+
+def _reward(scenario: Scenario) -> str:
+    values = scenario.reward
+    return f"beta {values.beta:g}, zeta {values.zeta:g}, {values.r_plus} R_plus, {values.form} form"

@@ -1,0 +1,83 @@
+"""The command line of `python -m uav_dc_ros.evaluate`."""
+
+import os
+from pathlib import Path
+
+import msgspec
+from rich.console import Console
+from rich.table import Table
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.errors import UavDcError
+from uav_dc_ros.experiments import cli
+from uav_dc_ros.experiments.evaluate import Evaluation, evaluate, rows, save_mission_picture
+
+PROG = "python -m uav_dc_ros.evaluate"
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Runs the command line, and exits."""
+    parser = cli.Parser(
+        prog=PROG, description="Fly trained policies over many missions and show how they do."
+    )
+    parser.add_argument(
+        "--policy",
+        nargs="+",
+        required=True,
+        metavar="NAME|DIR",
+        help=f"shipped: {', '.join(policies.names())}",
+    )
+    parser.add_argument(
+        "--scenario",
+        metavar="NAME|FILE",
+        help=f"shipped: {', '.join(scenarios.names())}; default: the one it learnt in",
+    )
+    parser.add_argument("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
+    options = parser.parse_args(argv)
+
+    def command() -> int:
+        if options.picture and len(options.policy) > 1:
+            raise UavDcError(f"--picture with {len(options.policy)} policies; expected one policy")
+        results = []
+        for name in options.policy:
+            policy = policies.load(name)
+            scenario = scenarios.load(options.scenario or policy.scenario.name)
+            results.append(evaluate(policy, scenario, range(options.seeds)))
+            if options.picture:
+                save_mission_picture(policy, scenario, 0, options.picture)
+        for result in results:
+            show(result)
+        if options.json:
+            write(options.json, msgspec.json.format(msgspec.json.encode(results), indent=2) + b"\n")
+        return 0
+
+    cli.run(command, PROG)
+
+
+def show(result: Evaluation) -> None:
+    """Prints one evaluation as a table."""
+    first, n = result.seeds
+    table = Table(
+        title=f"{result.policy} in {result.scenario}, {n} missions, seeds {first} to {first + n - 1}, "
+        f"{result.users_total} users",
+        title_justify="left",
+    )
+    table.add_column("")
+    for title in ("mean", "min", "max"):
+        table.add_column(title, justify="right")
+    for row in rows(result):
+        table.add_row(*row)
+    Console().print(table)
+
+
+def write(path: Path, content: bytes) -> None:
+    """Writes a file in one move, so that it is there in full or not at all."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    except OSError as error:
+        raise UavDcError(f"{path} cannot be written: {error.strerror}") from None

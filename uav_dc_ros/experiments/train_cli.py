@@ -1,0 +1,175 @@
+"""The command line of `python -m uav_dc_ros.train`: options, checkpoints, the result."""
+
+import argparse
+import shlex
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import msgspec
+from rich.console import Console
+
+from uav_dc_ros import __version__, scenarios
+from uav_dc_ros.agents import network, policy
+from uav_dc_ros.agents.policy import Algorithm, Hyperparameters, PolicyConfig
+from uav_dc_ros.core.reward import RewardForm, RPlus
+from uav_dc_ros.core.scenario import Scenario, from_values
+from uav_dc_ros.env.observations import Observation
+from uav_dc_ros.errors import ScenarioError, TrainingError
+from uav_dc_ros.experiments import cli
+from uav_dc_ros.experiments.card import card, checkpoint_card
+from uav_dc_ros.experiments.progress import Display
+
+if TYPE_CHECKING:
+    import torch
+
+PROG = "python -m uav_dc_ros.train"
+# Keys of a scenario's reward that an option may replace.
+_REWARD_OPTIONS = {"beta": "beta", "zeta": "zeta", "r_plus": "r_plus", "reward_form": "form"}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Runs the command line, and exits."""
+    argv = sys.argv[1:] if argv is None else argv
+    options = _parser().parse_args(argv)
+    cli.run(lambda: _train(options, f"{PROG} {shlex.join(argv)}"), PROG)
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser(
+        prog=PROG,
+        description="Train a policy. The result is a folder with its config, its parameters and its card.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--scenario", required=True, metavar="NAME|FILE", help=f"shipped: {', '.join(scenarios.names())}")
+    add("--algo", required=True, choices=get_args(Algorithm), help="the paper's algorithm 1 or 2")
+    add("--out", required=True, type=Path, metavar="DIR", help="folder to make, such as policies/NAME")
+    add("--observation", default="mission", choices=get_args(Observation), help="what the agent sees")
+    add("--aggregation", default="mean", choices=get_args(network.Aggregation), help="of the dueling streams")
+    add(
+        "--hidden",
+        default=[64, 64],
+        type=cli.count,
+        nargs="+",
+        metavar="N",
+        help="units of each hidden layer",
+    )
+    add("--seed", default=0, type=int, help="of the first run")
+    add("--runs", default=1, type=cli.count, metavar="N", help="runs side by side, of which the best is kept")
+    add("--checkpoint-every", default=100, type=cli.count, metavar="EPISODES", help="between two validations")
+    add("--device", default="cpu", help="where torch computes, such as cpu or cuda")
+    add(
+        "--threads", default=1, type=cli.count, metavar="N", help="of torch: equal numbers give equal results"
+    )
+    learning = parser.add_argument_group("learning")
+    for field in msgspec.structs.fields(Hyperparameters):
+        kind = type(field.default)
+        learning.add_argument(_option(field.name), default=field.default, type=kind, help=" ")
+    reward = parser.add_argument_group("reward, instead of the scenario's own; kept in the policy's config")
+    reward.add_argument("--beta", type=float, help="weight of the data")
+    reward.add_argument("--zeta", type=float, help="weight of R_plus")
+    reward.add_argument("--r-plus", choices=get_args(RPlus), help="shape of R_plus")
+    reward.add_argument("--reward-form", choices=get_args(RewardForm), help="what a step pays")
+    return parser
+
+
+def _train(options: argparse.Namespace, command: str) -> int:
+    shipped = scenarios.load(options.scenario)
+    config = _config(options, shipped)
+    checkpoints = options.out.with_name(f"{options.out.name}.checkpoints")
+    policy.refuse_existing(options.out)
+    policy.refuse_existing(checkpoints)
+    device = _device(options.device, options.threads)
+    from uav_dc_ros.experiments.train import train  # needs torch, which _device() has asked for
+
+    started = time.monotonic()
+    scenario = from_values(config.scenario, shipped.name)
+    latest = None
+    try:
+        with Display(config.hyperparameters.episodes, options.checkpoint_every) as display:
+            for report in train(config, scenario, options.runs, options.checkpoint_every, device):
+                display.show(report)
+                if report.best is not None:
+                    best, score = report.best, report.score
+                    config = msgspec.structs.replace(
+                        config, seed=options.seed + report.run, episode=report.episode
+                    )
+                    latest = checkpoints / f"episode_{report.episode:06d}"
+                    _save_checkpoint(latest, config, best, checkpoint_card(config, score, command))
+    except KeyboardInterrupt:
+        kept = f"the best policy until now is {latest}" if latest else "there is no checkpoint yet"
+        raise TrainingError(f"stopped; {kept}") from None
+    seconds = time.monotonic() - started
+    policy.save(
+        options.out,
+        config,
+        best,
+        lambda loaded: card(loaded, shipped, command, options.runs, seconds, score),
+    )
+    shutil.rmtree(checkpoints)
+    Console().print(f"{options.out}: {score:.1f} of {shipped.n_users} users brought home in validation")
+    return 0
+
+
+def _save_checkpoint(folder: Path, config: PolicyConfig, best: network.Parameters, text: str) -> None:
+    policy.save(folder, config, best, lambda _: text)
+
+
+def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
+    """The policy's config before training, from the options."""
+    values: dict[str, Any] = msgspec.to_builtins(shipped)
+    for option, key in _REWARD_OPTIONS.items():
+        if (value := getattr(options, option)) is not None:
+            values["reward"][key] = value
+    try:
+        from_values(values, PROG)
+    except ScenarioError as error:
+        raise TrainingError(str(error)) from None
+    learning = {name: getattr(options, name) for name in Hyperparameters.__struct_fields__}
+    try:
+        return msgspec.convert(
+            {
+                "name": options.out.name,
+                "algorithm": options.algo,
+                "aggregation": options.aggregation,
+                "observation": options.observation,
+                "hidden": options.hidden,
+                "hyperparameters": learning,
+                "seed": options.seed,
+                "episode": 0,
+                "version": __version__,
+                "scenario": values,
+            },
+            PolicyConfig,
+        )
+    except msgspec.ValidationError as error:
+        expected, _, path = str(error).replace("Expected", "expected").partition(" - at `$.")
+        key = path.strip("`").split(".")[-1].split("[")[0].replace("name", "out")
+        raise TrainingError(f"{_option(key)} is {getattr(options, key)!r}; {expected}") from None
+
+
+def _option(key: str) -> str:
+    return f"--{key.replace('_', '-')}"
+
+
+def _device(name: str, n_threads: int) -> "torch.device":
+    """The device to compute on.
+
+    Raises:
+        TrainingError: torch is not installed, or has no such device.
+    """
+    try:
+        import torch
+    except ModuleNotFoundError:
+        raise TrainingError(
+            'torch is not installed; expected it from: pip install "uav_dc_ros[train]"'
+        ) from None
+    torch.set_num_threads(n_threads)
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise TrainingError(f"--device is {name!r}; {str(error).splitlines()[0]}") from None
+    return torch.device(name)
