@@ -12,7 +12,6 @@ import msgspec
 
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
 
-
 ActionLabel: TypeAlias = Literal["left", "right", "forward", "backward", "upward", "downward", "hover"]
 
 
