@@ -105,8 +105,8 @@ def _draw_field(axes: Axes, track: Track) -> None:
     (start_x_m, start_y_m, _), (dock_x_m, dock_y_m) = scenario.mission.start_m, scenario.mission.dock_m
     axes.scatter(start_x_m, start_y_m, s=70, facecolors="none", edgecolors=INK, lw=1.6, zorder=7)
     axes.scatter(dock_x_m, dock_y_m, marker="s", s=130, c=DOCK, edgecolors=PAPER, lw=1.2, zorder=7)
-    for text, x_m, y_m in (("start", start_x_m, start_y_m), ("dock", dock_x_m, dock_y_m)):
-        axes.annotate(text, (x_m, y_m), (0, -20), textcoords="offset points", color=INK, size=9, ha="center")
+    for text, x_m, y_m, lift in (("start", start_x_m, start_y_m, -20), ("dock", dock_x_m, dock_y_m, 13)):
+        axes.annotate(text, (x_m, y_m), (0, lift), textcoords="offset points", color=INK, size=9, ha="center")
 
     altitude_m = float(scenario.grid.centre_m(track.cells[-1], like=state.users_m)[2])
     reach_m = np.sqrt(max(scenario.mission.d_cons_m**2 - altitude_m**2, 0.0))

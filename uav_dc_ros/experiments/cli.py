@@ -3,13 +3,19 @@
 import argparse
 import sys
 from collections.abc import Callable
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from uav_dc_ros.errors import UavDcError
 
+# What a shell says of a command that Ctrl-C ended.
+INTERRUPTED = 130
+
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one line."""
+    """An argument parser whose complaints are one line, and which guesses at no option."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(allow_abbrev=False, **settings)
 
     def error(self, message: str) -> NoReturn:
         """Exits with status 2."""
@@ -32,4 +38,4 @@ def run(command: Callable[[], int], prog: str) -> NoReturn:
         sys.exit(2)
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(INTERRUPTED)

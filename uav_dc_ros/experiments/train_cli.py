@@ -97,11 +97,12 @@ def _train(options: argparse.Namespace, command: str) -> int:
                     config = msgspec.structs.replace(
                         config, seed=options.seed + report.run, episode=report.episode
                     )
-                    latest = checkpoints / f"episode_{report.episode:06d}"
-                    _save_checkpoint(latest, config, best, checkpoint_card(config, score, command))
+                    text = checkpoint_card(config, score, command)
+                    latest = _save_checkpoint(checkpoints, config, best, text)
     except KeyboardInterrupt:
         kept = f"the best policy until now is {latest}" if latest else "there is no checkpoint yet"
-        raise TrainingError(f"stopped; {kept}") from None
+        print(f"{PROG}: stopped; {kept}", file=sys.stderr)
+        return cli.INTERRUPTED
     seconds = time.monotonic() - started
     policy.save(
         options.out,
@@ -114,8 +115,10 @@ def _train(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _save_checkpoint(folder: Path, config: PolicyConfig, best: network.Parameters, text: str) -> None:
+def _save_checkpoint(root: Path, config: PolicyConfig, best: network.Parameters, text: str) -> Path:
+    folder = root / f"episode_{config.episode:06d}"
     policy.save(folder, config, best, lambda _: text)
+    return folder
 
 
 def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
@@ -146,8 +149,9 @@ def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
             PolicyConfig,
         )
     except msgspec.ValidationError as error:
-        expected, _, path = str(error).replace("Expected", "expected").partition(" - at `$.")
-        key = path.strip("`").split(".")[-1].split("[")[0].replace("name", "out")
+        # Such as: Expected `float` <= 1.0 - at `$.hyperparameters.gamma`
+        expected, _, path = str(error).replace("`", "").replace("Expected", "expected").partition(" - at $.")
+        key = path.split(".")[-1].split("[")[0].replace("name", "out")
         raise TrainingError(f"{_option(key)} is {getattr(options, key)!r}; {expected}") from None
 
 

@@ -1,0 +1,58 @@
+"""The replay buffer."""
+
+import pytest
+import torch
+
+from uav_dc_ros.agents.replay import ReplayBuffer, Transitions
+
+
+def transitions(value, n_runs=2):
+    """One transition of each run, all its numbers made from `value` and the run."""
+    number = value + 1000.0 * torch.arange(n_runs)
+    return Transitions(
+        observation=number[:, None].expand(-1, 3),
+        action=number.to(torch.int64),
+        reward=number,
+        next_observation=number[:, None].expand(-1, 3) + 0.5,
+        terminated=torch.full((n_runs,), value % 2 == 1),
+    )
+
+
+def filled(n, capacity=10):
+    buffer = ReplayBuffer(2, capacity, 3, torch.device("cpu"))
+    for value in range(n):
+        buffer.add(transitions(value))
+    return buffer
+
+
+def every_slot(buffer):
+    """Draws that meet the middle of each slot once, for both runs."""
+    return ((torch.arange(len(buffer)) + 0.5) / len(buffer)).expand(2, -1)
+
+
+def test_the_parts_of_a_transition_stay_together():
+    batch = filled(7).sample(torch.rand((2, 50), generator=torch.Generator().manual_seed(0)))
+    assert batch.observation.shape == (2, 50, 3)
+    torch.testing.assert_close(batch.observation[..., 0], batch.reward)
+    torch.testing.assert_close(batch.next_observation[..., 2], batch.reward + 0.5)
+    assert torch.equal(batch.action, batch.reward.to(torch.int64))
+    assert torch.equal(batch.terminated, batch.action % 2 == 1)
+    assert torch.equal(batch.reward[1] >= 1000.0, torch.ones(50, dtype=torch.bool)), "runs do not mix"
+
+
+@pytest.mark.parametrize(("n", "held"), [(1, [0]), (4, [0, 1, 2, 3]), (10, range(10)), (23, range(13, 23))])
+def test_it_holds_the_latest(n, held):
+    buffer = filled(n)
+    assert len(buffer) == len(held)
+    rewards = buffer.sample(every_slot(buffer)).reward
+    assert sorted(rewards[0].tolist()) == list(held)
+    assert sorted(rewards[1].tolist()) == [1000 + value for value in held]
+
+
+def test_sampling_is_uniform_and_stays_inside():
+    buffer = filled(8)
+    draws = torch.rand((2, 80_000), generator=torch.Generator().manual_seed(1))
+    draws[:, 0], draws[:, 1] = 0.0, 1.0 - 2.0**-24  # the least and the greatest draw there is
+    counts = torch.bincount(buffer.sample(draws).reward[0].to(torch.int64), minlength=8)
+    # 10 000 expected in each of 8 slots; chi-squared with 7 degrees of freedom is below 24.3 in 999 of 1000.
+    assert ((counts - 10_000.0) ** 2 / 10_000.0).sum() < 24.3

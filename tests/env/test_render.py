@@ -1,0 +1,40 @@
+"""Pictures of missions."""
+
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+
+from tests.small_worlds import tiny
+from uav_dc_ros.env.gym_env import DataCollectionEnv
+
+
+def test_a_picture_follows_the_mission():
+    env = DataCollectionEnv("five_clusters", render_mode="rgb_array")
+    env.reset(seed=0)
+    start = env.render()
+    assert start.dtype == np.uint8
+    assert start.ndim == 3
+    assert start.shape[2] == 3
+    np.testing.assert_array_equal(start, env.render())
+    env.step(1)
+    assert not np.array_equal(start, env.render())
+
+
+def test_the_last_picture_can_still_be_made_when_the_mission_is_over():
+    env = DataCollectionEnv(tiny(mission={"max_steps": 4}), render_mode="rgb_array")
+    env.reset(seed=0)
+    for action in (1, 1, 2, 2):
+        env.step(action)
+    assert env.render().any()
+
+
+def test_there_is_no_picture_before_a_mission():
+    with pytest.raises(ResetNeeded):
+        DataCollectionEnv(tiny(), render_mode="rgb_array").render()
+
+
+def test_without_a_render_mode_there_is_a_warning():
+    env = DataCollectionEnv(tiny())
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="rgb_array"):
+        assert env.render() is None
