@@ -62,7 +62,7 @@ def test_a_value_that_is_not_finite_does_not_leak_through_the_end():
 
 def test_epsilon_is_the_probability_of_the_greedy_action():
     made = learner([0], epsilon=0.9)
-    n = 20_000
+    n = 2_000
     observation = torch.full((1, 3), 0.3)
     greedy = network.q_values(ARCHITECTURE, made.parameters(), observation[:, None].numpy()).argmax(-1).item()
     generator = torch.Generator().manual_seed(0)
@@ -72,7 +72,7 @@ def test_epsilon_is_the_probability_of_the_greedy_action():
     # A random action is the greedy one in a quarter of the cases.
     expected = torch.full((4,), 0.1 / 4)
     expected[greedy] += 0.9
-    torch.testing.assert_close(share, expected, atol=0.01, rtol=0.0)
+    torch.testing.assert_close(share, expected, atol=0.03, rtol=0.0)
 
 
 @pytest.mark.parametrize("dueling", ["mean", "max", None])

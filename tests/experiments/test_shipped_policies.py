@@ -1,0 +1,67 @@
+"""The policies that come with the package do what their cards say."""
+
+import re
+import shlex
+
+import pytest
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.agents import policy
+from uav_dc_ros.experiments.evaluate import evaluate, rows
+from uav_dc_ros.experiments.train import VALIDATION_SEEDS
+from uav_dc_ros.experiments.train_cli import PROG, _parser
+
+NAMES = policy.names()
+
+
+def card(name):
+    return (policy.load(name).folder / policy.CARD).read_text("utf-8")
+
+
+def test_there_is_one_for_each_scenario_and_one_with_the_papers_state():
+    loaded = [policy.load(name) for name in NAMES]
+    assert {one.scenario.name for one in loaded} >= set(scenarios.names())
+    assert "position" in {one.config.observation for one in loaded}
+    assert all(one.name == name for one, name in zip(loaded, NAMES, strict=True))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_figures_on_the_card_come_out_again(name):
+    loaded = policy.load(name)
+    result = evaluate(loaded, scenarios.load(loaded.scenario.name))
+    assert result.seeds == (0, 100)
+    text = card(name)
+    for row in rows(result):
+        assert f"| {' | '.join(row)} |" in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_command_on_the_card_says_how_it_was_made(name):
+    command = re.search(r"```\n(.+)\n```", card(name))[1]
+    assert command.startswith(PROG)
+    options = _parser().parse_args(shlex.split(command.removeprefix(PROG)))
+    config = policy.load(name).config
+    assert options.out.name == name
+    assert (options.algo, options.observation) == (config.algorithm, config.observation)
+    assert tuple(options.hidden) == config.hidden
+    assert config.seed in range(options.seed, options.seed + options.runs)
+    for key in config.hyperparameters.__struct_fields__:
+        assert getattr(options, key) == getattr(config.hyperparameters, key)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_learnt_in_the_scenario_as_it_is_now_but_for_the_reward(name):
+    learnt, now = policy.load(name).scenario, scenarios.load(policy.load(name).scenario.name)
+    for section in ("grid", "users", "mission", "radio"):
+        assert getattr(learnt, section) == getattr(now, section)
+
+
+def test_the_default_is_worth_flying():
+    """Also on missions that no card shows, and that chose nothing."""
+    made, scenario = policy.load("five_clusters_dueling"), scenarios.load("five_clusters")
+    fresh = range(5000, 5100)
+    assert not set(fresh) & set(VALIDATION_SEEDS)
+    for seeds in (range(100), fresh):
+        result = evaluate(made, scenario, seeds)
+        assert result.landing_rate >= 0.95
+        assert result.users_collected.mean >= 40.0
