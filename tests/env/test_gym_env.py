@@ -27,9 +27,10 @@ def test_gymnasium_finds_no_fault(observation, end):
     check_env(made.unwrapped)
 
 
-def test_it_can_be_made_by_name_alone():
+@pytest.mark.parametrize("module", ["uav_dc_ros", "uav_dc_ros.env.registration"])
+def test_it_can_be_made_by_name_alone(module):
     """Without an import of ours: Gymnasium itself imports what stands before the colon."""
-    name = f"{registration.__name__}:{registration.ENV_ID}"
+    name = f"{module}:{registration.ENV_ID}"
     code = (
         f"import gymnasium; print(gymnasium.make({name!r}, scenario='five_clusters').reset(seed=0)[0].shape)"
     )

@@ -9,7 +9,7 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.experiments.evaluate import evaluate, rows
 from uav_dc_ros.experiments.train import VALIDATION_SEEDS
-from uav_dc_ros.experiments.train_cli import PROG, _parser
+from uav_dc_ros.experiments.train_cli import PROG, options_parser
 
 NAMES = policy.names()
 
@@ -39,7 +39,7 @@ def test_the_figures_on_the_card_come_out_again(name):
 def test_the_command_on_the_card_says_how_it_was_made(name):
     command = re.search(r"```\n(.+)\n```", card(name))[1]
     assert command.startswith(PROG)
-    options = _parser().parse_args(shlex.split(command.removeprefix(PROG)))
+    options = options_parser().parse_args(shlex.split(command.removeprefix(PROG)))
     config = policy.load(name).config
     assert options.out.name == name
     assert (options.algo, options.observation) == (config.algorithm, config.observation)

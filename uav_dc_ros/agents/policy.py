@@ -41,16 +41,17 @@ class Hyperparameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         epsilon: probability of the greedy action.
         batch_size: transitions in a mini-batch.
         learning_rate: of Adam.
-        target_every: iterations between two copies to the target network (open in the paper: often
-            enough to follow, and ten missions of sixty steps apart by the number of samples).
-        buffer_size: transitions that the replay buffer holds (open in the paper).
+        target_every: iterations between two copies to the target network. The paper leaves it open;
+            500 is about eight missions.
+        buffer_size: transitions that the replay buffer holds. The paper leaves it open; 50 000 is
+            about 800 missions.
         episodes: missions flown to learn.
     """
 
     gamma: Probability = 0.9
     epsilon: Probability = 0.9
     batch_size: Count = 32
-    learning_rate: Annotated[float, Meta(gt=0)] = 1e-3
+    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 1e-3
     target_every: Count = 500
     buffer_size: Count = 50_000
     episodes: Count = 2000
@@ -151,11 +152,12 @@ class Policy:
         return np.argmax(self.q_values(observation), axis=-1)
 
     def check(self, scenario: Scenario) -> None:
-        """Refuses a world in which this policy's inputs or outputs mean something else.
+        """Refuses a world in which what this policy sees would mean something else.
+
+        (That its actions are those of this version has been checked by `load`.)
 
         Raises:
-            PolicyError: another grid, another number of clusters (unless it sees its position only),
-                or other actions.
+            PolicyError: another grid, or another number of clusters unless it sees its position only.
         """
         mine, flown = self.scenario, scenario
         facts: list[tuple[str, object, object]] = [

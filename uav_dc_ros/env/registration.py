@@ -1,7 +1,7 @@
 """Makes `uav_dc_ros/DataCollection-v0` known to Gymnasium.
 
-Gymnasium has looked for no plug-ins since its 1.0, so one import is needed: of this module, or, inside
-the name, `gymnasium.make("uav_dc_ros.env.registration:uav_dc_ros/DataCollection-v0")`.
+Gymnasium looks for no plug-ins since its 1.0, so one import is needed: `import gymnasium, uav_dc_ros`, this
+module, or what stands before the colon in `gymnasium.make("uav_dc_ros:uav_dc_ros/DataCollection-v0")`.
 """
 
 import gymnasium

@@ -31,7 +31,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--scenario",
         metavar="NAME|FILE",
-        help=f"shipped: {', '.join(scenarios.names())}; default: the one it learnt in",
+        help=f"shipped: {', '.join(scenarios.names())}; default: by the name of the policy's own",
     )
     parser.add_argument("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")

@@ -20,9 +20,9 @@ class Display:
         self._line_every = line_every
         self._started = time.monotonic()
         self._bars = Progress(
-            TextColumn("episode"),
+            # Together they fit into 80 columns.
             MofNCompleteColumn(),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=8),
             TimeRemainingColumn(compact=True),
             TextColumn("{task.fields[text]}"),
             console=self._console,
@@ -43,9 +43,9 @@ class Display:
         """Shows one report."""
         rate = report.episode / (time.monotonic() - self._started)
         text = (
-            f"{rate:.1f}/s  return {report.mean_return:.2f}  collected {report.users_collected:.1f}  "
-            f"landed {report.landing_rate:.0%}  best {report.score:.1f}"
+            f"{rate:.1f}/s return {report.mean_return:.1f} collected {report.users_collected:.1f} "
+            f"landed {report.landing_rate:.0%} best {report.score:.1f}"
         )
         self._bars.update(self._task, completed=report.episode, text=text)
         if not self._console.is_terminal and report.episode % self._line_every == 0:
-            self._console.print(f"episode {report.episode}  {text}", soft_wrap=True)
+            self._console.print(f"episode {report.episode} {text}", soft_wrap=True)
