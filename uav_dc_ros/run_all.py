@@ -65,6 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     # Before ROS is imported: nobody else on the network should see these nodes unless the user says so.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "{severity}: {message}")  # of all nodes
     from uav_dc_ros.nodes.flight import Flight
 
     try:

@@ -6,7 +6,8 @@ Quality of service, with reasons:
 - `latched` (transient local) for what describes the state: whoever joins late learns it at once. A pose is
   not latched, since an autopilot's is not, and a subscriber may not ask for more than is offered; a move
   is not, since an old one is worth nothing.
-- A depth of 100 steps lets a slow reader (the recorder, while the disk is busy) fall behind.
+- Publishers keep 1000 messages for readers that fall behind. Who acts on messages keeps the newest few; who
+  must miss nothing (the recorder, while the disk is busy) keeps all: see `hears_all` in the node table.
 """
 
 from dataclasses import dataclass
@@ -20,14 +21,14 @@ class Topic:
         name: relative name.
         type: ROS 2 message type; `std_msgs/msg/String` holds a JSON payload, see messages.PAYLOADS.
         latched: durability transient local instead of volatile.
-        depth: messages kept for readers that fall behind.
+        depth: messages that a publisher keeps.
         recorded: does the recorder write it?
     """
 
     name: str
     type: str
     latched: bool
-    depth: int = 100
+    depth: int = 1000
     recorded: bool = True
 
 
@@ -43,6 +44,6 @@ TOPICS: dict[str, Topic] = {
         Topic(name="mission", type=JSON, latched=True),
         Topic(name="move", type=JSON, latched=False),
         Topic(name="target", type=POSE, latched=True),
-        Topic(name="ready", type=JSON, latched=True, depth=1, recorded=False),
+        Topic(name="ready", type=JSON, latched=True, recorded=False),
     )
 }

@@ -46,12 +46,11 @@ class BagWriter:
         self._counts: dict[str, int] = {}
         self._first_ns: int | None = None
         self._last_ns = 0
+        if folder.exists():
+            raise BagError(f"bag folder {folder} exists already; expected a new one")
         try:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            folder.mkdir()
+            folder.mkdir(parents=True)
             self._file = (folder / f"{folder.name}_0.mcap").open("xb")
-        except FileExistsError:
-            raise BagError(f"bag folder {folder} exists already; expected a new one") from None
         except OSError as error:
             raise BagError(f"bag folder {folder} cannot be made: {error.strerror}") from None
         self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)

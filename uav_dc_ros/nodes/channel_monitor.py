@@ -25,9 +25,19 @@ class ChannelMonitor(runtime.MissionNode):
         self._poses: deque[tuple[int, Array]] = deque(maxlen=POSES_KEPT)
         self._users: deque[messages.Users] = deque(maxlen=POSES_KEPT)
         self._said: messages.Rates | None = None
+        self._forget()
+        core.measure(  # the first time takes longest
+            self.scenario,
+            np.asarray(self.scenario.mission.start_m),
+            self.scenario.user_centres_m,
+            self._collected,
+        )
+        self.listen()
+
+    def _forget(self) -> None:
+        """Begin a mission: nothing is collected."""
         self._data_bits = np.zeros(self.scenario.n_users)
         self._collected = np.zeros(self.scenario.n_users, dtype=bool)
-        self.listen()
 
     def on_pose(self, message: PoseStamped) -> None:
         """Keep a pose; users may have waited for it."""
@@ -56,8 +66,7 @@ class ChannelMonitor(runtime.MissionNode):
             self.say("rates", said)  # a repeated step is measured, and booked, once
             return
         if said is None or said.mission != users.mission:
-            self._data_bits = np.zeros(self.scenario.n_users)
-            self._collected = np.zeros(self.scenario.n_users, dtype=bool)
+            self._forget()
         link = core.measure(self.scenario, uav_m, convert.users_m(users, self.scenario), self._collected)
         if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in
             self._data_bits, self._collected = core.collect(

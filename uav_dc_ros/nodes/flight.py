@@ -61,7 +61,8 @@ class Flight:
             except NodeError as error:
                 self.display.error(str(error))
                 status = 1
-            failed = [f"{name} ended with {code}" for name, code in launcher.stop().items() if code]
+            ended = launcher.stop().items()
+            failed = [f"{name} ended with {code}" for name, code in ended if code not in (0, -signal.SIGTERM)]
             if failed and not status:
                 self.display.error(f"while stopping: {', '.join(failed)}")
                 status = 1

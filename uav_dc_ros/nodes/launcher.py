@@ -20,7 +20,6 @@ from uav_dc_ros.nodes.runtime import SUPERVISED
 from uav_dc_ros.nodes.table import NODES
 
 STOP_S = 5.0  # for a node to end after it was asked to
-LOG_FORMAT = "{severity}: {message}"
 
 
 class NodeProcess:
@@ -39,7 +38,7 @@ class NodeProcess:
         arguments = [sys.executable, "-m", f"uav_dc_ros.nodes.{name}", "--ros-args"]
         for key, value in parameters.items():
             arguments += ["-p", f"{key}:={json.dumps(value)}"]  # JSON is YAML: any text arrives as it is
-        environment = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": LOG_FORMAT, **os.environ, SUPERVISED: "1"}
+        environment = {**os.environ, SUPERVISED: "1"}
         self.process = subprocess.Popen(
             arguments,
             stdin=subprocess.PIPE,
@@ -65,9 +64,9 @@ class NodeProcess:
         return self.process.poll() is not None
 
     def ask_to_stop(self) -> None:
-        """Send SIGINT."""
+        """Send SIGTERM: unlike SIGINT it ends a Python that still starts without a traceback."""
         if not self.ended:
-            self.process.send_signal(signal.SIGINT)
+            self.process.terminate()
 
     def wait(self, deadline_s: float) -> int:
         """Wait for the end until `deadline_s` of the monotonic clock, then kill. Returns the status."""

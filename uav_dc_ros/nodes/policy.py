@@ -7,6 +7,7 @@ import numpy as np
 
 from uav_dc_ros import messages, scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.nodes import convert, runtime
 
@@ -22,6 +23,8 @@ class Policy(runtime.MissionNode):
         scenario = self.parameter("scenario", "", "scenario of the mission; empty: the policy's own")
         self.scenario = self.policy.scenario if not scenario else scenarios.load(scenario)
         self.policy.check(self.scenario)
+        nothing = np.zeros(self.scenario.n_users)
+        self._decide(self.scenario.start_cell, 0, nothing, nothing > 0)  # the first time takes longest
         self._steps: runtime.StepJoin[messages.Stepped] = runtime.StepJoin("mission", "rates")
         self.listen()
 
@@ -44,15 +47,21 @@ class Policy(runtime.MissionNode):
         assert isinstance(mission, messages.Mission)
         assert isinstance(rates, messages.Rates)
         data_bits, collected = convert.collection(rates, self.scenario)
+        steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
+        action = self._decide(mission.cell, steps_flown, data_bits, collected)
+        self.say("move", messages.Move(mission=mission.mission, step=mission.step, action=action.label))
+
+    def _decide(
+        self, cell: tuple[int, int, int], steps_flown: int, data_bits: Array, collected: Array
+    ) -> Action:
         observation = self.policy.observe(
             self.scenario,
-            cell=np.asarray(mission.cell),
-            step=np.asarray(self.scenario.mission.max_steps - mission.remaining_steps),
+            cell=np.asarray(cell),
+            step=np.asarray(steps_flown),
             data_bits=data_bits,
             collected=collected,
         )
-        action = Action(int(self.policy.act(observation)))
-        self.say("move", messages.Move(mission=mission.mission, step=mission.step, action=action.label))
+        return Action(int(self.policy.act(observation)))
 
 
 if __name__ == "__main__":

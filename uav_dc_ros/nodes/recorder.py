@@ -59,7 +59,11 @@ class Recorder(runtime.MissionNode):
         # rclpy sees by the signature that `hear` takes the message's information, too; its types do not.
         callback: Any = hear
         return self.create_subscription(
-            runtime.MESSAGE_TYPES[topic.type], topic.name, callback, runtime.qos(topic), raw=True
+            runtime.MESSAGE_TYPES[topic.type],
+            topic.name,
+            callback,
+            runtime.requested_qos(topic, all=True),
+            raw=True,
         )
 
     def _announce(self, topic: Topic) -> None:

@@ -21,7 +21,7 @@ from rclpy.duration import Duration
 from rclpy.executors import ConditionReachedException, SingleThreadedExecutor, TimeoutException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
@@ -34,6 +34,7 @@ from uav_dc_ros.topics import TOPICS, Topic
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: the node ends when its standard input does
 PEERS_PERIOD_S = 0.02
 ACKNOWLEDGE_S = 1.0
+NEWEST = 10  # messages kept by a subscription that acts on them
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.05
 MESSAGE_TYPES: dict[str, type] = {topics.JSON: String, topics.POSE: PoseStamped}
@@ -41,10 +42,19 @@ MESSAGE_TYPES: dict[str, type] = {topics.JSON: String, topics.POSE: PoseStamped}
 V = TypeVar("V")
 
 
-def qos(topic: Topic) -> QoSProfile:
-    """The QoS of a topic, from its row."""
+def offered_qos(topic: Topic) -> QoSProfile:
+    """The QoS that a topic's publisher offers, from its row."""
     durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
     return QoSProfile(depth=topic.depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+
+def requested_qos(topic: Topic, *, all: bool) -> QoSProfile:
+    """The QoS that a subscription asks for; `all` as in the node table's `hears_all`."""
+    profile = offered_qos(topic)
+    profile.depth = NEWEST
+    if all:
+        profile.history = HistoryPolicy.KEEP_ALL
+    return profile
 
 
 class MissionNode(Node):
@@ -70,7 +80,9 @@ class MissionNode(Node):
         self._peers = self._peers_parameter()
         for topic in self.row.publishes:
             row = TOPICS[topic]
-            self._publishers_of[topic] = self.create_publisher(MESSAGE_TYPES[row.type], topic, qos(row))
+            self._publishers_of[topic] = self.create_publisher(
+                MESSAGE_TYPES[row.type], topic, offered_qos(row)
+            )
 
     def listen(self) -> None:
         """Subscribe to the row's topics and look for peers: the last act of a node's `__init__`."""
@@ -89,7 +101,8 @@ class MissionNode(Node):
             except MessageError as error:
                 self.reject(topic.name, error)
 
-        return self.create_subscription(MESSAGE_TYPES[topic.type], topic.name, hear, qos(topic))
+        qos = requested_qos(topic, all=self.row.hears_all)
+        return self.create_subscription(MESSAGE_TYPES[topic.type], topic.name, hear, qos)
 
     def say(self, topic: str, payload: messages.Payload) -> None:
         """Publish a checked payload on a JSON topic."""

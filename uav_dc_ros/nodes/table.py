@@ -12,6 +12,7 @@ class NodeRow:
     Attributes:
         name: its name in the ROS graph.
         publishes, subscribes: names of topics.
+        hears_all: does it keep every message until it gets to it, or the newest few?
         process: is it a process of its own, `python -m uav_dc_ros.nodes.NAME`?
         stop_rank: run_all stops nodes of a lower rank first; the world says how the mission ended, the
             recorder must still hear it.
@@ -20,6 +21,7 @@ class NodeRow:
     name: str
     publishes: tuple[str, ...]
     subscribes: tuple[str, ...]
+    hears_all: bool = False
     process: bool = True
     stop_rank: int = 1
 
@@ -47,12 +49,14 @@ NODES: dict[str, NodeRow] = {
             name="recorder",
             publishes=("ready",),
             subscribes=tuple(topic.name for topic in TOPICS.values() if topic.recorded),
+            hears_all=True,
             stop_rank=2,
         ),
         NodeRow(
             name="observer",
             publishes=("ready",),
             subscribes=("mission", "rates"),
+            hears_all=True,
             process=False,
         ),
     )

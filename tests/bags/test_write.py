@@ -1,0 +1,106 @@
+"""The bag writer: whole rosbag2 folders that independent readers understand."""
+
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
+
+from uav_dc_ros.bags.write import METADATA_NAME, BagWriter
+from uav_dc_ros.errors import BagError
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+STRING = "std_msgs/msg/String"
+
+
+def text(content: str) -> bytes:
+    """A std_msgs/String, serialised."""
+    return bytes(TYPES.serialize_cdr(TYPES.types[STRING](content), STRING))
+
+
+def written(folder: Path, n: int = 3) -> Path:
+    """A bag with two topics, one of them silent."""
+    with BagWriter(folder, {"seed": "3", "note": "äöü: \n 'quoted'"}) as bag:
+        bag.add_topic("/a", STRING)
+        bag.add_topic("/silent", STRING)
+        for i in range(n):
+            bag.write("/a", text(f"message {i}"), log_time_ns=1000 + i, publish_time_ns=900 + i)
+    return folder
+
+
+def test_rosbags_reads_it(tmp_path: Path) -> None:
+    with Reader(written(tmp_path / "bag")) as reader:
+        read = [(c.topic, t, TYPES.deserialize_cdr(d, c.msgtype).data) for c, t, d in reader.messages()]
+        assert read == [("/a", 1000 + i, f"message {i}") for i in range(3)]
+        assert reader.topics["/silent"].msgcount == 0
+        assert (reader.start_time, reader.end_time) == (1000, 1003)  # rosbags' end is exclusive
+
+
+def test_mcap_reads_it(tmp_path: Path) -> None:
+    folder = written(tmp_path / "bag")
+    with (folder / "bag_0.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        read = [
+            (s.name, s.encoding, c.topic, m.log_time, m.publish_time) for s, c, m in reader.iter_messages()
+        ]
+        assert read == [(STRING, "ros2msg", "/a", 1000 + i, 900 + i) for i in range(3)]
+        about = {record.name: record.metadata for record in reader.iter_metadata()}
+        assert about[METADATA_NAME] == {"seed": "3", "note": "äöü: \n 'quoted'"}
+        summary = reader.get_summary()
+        assert summary is not None
+        assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+
+
+def test_metadata_yaml_has_what_rosbag2_of_jazzy_writes(tmp_path: Path) -> None:
+    folder = written(tmp_path / "bag")
+    info = YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"]
+    assert list(info) == [
+        "version",
+        "storage_identifier",
+        "duration",
+        "starting_time",
+        "message_count",
+        "topics_with_message_count",
+        "compression_format",
+        "compression_mode",
+        "relative_file_paths",
+        "files",
+        "custom_data",
+        "ros_distro",
+    ]
+    assert (info["version"], info["storage_identifier"], info["ros_distro"]) == (9, "mcap", "jazzy")
+    assert info["duration"] == {"nanoseconds": 2}
+    assert info["relative_file_paths"] == ["bag_0.mcap"]
+    assert info["custom_data"]["seed"] == "3"
+    assert "&id" not in (folder / "metadata.yaml").read_text("utf-8")
+
+
+def test_an_empty_bag_is_a_bag(tmp_path: Path) -> None:
+    with Reader(written(tmp_path / "bag", n=0)) as reader:
+        assert reader.message_count == 0
+
+
+def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:
+    folder = written(tmp_path / "bag")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(BagError, match="exists already"):
+        BagWriter(folder, {})
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BagError, match="cannot be made"):
+        BagWriter(tmp_path / "file" / "bag", {})
+
+
+def test_what_was_written_before_a_failure_is_readable(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), BagWriter(tmp_path / "bag", {}) as bag:  # noqa: PT012
+        bag.add_topic("/a", STRING)
+        bag.write("/a", text("kept"), log_time_ns=1, publish_time_ns=1)
+        raise RuntimeError
+    with Reader(tmp_path / "bag") as reader:
+        assert reader.message_count == 1

@@ -1,0 +1,159 @@
+"""What tests share: a ROS domain of their own, processes that are all gone afterwards, small worlds."""
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+MARK = "UAV_DC_TEST"
+
+
+class Ros:
+    """Runs this project's commands in a ROS domain of their own, in a folder of their own."""
+
+    def __init__(self, domain: int, folder: Path) -> None:
+        self.folder = folder
+        self.mark = uuid.uuid4().hex
+        self.environment = {
+            **os.environ,
+            MARK: self.mark,
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_LOG_DIR": str(folder / "log"),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONPATH": str(Path(__file__).parents[1]),
+        }
+
+    def start(self, module: str, *arguments: object, **popen: Any) -> subprocess.Popen[str]:
+        """Start `python -m module arguments...`; its output, both streams, is piped."""
+        return subprocess.Popen(
+            [sys.executable, "-m", module, *(str(argument) for argument in arguments)],
+            env=self.environment,
+            cwd=self.folder,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            **popen,
+        )
+
+    def run(self, module: str, *arguments: object, timeout_s: float = 90.0) -> tuple[int, str]:
+        """Run it to its end; the exit status and what it printed."""
+        process = self.start(module, *arguments)
+        return finish(process, timeout_s)
+
+    def run_all(self, *arguments: object, timeout_s: float = 90.0) -> tuple[int, str]:
+        """Run run_all to its end."""
+        return self.run("uav_dc_ros.run_all", *arguments, timeout_s=timeout_s)
+
+    def processes(self) -> dict[int, str]:
+        """Command lines of this test's processes, by process id."""
+        found = {}
+        for entry in Path("/proc").iterdir():
+            if not entry.name.isdigit():
+                continue
+            try:
+                ours = f"{MARK}={self.mark}".encode() in (entry / "environ").read_bytes().split(b"\0")
+                if ours:
+                    found[int(entry.name)] = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:
+                continue  # it has ended, or is not ours to read
+        return found
+
+    def node(self, name: str) -> int:
+        """Process id of a node that runs, by name."""
+        deadline_s = time.monotonic() + 30.0
+        while time.monotonic() < deadline_s:
+            for process_id, command in self.processes().items():
+                if f"uav_dc_ros.nodes.{name} " in command:
+                    return process_id
+            time.sleep(0.02)
+        raise AssertionError(f"node {name} did not start")
+
+    def gone(self, within_s: float = 10.0) -> bool:
+        """Wait for the end of this test's processes; have they all ended."""
+        deadline_s = time.monotonic() + within_s
+        while self.processes() and time.monotonic() < deadline_s:
+            time.sleep(0.05)
+        return not self.processes()
+
+
+def finish(process: subprocess.Popen[str], timeout_s: float = 90.0) -> tuple[int, str]:
+    """Wait for a process; its exit status and what it printed."""
+    try:
+        output, _ = process.communicate(timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        output, _ = process.communicate()
+        raise AssertionError(f"still running after {timeout_s} s; it printed:\n{output}") from None
+    return process.returncode, output
+
+
+def wait_for(stream: IO[str], text: str) -> str:
+    """Read lines until one holds `text`; all that was read."""
+    read = ""
+    for line in stream:
+        read += line
+        if text in line:
+            return read
+    raise AssertionError(f"{text!r} was never printed; this was:\n{read}")
+
+
+def _free_domain() -> tuple[int, IO[str]]:
+    """A domain that no other test on this machine uses, held by a lock."""
+    folder = Path(tempfile.gettempdir()) / "uav_dc_ros_domains"
+    folder.mkdir(exist_ok=True)
+    for domain in range(20, 100):
+        lock = (folder / str(domain)).open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        return domain, lock
+    raise AssertionError("no ROS domain is free")
+
+
+def ros_in(folder: Path) -> Iterator[Ros]:
+    """A Ros in a folder; afterwards nothing of it may still run."""
+    domain, lock = _free_domain()
+    ros = Ros(domain, folder)
+    yield ros
+    left = {} if ros.gone() else ros.processes()
+    for process_id in left:
+        os.kill(process_id, signal.SIGKILL)
+    lock.close()
+    assert not left, f"processes left behind: {left}"
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[Ros]:
+    """A ROS domain and a folder for one test."""
+    yield from ros_in(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def module_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
+    """A ROS domain and a folder for the tests of a module."""
+    yield from ros_in(tmp_path_factory.mktemp("ros"))
+
+
+def read_bag(folder: Path) -> list[tuple[str, Any]]:
+    """Topic and content of each message of a bag, in its order; JSON payloads decoded."""
+    from rosbags.highlevel import AnyReader
+
+    read = []
+    with AnyReader([folder]) as reader:
+        for connection, _, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            is_json = connection.msgtype == "std_msgs/msg/String"
+            read.append((connection.topic, json.loads(message.data) if is_json else message))
+    return read

@@ -1,0 +1,76 @@
+"""A small world and a policy that fits it, for tests that are not about flying well."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.agents import network
+from uav_dc_ros.agents.policy import Hyperparameters, PolicyConfig, save
+
+SMALL = """
+name = "small"
+[grid]
+n_x = 3
+n_y = 3
+n_z = 2
+cell_m = 100.0
+altitude_min_m = 100.0
+altitude_step_m = 50.0
+[users]
+cluster_centres_m = [[100.0, 100.0]]
+users_per_cluster = 4
+cluster_radius_m = 50.0
+v_max_mps = 1.0
+[mission]
+start_m = [0.0, 0.0, 100.0]
+dock_m = [200.0, 200.0]
+step_s = 10.0
+max_steps = 30
+d_cons_m = 250.0
+r_min_bits = 1e7
+episode_end = "at_time_limit"
+[radio]
+bandwidth_hz = 1e6
+tx_power_w = 5.0
+noise_power_dbm = -110.0
+ref_gain_db = -50.0
+path_loss_exponent = 2.0
+interference = "all"
+[reward]
+beta = 1.0
+zeta = 1.0
+r_plus = "binary"
+form = "episode"
+data_scale_bits = 1e7
+"""
+
+
+@pytest.fixture
+def small_scenario(tmp_path: Path) -> Path:
+    """A scenario file of a user's own: three by three cells, four users, thirty steps."""
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.fixture
+def small_policy(tmp_path: Path, small_scenario: Path) -> Path:
+    """An untrained policy for the small world."""
+    scenario = scenarios.load(small_scenario)
+    config = PolicyConfig(
+        name="untrained",
+        algorithm="dueling_dqn",
+        observation="mission",
+        hidden=(8, 8),
+        hyperparameters=Hyperparameters(),
+        seed=0,
+        episode=0,
+        version="0",
+        scenario=msgspec.to_builtins(scenario),
+    )
+    parameters = network.initial(config.architecture(scenario), np.random.default_rng(0))
+    save(tmp_path / "untrained", config, parameters, card=lambda policy: f"# {policy.name}\n")
+    return tmp_path / "untrained"

@@ -1,0 +1,69 @@
+"""A stranger on the network: publishes what it is told to, and prints what it hears.
+
+Commands come as JSON lines on standard input: {"topic", "type", "latched", "data"}; with a number in
+"pose" the message is a PoseStamped. Each message on a topic in argv is printed as a JSON line.
+"""
+
+import contextlib
+import json
+import sys
+import threading
+import time
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.duration import Duration
+from std_msgs.msg import String
+
+from uav_dc_ros.nodes import runtime
+from uav_dc_ros.topics import TOPICS
+
+SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of it
+
+
+def main() -> None:
+    rclpy.init()
+    node = rclpy.create_node("probe")
+    for name in sys.argv[1:]:
+        topic = TOPICS[name.rsplit("/", 1)[-1]]
+
+        def hear(message: object, name: str = name) -> None:
+            print(json.dumps({"topic": name, "data": getattr(message, "data", None)}), flush=True)
+
+        node.create_subscription(
+            runtime.MESSAGE_TYPES[topic.type],
+            name,
+            lambda m, h=hear: h(m),
+            runtime.requested_qos(topic, all=True),
+        )
+    publishers = {}
+
+    def obey() -> None:
+        for line in sys.stdin:
+            command = json.loads(line)
+            name = command["topic"]
+            row = TOPICS[name.rsplit("/", 1)[-1]]
+            if name not in publishers:
+                kind = runtime.MESSAGE_TYPES[row.type]
+                publishers[name] = node.create_publisher(kind, name, runtime.offered_qos(row))
+                while publishers[name].get_subscription_count() < command["hearing"]:
+                    time.sleep(0.01)
+                time.sleep(SETTLE_S)
+            if "pose" in command:
+                message = PoseStamped()
+                message.header.frame_id = command["frame"]
+                message.pose.position.x = float(command["pose"])
+            else:
+                message = String(data=command["data"])
+            publishers[name].publish(message)
+        for publisher in publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=5))
+        rclpy.shutdown()
+
+    threading.Thread(target=obey, daemon=True).start()
+    with contextlib.suppress(rclpy.executors.ExternalShutdownException):
+        rclpy.spin(node)
+
+
+if __name__ == "__main__":
+    main()

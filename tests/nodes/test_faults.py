@@ -1,0 +1,95 @@
+"""Processes that really get killed: always an end, never a stray process, always a readable bag."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Ros, finish, read_bag, wait_for
+
+# Each fixture `ros` asserts at its end that no process of the test is left.
+
+FLYING = "mission: step 5/30"
+
+
+@pytest.fixture
+def arguments(small_scenario: Path, small_policy: Path, tmp_path: Path) -> list[object]:
+    """A mission of thirty seconds, which no test waits for."""
+    return [
+        *("--scenario", small_scenario, "--policy", small_policy, "--pace", 10),
+        *("--bag", tmp_path / "bag", "--summary", tmp_path / "summary.json"),
+    ]
+
+
+def test_ctrl_c_stops_everything_and_leaves_a_readable_bag(
+    ros: Ros, arguments: list[object], tmp_path: Path
+) -> None:
+    process = ros.start("uav_dc_ros.run_all", *arguments)
+    assert process.stdout is not None
+    wait_for(process.stdout, FLYING)
+    process.send_signal(signal.SIGINT)
+    status, output = finish(process)
+    assert status == 130, output
+    assert "Traceback" not in output
+    messages = read_bag(tmp_path / "bag")
+    missions = [message for name, message in messages if name == "/mission"]
+    assert [m["step"] for m in missions[:6]] == [0, 1, 2, 3, 4, 5]
+    assert missions[-1]["phase"] == "aborted"
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["outcome"] == "aborted"
+    assert summary["steps"] == missions[-1]["step"]
+    assert (tmp_path / "bag" / "metadata.yaml").is_file()
+
+
+@pytest.mark.parametrize("node", ["world", "channel_monitor", "policy", "recorder"])
+def test_a_node_that_is_killed_ends_the_mission(
+    ros: Ros, arguments: list[object], tmp_path: Path, node: str
+) -> None:
+    process = ros.start("uav_dc_ros.run_all", *arguments)
+    assert process.stdout is not None
+    wait_for(process.stdout, FLYING)
+    os.kill(ros.node(node), signal.SIGKILL)
+    status, output = finish(process)
+    assert status == 1, output
+    assert f"error: node {node} was killed by SIGKILL" in output
+    assert "Traceback" not in output
+    assert json.loads((tmp_path / "summary.json").read_text())["outcome"] == "aborted"
+    if node != "recorder":
+        missions = [m for name, m in read_bag(tmp_path / "bag") if name == "/mission"]
+        assert len(missions) >= 6
+        assert missions[-1]["phase"] == ("ready" if node == "world" else "aborted")
+
+
+def test_nodes_end_with_a_launcher_that_is_killed(ros: Ros, arguments: list[object], tmp_path: Path) -> None:
+    process = ros.start("uav_dc_ros.run_all", *arguments)
+    assert process.stdout is not None
+    wait_for(process.stdout, FLYING)
+    process.kill()
+    finish(process)
+    assert ros.gone()
+    assert len(read_bag(tmp_path / "bag")) > 20  # the recorder closed it on its own
+
+
+def test_ctrl_c_while_the_nodes_start(ros: Ros, arguments: list[object]) -> None:
+    process = ros.start("uav_dc_ros.run_all", *arguments)
+    ros.node("recorder")
+    time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    status, output = finish(process)
+    assert status == 130, output
+    assert "Traceback" not in output
+
+
+def test_a_node_that_cannot_start_is_told_with_its_reason(
+    ros: Ros, arguments: list[object], tmp_path: Path
+) -> None:
+    """Only the recorder can see that its folder cannot be made: the rest was checked before."""
+    (tmp_path / "file").write_text("")
+    at = arguments.index("--bag")
+    status, output = ros.run_all(*arguments[:at], "--bag", tmp_path / "file" / "bag", *arguments[at + 2 :])
+    assert status == 1, output
+    assert "error: node recorder ended with 2: error: bag folder" in output
+    assert "Traceback" not in output

@@ -1,0 +1,122 @@
+"""run_all's options: what a newcomer gets wrong is one clear line, status 2, and nothing written."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Ros
+from uav_dc_ros import resources
+
+
+def refused(ros: Ros, *arguments: object) -> str:
+    """Run run_all with options that cannot be flown; the one line it must print."""
+    before = sorted(ros.folder.rglob("*"))
+    status, output = ros.run_all(*arguments)
+    assert status == 2, output
+    assert "Traceback" not in output
+    assert sorted(path for path in ros.folder.rglob("*") if path.name != "log") == before
+    lines = [line for line in output.splitlines() if "error: " in line]
+    assert len(lines) == 1, output
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (
+            ("--scenario", "mars"),
+            "scenario 'mars': no such name or file; expected one of five_clusters, three",
+        ),
+        (("--policy", "nobody"), "policy 'nobody': no such name or folder; expected one of five_clusters_"),
+        (("--policy", "three_clusters_dueling"), "clusters is 5; expected 3"),
+        (("--seed", "-1"), "argument --seed: '-1'; expected a whole number of at least 0"),
+        (("--seed", "x"), "argument --seed: 'x'; expected a whole number"),
+        (("--missions", "0"), "argument --missions: '0'; expected a whole number of at least 1"),
+        (("--pace", "0"), "argument --pace: '0'; expected 'lockstep' or a number above 0"),
+        (("--pace", "nan"), "argument --pace: 'nan'; expected 'lockstep' or a number above 0"),
+        (("--pace", "fast"), "argument --pace: 'fast'; expected 'lockstep' or a number above 0"),
+        (("--no-record", "--bag", "b"), "not allowed with argument"),
+        (("--summary", "nowhere/s.json"), "--summary nowhere/s.json: expected a file in an existing folder"),
+        (("--sead", "1"), "unrecognized arguments: --sead"),
+    ],
+)
+def test_an_option_that_cannot_be_flown(ros: Ros, arguments: tuple[str, ...], told: str) -> None:
+    assert told in refused(ros, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("v_max_mps", "v_max", "users.v_max = 1.0; did you mean 'v_max_mps'?"),
+        ("step_s = 10.0", 'step_s = "10"', "mission.step_s = '10'; expected float, got str"),
+        ("max_steps = 30", "max_steps = -30", "mission.max_steps = -30; expected int >= 1"),
+    ],
+)
+def test_a_scenario_file_with_a_slip(
+    ros: Ros, small_scenario: Path, small_policy: Path, old: str, new: str, told: str
+) -> None:
+    small_scenario.write_text(small_scenario.read_text().replace(old, new))
+    line = refused(ros, "--scenario", small_scenario, "--policy", small_policy)
+    assert told in line
+    assert str(small_scenario) in line
+
+
+def test_a_user_s_scenario_without_a_policy_asks_for_one(ros: Ros, small_scenario: Path) -> None:
+    assert "policy 'small_dueling': no such name or folder" in refused(ros, "--scenario", small_scenario)
+
+
+def test_a_truncated_model(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
+    model = small_policy / "model.safetensors"
+    model.write_bytes(model.read_bytes()[:-100])
+    line = refused(ros, "--scenario", small_scenario, "--policy", small_policy)
+    assert str(model) in line
+    assert "damaged" in line
+
+
+def test_an_existing_bag_folder(ros: Ros) -> None:
+    bag = ros.folder / "bag"
+    bag.mkdir()
+    assert f"--bag {bag}: it exists already" in refused(ros, "--bag", bag)
+
+
+def test_a_machine_without_ros(ros: Ros) -> None:
+    """None in sys.modules is how Python itself marks a module as not there."""
+    blocked = ros.folder / "blocked"
+    blocked.mkdir()
+    (blocked / "sitecustomize.py").write_text("import sys\nsys.modules['rclpy'] = None\n")
+    ros.environment["PYTHONPATH"] = f"{blocked}:{ros.environment['PYTHONPATH']}"
+    for module in ("run_all", "nodes.world"):
+        status, output = ros.run(f"uav_dc_ros.{module}")
+        assert status == 2
+        assert output.startswith("ROS 2 is missing: no module rclpy."), output
+        assert "pip install 'uav_dc_ros[ros]'" in output
+        assert len(output.splitlines()) == 1
+
+
+def test_help_and_version_need_no_ros(ros: Ros) -> None:
+    status, output = ros.run_all("--help")
+    assert status == 0
+    for option in ("scenario", "policy", "seed", "missions", "pace", "bag", "no-record", "summary"):
+        assert f"--{option}" in output
+    assert ros.run_all("--version")[0] == 0
+
+
+def test_a_policy_folder_may_lie_anywhere(ros: Ros) -> None:
+    folder = ros.folder / "a b 'c'" / "my policy"
+    shutil.copytree(resources.folder("policies") / "five_clusters_dueling", folder)
+    status, output = ros.run_all("--policy", folder, "--pace", "lockstep", "--no-record")
+    assert status == 0, output
+    assert "landed" in output
+    assert "bag:" not in output
+
+
+def test_the_default_bag_is_dated_and_never_overwritten(
+    ros: Ros, small_scenario: Path, small_policy: Path
+) -> None:
+    options = ("--scenario", small_scenario, "--policy", small_policy, "--pace", "lockstep")
+    assert ros.run_all(*options)[0] == 0
+    assert ros.run_all(*options)[0] == 0
+    bags = sorted((ros.folder / "bags").iterdir())
+    assert len(bags) == 2
+    assert all(bag.name.startswith("20") and (bag / "metadata.yaml").is_file() for bag in bags)

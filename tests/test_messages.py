@@ -1,0 +1,126 @@
+"""The JSON contract: what travels, what is refused, and that msgs_json/ tells the same."""
+
+import json
+
+import jsonschema
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uav_dc_ros import messages, resources, topics
+from uav_dc_ros.core.grid import ACTION_LABELS, ActionLabel
+from uav_dc_ros.errors import MessageError
+from uav_dc_ros.messages import PAYLOADS, Mission, Move, Phase, Rates, Ready, Users
+
+EXAMPLES = {
+    "users": Users(mission=0, step=3, stamp_ns=45 * 10**9, cluster=[0, 1], x_m=[1.5, -2.0], y_m=[0.1, 1e-9]),
+    "rates": Rates(
+        mission=0,
+        step=3,
+        sum_rate_bps=0.1 + 0.2,
+        sinr=[1 / 3, 0.0],
+        rate_bps=[5e-324, 1e6],
+        data_bits=[1.0, 2.0],
+        served=[True, False],
+        collected=[False, True],
+    ),
+    "mission": Mission(
+        mission=0,
+        step=3,
+        phase=Phase.READY,
+        cell=(1, 2, 0),
+        remaining_steps=57,
+        seed=2**63 - 1,
+        scenario="five_clusters",
+        fingerprint="0123456789ab",
+    ),
+    "move": Move(mission=0, step=3, action="upward"),
+    "ready": Ready(node="policy"),
+}
+
+
+@pytest.mark.parametrize("topic", PAYLOADS)
+def test_a_payload_arrives_as_it_was_sent(topic: str) -> None:
+    sent = EXAMPLES[topic]
+    assert messages.decode(messages.encode(sent), PAYLOADS[topic]) == sent
+
+
+@pytest.mark.parametrize("topic", PAYLOADS)
+def test_the_published_schema_is_the_code_s(topic: str) -> None:
+    path = resources.folder("msgs_json") / f"{topic}.schema.json"
+    assert path.read_text("utf-8") == messages.schema_text(PAYLOADS[topic]), (
+        "run `python -m uav_dc_ros.messages` and look at the difference: it changes the contract"
+    )
+
+
+def test_no_schema_is_left_over() -> None:
+    names = {path.name for path in resources.folder("msgs_json").iterdir()}
+    assert names == {f"{topic}.schema.json" for topic in PAYLOADS}
+
+
+@pytest.mark.parametrize("topic", PAYLOADS)
+def test_an_independent_validator_agrees(topic: str) -> None:
+    schema = json.loads((resources.folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    good = json.loads(messages.encode(EXAMPLES[topic]))
+    validator.validate(good)
+    for key in good:
+        less = {name: value for name, value in good.items() if name != key}
+        for bad in (less, good | {key: None}, good | {key: {}}, good | {"surplus": 1}):
+            assert not validator.is_valid(bad)
+            with pytest.raises(MessageError):
+                messages.decode(json.dumps(bad), PAYLOADS[topic])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "malformed"),
+        ("{", "malformed"),
+        ("\ud800", "malformed"),
+        ("[" * 100_000, "invalid"),
+        ("null", "invalid"),
+        ('{"mission":0,"step":0,"action":"up"}', "invalid"),
+        ('{"mission":0,"step":-1,"action":"hover"}', "invalid"),
+        ('{"mission":0,"step":1.5,"action":"hover"}', "invalid"),
+        ('{"mission":0,"step":"1","action":"hover"}', "invalid"),
+        ('{"mission":0,"step":NaN,"action":"hover"}', "malformed"),
+        ('{"mission":0,"step":1e400,"action":"hover"}', "invalid"),
+        (" " * (messages.MAX_BYTES + 1), "oversized"),
+    ],
+)
+def test_what_is_not_a_payload_is_refused_by_reason(text: str, reason: str) -> None:
+    with pytest.raises(MessageError) as refused:
+        messages.decode(text, Move)
+    assert refused.value.reason == reason
+
+
+@given(st.text() | st.recursive(st.none() | st.floats() | st.text(), lambda x: st.lists(x)).map(json.dumps))
+def test_junk_is_only_ever_a_message_error(text: str) -> None:
+    for kind in PAYLOADS.values():
+        with pytest.raises(MessageError):
+            messages.decode(text, kind)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_number_that_json_does_not_know_never_leaves(value: float) -> None:
+    bad = msgspec.structs.replace(EXAMPLES["users"], x_m=[value, 0.0])
+    with pytest.raises(MessageError):
+        messages.encode(bad)
+
+
+def test_columns_have_one_length() -> None:
+    text = messages.encode(EXAMPLES["users"]).replace("[1.5,-2.0]", "[1.5]")
+    with pytest.raises(MessageError, match="x_m 1, y_m 2"):
+        messages.decode(text, Users)
+
+
+def test_actions_are_those_of_the_grid() -> None:
+    assert ActionLabel.__args__ == ACTION_LABELS  # type: ignore[attr-defined]
+
+
+def test_every_json_topic_has_a_payload() -> None:
+    of_type = {topic.name for topic in topics.TOPICS.values() if topic.type == topics.JSON}
+    assert of_type == set(PAYLOADS)
