@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import CircleCollection, LineCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
@@ -15,7 +16,8 @@ from uav_dc_ros.core.scenario import Scenario
 
 INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
 WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
-PATH_COLOURS = "viridis"
+# From the start of a mission to its end.
+PATH_COLOURS = LinearSegmentedColormap.from_list("path", ["#2b3f7e", "#8c5aa6", "#f0a83a"])
 
 
 class Track:
@@ -85,7 +87,7 @@ def _draw_field(axes: Axes, track: Track) -> None:
     for done, colour, size in ((False, WAITING, 20), (True, COLLECTED, 26)):
         x_m, y_m = state.users_m[state.collected == done].T
         label = "collected" if done else "waiting"
-        axes.scatter(x_m, y_m, s=size, c=colour, edgecolors=PAPER, linewidths=0.6, zorder=3, label=label)
+        axes.scatter(x_m, y_m, s=size, c=colour, edgecolors=PAPER, linewidths=0.6, zorder=6.5, label=label)
 
     axes.plot(path_m[:, 0], path_m[:, 1], color=PAPER, lw=5, solid_capstyle="round", zorder=4)
     pieces = np.stack([path_m[:-1], path_m[1:]], axis=1)
