@@ -31,7 +31,6 @@ Name: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 class Phase(StrEnum):
     """Where a mission stands."""
 
-    IDLE = "idle"  # waiting for the other nodes
     READY = "ready"  # waiting for the move of this step
     LANDED = "landed"  # over, at the dock
     TIMEOUT = "timeout"  # over, out of steps somewhere else
@@ -40,7 +39,7 @@ class Phase(StrEnum):
     @property
     def is_over(self) -> bool:
         """Has this mission no further step."""
-        return self not in (Phase.IDLE, Phase.READY)
+        return self is not Phase.READY
 
 
 class Payload(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -97,8 +96,8 @@ class Mission(Stepped, frozen=True):
     phase: Annotated[
         Phase,
         Meta(
-            description="idle: waiting for the other nodes; ready: waiting for the move of this step; "
-            "landed, timeout, aborted: over"
+            description="ready: waiting for the move of this step; landed: over, at the dock; timeout: "
+            "over, out of steps elsewhere; aborted: stopped before its end"
         ),
     ]
     cell: Annotated[tuple[Index, Index, Index], Meta(description="the UAV's cell: indices east, north, up")]

@@ -105,6 +105,11 @@ def test_the_command_prints_and_writes_figures(tmp_path):
         (["--policy", "MADE", "--scenario", "five_clusters"], "expected 3"),
         (["--policy", "MADE", "--seeds", "0"], "'0'; expected a whole number of at least 1"),
         (["--policy", "MADE", "--seeds", "2", "--json", "/nowhere/x"], "/nowhere/x cannot be written"),
+        (
+            ["--policy", "MADE", "--seeds", "2", "--picture", "/nowhere/x.png"],
+            "/nowhere/x.png cannot be written",
+        ),
+        (["--policy", "MADE", "--seeds", "2", "--picture", "x.mission"], "x.mission cannot be written"),
         (["--policy", "MADE", "MADE", "--picture", "x.png"], "expected one policy"),
         (["--policy", "MADE", "--seed", "3"], "--seed 3"),
     ],

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,6 +44,59 @@ def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path
     probe.stdout.close()
 
 
+def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario: Path) -> None:
+    """A stranger plays the policy, and lets the vehicle wait: nothing is flown or booked twice."""
+    heard = [f"/{topic}" for topic in ("mission", "rates")]
+    stranger = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("probe.py")), *heard],
+        env=ros.environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert stranger.stdin is not None
+    assert stranger.stdout is not None
+
+    def say(topic: str, payload: dict[str, object], hearing: int = 1) -> None:
+        command = {"topic": f"/{topic}", "data": json.dumps(payload), "hearing": hearing}
+        stranger.stdin.write(json.dumps(command) + "\n")
+        stranger.stdin.flush()
+
+    def next_rates() -> dict[str, Any]:
+        line = wait_for(stranger.stdout, '"/rates"').splitlines()[-1]
+        return json.loads(json.loads(line)["data"])
+
+    given = [
+        "--ros-args",
+        "-p",
+        f"scenario:={small_scenario}",
+        "-p",
+        'peers:=["world", "channel_monitor", "policy"]',
+    ]
+    nodes = [ros.start(f"uav_dc_ros.nodes.{node}", *given) for node in ("world", "channel_monitor")]
+    say("move", {"mission": 9, "step": 9, "action": "hover"})  # makes the publisher that the world waits for
+    say("ready", {"node": "policy"})
+    assert next_rates()["step"] == 0
+    say("move", {"mission": 0, "step": 0, "action": "right"})
+    first = next_rates()
+    assert first["step"] == 1
+    assert sum(first["data_bits"]) > 0
+    assert next_rates() == first  # after the world's patience, without a new move
+    say("move", {"mission": 0, "step": 0, "action": "right"})  # late: it was flown already
+    say("move", {"mission": 0, "step": 1, "action": "forward"})
+    while (second := next_rates()) == first:
+        pass
+    assert second["step"] == 2
+    stranger.stdin.close()
+    for node in nodes:
+        node.terminate()
+    output = finish(nodes[0])[1]
+    finish(nodes[1])
+    stranger.wait(10)
+    stranger.stdout.close()
+    assert "move wrong_step 2" in output
+
+
 @pytest.mark.parametrize(
     ("node", "parameters", "told"),
     [
@@ -53,7 +107,7 @@ def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path
         ),
         ("world", {"seed": -1}, "seed: -1; expected a whole number of at least 0"),
         ("world", {"missions": 0}, "missions: 0; expected a whole number of at least 1"),
-        ("world", {"missions": "many"}, "missions: 'many'; expected a int"),
+        ("world", {"missions": "many"}, "missions: 'many'; expected a whole number"),
         ("world", {"pace": "slow"}, "pace: 'slow'; expected 'lockstep' or a number above 0"),
         ("world", {"pace": -3}, "pace: '-3'; expected 'lockstep' or a number above 0"),
         ("world", {"peers": ["pilot"]}, "peers: 'pilot'; expected some of world, channel_monitor"),

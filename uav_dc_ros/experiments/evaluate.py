@@ -13,6 +13,7 @@ from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.batch import observe
+from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.fly import Act, Missions, flight, fly
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
@@ -122,8 +123,18 @@ def rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
 
 
 def save_mission_picture(policy: Policy, scenario: Scenario, seed: int, path: Path) -> None:
-    """Flies the mission with this seed, and writes its picture."""
-    from uav_dc_ros.env.render import Track, save_picture  # matplotlib is slow to import and not always there
+    """Flies the mission with this seed, and writes its picture.
+
+    Raises:
+        PolicyError: the policy does not fit the scenario.
+        UavDcError: matplotlib is not installed, or the picture cannot be written.
+    """
+    try:
+        from uav_dc_ros.env.render import Track, save_picture  # slow to import, and not always there
+    except ModuleNotFoundError:
+        raise UavDcError(
+            'matplotlib is not installed; expected it from: pip install "uav_dc_ros[train]"'
+        ) from None
 
     def first(batch: Any) -> Any:
         return type(batch)(**{f.name: getattr(batch, f.name)[0] for f in fields(batch)})
@@ -134,4 +145,7 @@ def save_mission_picture(policy: Policy, scenario: Scenario, seed: int, path: Pa
         track.add(first(state), link)
         if outcome and (outcome.terminated | outcome.truncated)[0]:
             break
-    save_picture(track, path)
+    try:
+        save_picture(track, path)
+    except (OSError, ValueError) as error:
+        raise UavDcError(f"{path} cannot be written: {error}") from None

@@ -34,7 +34,7 @@ def main(argv: list[str] | None = None) -> None:
         help=f"shipped: {', '.join(scenarios.names())}; default: by the name of the policy's own",
     )
     parser.add_argument("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures, a list")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
     options = parser.parse_args(argv)
 

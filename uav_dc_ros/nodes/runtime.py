@@ -38,6 +38,7 @@ NEWEST = 10  # messages kept by a subscription that acts on them
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.05
 MESSAGE_TYPES: dict[str, type] = {topics.JSON: String, topics.POSE: PoseStamped}
+EXPECTED: dict[type, str] = {int: "a whole number", str: "text", list: "a list of texts"}
 
 V = TypeVar("V")
 
@@ -162,7 +163,7 @@ class MissionNode(Node):
         elif isinstance(default, str) and isinstance(value, bool | int | float):
             value = str(value)  # `-p pace:=90` arrives as a number
         if type(value) is not type(default):
-            raise ParameterError(f"{name}: {value!r}; expected a {type(default).__name__}")
+            raise ParameterError(f"{name}: {value!r}; expected {EXPECTED[type(default)]}")
         return value
 
     def whole_number(self, name: str, default: int, least: int, description: str) -> int:

@@ -34,9 +34,9 @@ class World(runtime.MissionNode):
         )
         self._ready_peers: set[str] = set()
         self._peers_seen = False
-        self._mission = -1
-        self._phase = messages.Phase.IDLE
-        self._action = Action.HOVER
+        self._mission, self._step = -1, 0
+        self._phase: messages.Phase | None = None  # none before the first mission
+        self._seen_by_tick: tuple[int, int] | None = None
         self.listen()
 
     # Before the first mission.
@@ -94,9 +94,8 @@ class World(runtime.MissionNode):
             self._tell()
 
     def _stood_still(self) -> bool:
-        now = (self._mission, self._step)
-        before, self._seen_by_tick = getattr(self, "_seen_by_tick", None), now
-        return before == now
+        before, self._seen_by_tick = self._seen_by_tick, (self._mission, self._step)
+        return before == self._seen_by_tick
 
     def _fly(self) -> None:
         self._cell = self.scenario.grid.move(self._cell, np.asarray(int(self._action)))
@@ -107,7 +106,7 @@ class World(runtime.MissionNode):
         if terminated or truncated:
             self._phase = messages.Phase.LANDED if landed else messages.Phase.TIMEOUT
         self._tell()
-        if self._phase.is_over and self._mission + 1 < self.missions:
+        if self._phase is not messages.Phase.READY and self._mission + 1 < self.missions:
             self._begin(self._mission + 1)
 
     def on_stop(self) -> None:
@@ -133,6 +132,7 @@ class World(runtime.MissionNode):
         self.say("mission", self._status())
 
     def _status(self) -> messages.Mission:
+        assert self._phase is not None, "a mission has begun"
         east, north, up = (int(index) for index in self._cell)
         return messages.Mission(
             mission=self._mission,
