@@ -33,7 +33,9 @@ from uav_dc_ros.topics import TOPICS, Topic
 
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: the node ends when its standard input does
 PEERS_PERIOD_S = 0.02
-ACKNOWLEDGE_S = 1.0
+ACKNOWLEDGE_S = (
+    1.0  # messages arrive at once, but the middleware may ask for receipts every three seconds only
+)
 NEWEST = 10  # messages kept by a subscription that acts on them
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.05
@@ -185,10 +187,11 @@ class MissionNode(Node):
         """Act once more before the node ends: the topics still work."""
 
     def finish(self) -> None:
-        """Say the last word, and wait until everyone has heard it."""
+        """Say the last word, and give everyone the time to hear it."""
         self.on_stop()
+        deadline_s = time.monotonic() + ACKNOWLEDGE_S
         for publisher in self._publishers_of.values():
-            publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_S))
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline_s - time.monotonic())))
         if self.rejected:
             told = ", ".join(f"{topic} {reason} {n}" for (topic, reason), n in self.rejected.items())
             self.get_logger().warning(f"rejected messages: {told}")

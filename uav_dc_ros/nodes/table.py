@@ -14,8 +14,8 @@ class NodeRow:
         publishes, subscribes: names of topics.
         hears_all: does it keep every message until it gets to it, or the newest few?
         process: is it a process of its own, `python -m uav_dc_ros.nodes.NAME`?
-        stop_rank: run_all stops nodes of a lower rank first; the world says how the mission ended, the
-            recorder must still hear it.
+        stop_rank: run_all stops nodes of a lower rank first: the recorder must still hear the last word of
+            all others.
     """
 
     name: str
@@ -23,7 +23,7 @@ class NodeRow:
     subscribes: tuple[str, ...]
     hears_all: bool = False
     process: bool = True
-    stop_rank: int = 1
+    stop_rank: int = 0
 
 
 NODES: dict[str, NodeRow] = {
@@ -33,7 +33,6 @@ NODES: dict[str, NodeRow] = {
             name="world",
             publishes=("pose", "users", "mission", "target"),
             subscribes=("move", "ready"),
-            stop_rank=0,
         ),
         NodeRow(
             name="channel_monitor",
@@ -50,7 +49,7 @@ NODES: dict[str, NodeRow] = {
             publishes=("ready",),
             subscribes=tuple(topic.name for topic in TOPICS.values() if topic.recorded),
             hears_all=True,
-            stop_rank=2,
+            stop_rank=1,
         ),
         NodeRow(
             name="observer",
