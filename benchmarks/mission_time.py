@@ -51,7 +51,9 @@ def main() -> None:
     print(f"one five_clusters mission in lockstep, {runs} runs, {os.cpu_count()} cores; seconds")
     for part in flown[0]:
         values = [run[part] for run in flown]
-        print(f"{part:>10}  median {statistics.median(values):6.2f}  {min(values):6.2f} to {max(values):6.2f}")
+        print(
+            f"{part:>10}  median {statistics.median(values):6.2f}  {min(values):6.2f} to {max(values):6.2f}"
+        )
     ratio = statistics.median(run["total"] / run["bare node"] for run in flown)
     print(f"total / bare node: {ratio:.1f} (five processes on {os.cpu_count()} cores)")
 

@@ -6,8 +6,8 @@ Quality of service, with reasons:
 - `latched` (transient local) for what describes the state: whoever joins late learns it at once. A pose is
   not latched, since an autopilot's is not, and a subscriber may not ask for more than is offered; a move
   is not, since an old one is worth nothing.
-- Publishers keep 1000 messages for readers that fall behind. Who acts on messages keeps the newest few; who
-  must miss nothing (the recorder, while the disk is busy) keeps all: see `hears_all` in the node table.
+- Publishers keep 1000 messages for readers that fall behind. Who acts on messages keeps the newest hundred;
+  who must miss nothing (the recorder, while the disk is busy) keeps all: see `hears_all` in the node table.
 """
 
 from dataclasses import dataclass

@@ -33,12 +33,12 @@ from uav_dc_ros.topics import TOPICS, Topic
 
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: the node ends when its standard input does
 PEERS_PERIOD_S = 0.02
-ACKNOWLEDGE_S = (
-    1.0  # messages arrive at once, but the middleware may ask for receipts every three seconds only
-)
-NEWEST = 10  # messages kept by a subscription that acts on them
+# Messages arrive at once, but the middleware may ask for receipts every three seconds only.
+ACKNOWLEDGE_S = 1.0
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.05
+# Messages kept by a subscription that acts on them: a burst of rubbish must not push out a real one.
+NEWEST = 100
 MESSAGE_TYPES: dict[str, type] = {topics.JSON: String, topics.POSE: PoseStamped}
 EXPECTED: dict[type, str] = {int: "a whole number", str: "text", list: "a list of texts"}
 

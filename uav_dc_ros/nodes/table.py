@@ -12,7 +12,7 @@ class NodeRow:
     Attributes:
         name: its name in the ROS graph.
         publishes, subscribes: names of topics.
-        hears_all: does it keep every message until it gets to it, or the newest few?
+        hears_all: does it keep every message until it gets to it, or the newest hundred?
         process: is it a process of its own, `python -m uav_dc_ros.nodes.NAME`?
         stop_rank: run_all stops nodes of a lower rank first: the recorder must still hear the last word of
             all others.
