@@ -73,6 +73,28 @@ def test_nodes_end_with_a_launcher_that_is_killed(ros: Ros, arguments: list[obje
     assert len(read_bag(tmp_path / "bag")) > 20  # the recorder closed it on its own
 
 
+def test_a_second_mission_on_the_same_network_is_refused_or_unharmed(
+    ros: Ros, arguments: list[object], small_scenario: Path, small_policy: Path, tmp_path: Path
+) -> None:
+    """Discovery takes its time: a short mission may be over before the two know of each other."""
+    second = [*("--scenario", small_scenario, "--policy", small_policy), *("--seed", 99, "--no-record")]
+    alone, disturbed = tmp_path / "alone.json", tmp_path / "disturbed.json"
+    status, output = ros.run_all(*second, "--pace", "lockstep", "--summary", alone)
+    assert status == 0, output
+
+    process = ros.start("uav_dc_ros.run_all", *arguments)
+    assert process.stdout is not None
+    wait_for(process.stdout, FLYING)
+    status, output = ros.run_all(*second, "--pace", "lockstep", "--summary", disturbed)
+    process.send_signal(signal.SIGINT)
+    finish(process)
+    if status == 0:
+        assert json.loads(disturbed.read_text()) == json.loads(alone.read_text()), output
+    else:
+        assert status == 1, output
+        assert "another mission is being flown here" in output
+
+
 def test_ctrl_c_while_the_nodes_start(ros: Ros, arguments: list[object]) -> None:
     process = ros.start("uav_dc_ros.run_all", *arguments)
     ros.node("recorder")

@@ -17,7 +17,7 @@ from uav_dc_ros.agents.replay import Transitions
 
 
 def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float) -> Tensor:
-    """The target y (eq. 21): `r` when the episode terminated at s', else `r + gamma max_a' Q'(s', a')`.
+    """The target y (eq. 22): `r` when the episode terminated at s', else `r + gamma max_a' Q'(s', a')`.
 
     Args:
         reward: r, `[...]`.
@@ -55,7 +55,7 @@ class Learner:
 
     @torch.no_grad()
     def act(self, observation: Tensor, explore: Tensor, choice: Tensor) -> Tensor:
-        """Epsilon-greedy actions (eq. 19): greedy with probability epsilon, else any one.
+        """Epsilon-greedy actions (eq. 18): greedy with probability epsilon, else any one.
 
         Args:
             observation: `[N, D]`.

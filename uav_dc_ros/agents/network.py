@@ -25,7 +25,7 @@ class Architecture(msgspec.Struct, frozen=True, kw_only=True):
         n_inputs: length D of the observation.
         hidden: units of each hidden layer.
         n_actions: number of actions A.
-        dueling: what is subtracted from the advantage: its `mean` (eq. 29) or its `max` (eq. 28); None
+        dueling: what is subtracted from the advantage: its `mean` (eq. 30) or its `max` (eq. 29); None
             for the plain network of the paper's first algorithm.
     """
 

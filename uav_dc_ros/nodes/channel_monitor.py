@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseStamped
 from uav_dc_ros import messages
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes import convert, runtime
 
 POSES_KEPT = 256
@@ -51,13 +52,21 @@ class ChannelMonitor(runtime.MissionNode):
         self._pair()
 
     def _pair(self) -> None:
-        """Measure every step whose pose, the first one not older than the users, has come."""
+        """Measure every step whose pose has come: the first one not older than the users."""
         while self._users:
             users = self._users[0]
-            uav_m = next((m for time_ns, m in self._poses if time_ns >= users.stamp_ns), None)
-            if uav_m is None:
+            found = next((pose for pose in self._poses if pose[0] >= users.stamp_ns), None)
+            if found is None:
                 return
             self._users.popleft()
+            time_ns, uav_m = found
+            late_s = (time_ns - users.stamp_ns) * 1e-9
+            if late_s >= self.scenario.mission.step_s:
+                raise MessageError(
+                    "no_pose",
+                    f"step {users.step} of mission {users.mission}: the next pose is {late_s:g} s younger; "
+                    f"expected one within the step's {self.scenario.mission.step_s:g} s",
+                )
             self._measure(users, uav_m)
 
     def _measure(self, users: messages.Users, uav_m: Array) -> None:
@@ -66,6 +75,12 @@ class ChannelMonitor(runtime.MissionNode):
             self.say("rates", said)  # a repeated step is measured, and booked, once
             return
         if said is None or said.mission != users.mission:
+            if users.step > 0:
+                raise MessageError(
+                    "joined_late",
+                    f"step {users.step} of mission {users.mission}, whose start was not heard: what has been "
+                    "collected before is not known; expected a mission from its step 0",
+                )
             self._forget()
         link = core.measure(self.scenario, uav_m, convert.users_m(users, self.scenario), self._collected)
         if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in

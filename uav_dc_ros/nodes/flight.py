@@ -51,12 +51,16 @@ class Flight:
             signal.signal(number, self._interrupt)
         status = 0
         parameters = self._parameters()
-        with Launcher(parameters, self.display.node_line) as launcher, self.display:
+        with Launcher(self.display.node_line) as launcher, self.display:
             rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-            node = observer.Observer(self.scenario, list(parameters), self._on_step, self._on_end)
+            node = observer.Observer(
+                self.scenario, self.options.seed, list(parameters), self._on_step, self._on_end
+            )
             executor = SingleThreadedExecutor()
             executor.add_node(node)
             try:
+                for name, values in parameters.items():
+                    launcher.start(name, values)
                 self._follow(launcher, node, executor)
             except NodeError as error:
                 self.display.error(str(error))

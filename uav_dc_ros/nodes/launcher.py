@@ -86,25 +86,19 @@ class Launcher:
     """The nodes of a mission; a context manager that leaves no process behind.
 
     Args:
-        parameters: ROS parameters of each node that is to be started, by node name.
         on_line: called, from threads, with each line that a node prints.
     """
 
-    def __init__(
-        self, parameters: Mapping[str, Mapping[str, object]], on_line: Callable[[str, str], None]
-    ) -> None:
-        self._parameters = parameters
+    def __init__(self, on_line: Callable[[str, str], None]) -> None:
         self._on_line = on_line
         self.nodes: list[NodeProcess] = []
 
+    def start(self, name: str, parameters: Mapping[str, object]) -> None:
+        """Start a node of the node table with its ROS parameters."""
+        self.nodes.append(NodeProcess(name, parameters, self._on_line))
+
     def __enter__(self) -> Self:
-        """Start all nodes."""
-        try:
-            for name, parameters in self._parameters.items():
-                self.nodes.append(NodeProcess(name, parameters, self._on_line))
-        except BaseException:
-            self.stop()
-            raise
+        """Use the launcher in a `with` statement."""
         return self
 
     def __exit__(

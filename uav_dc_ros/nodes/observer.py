@@ -11,6 +11,7 @@ from uav_dc_ros.core import mission as core_mission
 from uav_dc_ros.core import reward as core_reward
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes import convert, runtime
 
 
@@ -65,6 +66,7 @@ class Observer(runtime.MissionNode):
 
     Args:
         scenario: the world that is flown.
+        seed: seed of the first mission.
         peers: nodes of the mission.
         on_step: called after each step.
         on_end: called when a mission has come to its end, with how.
@@ -73,6 +75,7 @@ class Observer(runtime.MissionNode):
     def __init__(
         self,
         scenario: Scenario,
+        seed: int,
         peers: list[str],
         on_step: Callable[[MissionSoFar], None],
         on_end: Callable[[MissionSoFar, messages.Phase], None],
@@ -80,6 +83,7 @@ class Observer(runtime.MissionNode):
         self._given_peers = peers
         super().__init__("observer")
         self.scenario = scenario
+        self.seed = seed
         self.mission: MissionSoFar | None = None
         self._on_step, self._on_end = on_step, on_end
         self._steps: runtime.StepJoin[messages.Stepped] = runtime.StepJoin("mission", "rates")
@@ -89,8 +93,14 @@ class Observer(runtime.MissionNode):
         return [peer for peer in self._given_peers if peer != "observer"]
 
     def on_mission(self, payload: messages.Mission) -> None:
-        """Follow the vehicle."""
+        """Follow the vehicle.
+
+        Raises:
+            NodeError: it flies for somebody else.
+        """
         convert.check_world(payload, self.scenario)
+        if payload.seed != self.seed + payload.mission:
+            raise NodeError(runtime.ANOTHER_MISSION)
         self._join("mission", payload)
 
     def on_rates(self, payload: messages.Rates) -> None:

@@ -40,6 +40,10 @@ DRAIN_QUIET_S = 0.05
 # Messages kept by a subscription that acts on them: a burst of rubbish must not push out a real one.
 NEWEST = 100
 MESSAGE_TYPES: dict[str, type] = {topics.JSON: String, topics.POSE: PoseStamped}
+ANOTHER_MISSION = (
+    "another mission is being flown here: somebody else publishes `mission`. Give this one a network of its "
+    "own (export ROS_DOMAIN_ID=1, or any number up to 101), or a namespace"
+)
 EXPECTED: dict[type, str] = {int: "a whole number", str: "text", list: "a list of texts"}
 
 V = TypeVar("V")

@@ -14,7 +14,7 @@ from uav_dc_ros import messages
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.errors import MessageError, ParameterError
+from uav_dc_ros.errors import MessageError, NodeError, ParameterError
 from uav_dc_ros.nodes import convert, runtime
 
 LOCKSTEP = "lockstep"
@@ -53,6 +53,8 @@ class World(runtime.MissionNode):
 
     def _start_if_all_ready(self) -> None:
         if self._mission < 0 and self._peers_seen and self._ready_peers.issuperset(self._peers):
+            if self.count_publishers("mission") > 1:
+                raise NodeError(runtime.ANOTHER_MISSION)
             self._begin(0)
             period_s = STALL_S
             if self.pace is not None:
