@@ -63,9 +63,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = parser().parse_args(arguments)
-    # Before ROS is imported: nobody else on the network should see these nodes unless the user says so.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "{severity}: {message}")  # of all nodes
+    _prepare_ros()  # before it is imported
     from uav_dc_ros.nodes.flight import Flight
 
     try:
@@ -74,6 +72,18 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return flight.run()
+
+
+def _prepare_ros() -> None:
+    """What holds for this command and its nodes, unless the user's environment says otherwise."""
+    # Nobody else on the network should see these nodes by accident.
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "{severity}: {message}")
+    # Jazzy's Fast DDS reads the first name, later ones the second.
+    names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+    if not any(name in os.environ for name in names):
+        profiles = str(Path(__file__).parent / "nodes" / "fastdds.xml")
+        os.environ.update(dict.fromkeys(names, profiles))
 
 
 def _whole(least: int) -> Callable[[str], int]:

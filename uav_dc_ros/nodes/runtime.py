@@ -34,7 +34,7 @@ from uav_dc_ros.topics import TOPICS, Topic
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: the node ends when its standard input does
 PEERS_PERIOD_S = 0.02
 # Messages arrive at once, but the middleware may ask for receipts every three seconds only.
-ACKNOWLEDGE_S = 1.0
+ACKNOWLEDGE_S = 0.5
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.05
 # Messages kept by a subscription that acts on them: a burst of rubbish must not push out a real one.
