@@ -147,6 +147,16 @@ print(json.dumps({
         assert (policy / "README.md").is_file(), policy.name
 
 
+def test_the_installed_package_flies_from_an_empty_folder(installed, ros):
+    ros.environment |= {"PYTHONPATH": str(installed), "PYTHONSAFEPATH": "1"}
+    status, output = ros.run_all("--scenario", "three_clusters", "--pace", "lockstep")
+    assert status == 0, output
+    assert "landed" in output
+    assert "error" not in output.lower(), output
+    (bag,) = (ros.folder / "bags").iterdir()
+    assert (bag / "metadata.yaml").is_file()
+
+
 def test_the_core_imports_nothing_heavy():
     program = """
 import json, sys
