@@ -6,6 +6,13 @@ _PACKAGE = Path(__file__).parent
 
 
 def folder(name: str) -> Path:
-    """The folder `policies` or `msgs_json`."""
-    installed = _PACKAGE / name
-    return installed if installed.is_dir() else _PACKAGE.parent / name
+    """The folder `policies` or `msgs_json`.
+
+    Raises:
+        FileNotFoundError: an installation without it.
+    """
+    places = (_PACKAGE / name, _PACKAGE.parent / name)
+    for place in places:
+        if place.is_dir():
+            return place
+    raise FileNotFoundError(f"no folder {name}: expected it at {' or '.join(map(str, places))}")

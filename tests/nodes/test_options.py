@@ -37,7 +37,11 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--pace", "nan"), "argument --pace: 'nan'; expected 'lockstep' or a number above 0"),
         (("--pace", "fast"), "argument --pace: 'fast'; expected 'lockstep' or a number above 0"),
         (("--no-record", "--bag", "b"), "not allowed with argument"),
-        (("--summary", "nowhere/s.json"), "--summary nowhere/s.json: expected a file in an existing folder"),
+        (
+            ("--summary", "nowhere/s.json"),
+            "--summary nowhere/s.json: expected a file in an existing folder that",
+        ),
+        (("--summary", "."), "--summary .: expected a file in an existing folder that can be written"),
         (("--sead", "1"), "unrecognized arguments: --sead"),
     ],
 )

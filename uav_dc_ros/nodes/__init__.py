@@ -2,6 +2,7 @@
 
 table            NODES: what each node is, what it hears and says: the only list
 runtime          what all nodes share: parameters, topics from the tables, peers, the way to the end
+pairs            what belongs to one step, brought together
 convert          messages to and from the core's arrays
 world            the vehicle in simulation, and the users who walk about
 channel_monitor  SINR, rates, and the data collected

@@ -1,5 +1,6 @@
 """What run_all shows: a live line on a terminal, plain lines elsewhere, and the summary."""
 
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -76,7 +77,10 @@ class Display:
             )
         self.console.print(table)
         if summaries and summaries[0].bag is not None:
-            self.console.print(f"bag: {summaries[0].bag}", markup=False)
+            bag, here = Path(summaries[0].bag), Path.cwd()
+            self.console.print(
+                f"bag: {bag.relative_to(here) if bag.is_relative_to(here) else bag}", markup=False
+            )
 
     def __enter__(self) -> Self:
         """Start the live display."""

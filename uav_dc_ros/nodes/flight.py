@@ -1,6 +1,7 @@
 """One run of run_all: check everything, start the nodes, follow the missions, stop, tell."""
 
 import argparse
+import os
 import signal
 import time
 from datetime import datetime
@@ -38,8 +39,8 @@ class Flight:
         self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
         self.policy.check(self.scenario)
         self.bag = None if options.no_record else _new_bag(options.bag)
-        if options.summary is not None and not options.summary.absolute().parent.is_dir():
-            raise ParameterError(f"--summary {options.summary}: expected a file in an existing folder")
+        if options.summary is not None:
+            _check_writable(options.summary)
         self.display = Display(self.scenario, options.missions)
         self.summaries: list[observer.Summary] = []
         self._interrupted = False
@@ -70,8 +71,10 @@ class Flight:
             if failed and not status:
                 self.display.error(f"while stopping: {', '.join(failed)}")
                 status = 1
-            if len(self.summaries) < self.options.missions:
-                self._on_end(node.mission or observer.MissionSoFar(seed=self.options.seed), Phase.ABORTED)
+            if (flown := len(self.summaries)) < self.options.missions:
+                not_begun = observer.MissionSoFar(mission=flown, seed=self.options.seed + flown)
+                now = node.mission or not_begun
+                self._on_end(now if now.mission == flown else not_begun, Phase.ABORTED)
             node.destroy_node()
             rclpy.try_shutdown()
         self._tell()
@@ -137,6 +140,14 @@ class Flight:
             told = self.summaries[0] if self.options.missions == 1 else self.summaries
             text = msgspec.json.format(msgspec.json.encode(told), indent=2)
             self.options.summary.write_bytes(text + b"\n")
+
+
+def _check_writable(summary: Path) -> None:
+    folder = summary.absolute().parent
+    if summary.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise ParameterError(
+            f"--summary {summary}: expected a file in an existing folder that can be written"
+        )
 
 
 def _new_bag(wanted: Path | None) -> Path:

@@ -13,6 +13,7 @@ from uav_dc_ros.core import world as core
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes.pairs import StepPairs
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -86,7 +87,7 @@ class Observer(runtime.MissionNode):
         self.seed = seed
         self.mission: MissionSoFar | None = None
         self._on_step, self._on_end = on_step, on_end
-        self._steps: runtime.StepJoin[messages.Stepped] = runtime.StepJoin("mission", "rates")
+        self._steps = StepPairs()
         self.listen()
 
     def _peers_parameter(self) -> list[str]:
@@ -101,21 +102,17 @@ class Observer(runtime.MissionNode):
         convert.check_world(payload, self.scenario)
         if payload.seed != self.seed + payload.mission:
             raise NodeError(runtime.ANOTHER_MISSION)
-        self._join("mission", payload)
+        self._hear(payload)
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Follow the collection."""
         convert.collection(payload, self.scenario)
-        self._join("rates", payload)
+        self._hear(payload)
 
-    def _join(self, part: str, payload: messages.Stepped) -> None:
-        whole = self._steps.add(part, payload.mission, payload.step, payload)
-        if whole is None:
-            return
-        mission, rates = whole["mission"], whole["rates"]
-        assert isinstance(mission, messages.Mission)
-        assert isinstance(rates, messages.Rates)
-        self._follow(mission, rates)
+    def _hear(self, payload: messages.Mission | messages.Rates) -> None:
+        pair = self._steps.add(payload)
+        if pair is not None:
+            self._follow(*pair)
 
     def _follow(self, mission: messages.Mission, rates: messages.Rates) -> None:
         now = self.mission

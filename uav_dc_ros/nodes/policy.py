@@ -10,6 +10,7 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes.pairs import StepPairs
 
 
 class Policy(runtime.MissionNode):
@@ -25,27 +26,25 @@ class Policy(runtime.MissionNode):
         self.policy.check(self.scenario)
         nothing = np.zeros(self.scenario.n_users)
         self._decide(self.scenario.start_cell, 0, nothing, nothing > 0)  # the first time takes longest
-        self._steps: runtime.StepJoin[messages.Stepped] = runtime.StepJoin("mission", "rates")
+        self._steps = StepPairs()
         self.listen()
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Note a step that the vehicle is ready for."""
         convert.check_world(payload, self.scenario)
         if payload.phase is messages.Phase.READY:
-            self._join("mission", payload)
+            self._hear(payload)
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Note what has been collected by a step."""
         convert.collection(payload, self.scenario)  # refuse another scenario's rates before they wait
-        self._join("rates", payload)
+        self._hear(payload)
 
-    def _join(self, part: str, payload: messages.Stepped) -> None:
-        whole = self._steps.add(part, payload.mission, payload.step, payload)
-        if whole is None:
+    def _hear(self, payload: messages.Mission | messages.Rates) -> None:
+        pair = self._steps.add(payload)
+        if pair is None:
             return
-        mission, rates = whole["mission"], whole["rates"]
-        assert isinstance(mission, messages.Mission)
-        assert isinstance(rates, messages.Rates)
+        mission, rates = pair
         data_bits, collected = convert.collection(rates, self.scenario)
         steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
         action = self._decide(mission.cell, steps_flown, data_bits, collected)

@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
@@ -201,25 +201,6 @@ class MissionNode(Node):
             self.get_logger().warning(f"rejected messages: {told}")
 
 
-class StepJoin(Generic[V]):
-    """Brings together what belongs to one step of one mission, from topics that arrive in any order."""
-
-    def __init__(self, *parts: str) -> None:
-        self._parts = frozenset(parts)
-        self._waiting: dict[tuple[int, int], dict[str, V]] = {}
-
-    def add(self, part: str, mission: int, step: int, value: V) -> dict[str, V] | None:
-        """Add a part; the whole, once all parts of its step are there."""
-        key = (mission, step)
-        whole = self._waiting.setdefault(key, {})
-        whole[part] = value
-        if whole.keys() != self._parts:
-            return None
-        for old in [waiting for waiting in self._waiting if waiting <= key]:
-            del self._waiting[old]
-        return whole
-
-
 class Stopper:
     """Turns SIGINT, SIGTERM and, under run_all, the end of standard input into a wish to stop.
 
@@ -274,12 +255,14 @@ def main(make: Callable[[], MissionNode]) -> NoReturn:
     try:
         node = make()
         executor.add_node(node)
-        _spin(executor, lambda: stopper.requested)
-        if node.drains:
-            deadline_s = time.monotonic() + DRAIN_S
-            _spin(executor, lambda: time.monotonic() > deadline_s, DRAIN_QUIET_S)
-        node.finish()
-        node.destroy_node()
+        try:
+            _spin(executor, lambda: stopper.requested)
+            if node.drains:
+                deadline_s = time.monotonic() + DRAIN_S
+                _spin(executor, lambda: time.monotonic() > deadline_s, DRAIN_QUIET_S)
+        finally:
+            node.finish()  # also when it failed: a recorder still closes its bag
+            node.destroy_node()
     except UavDcError as error:
         print(f"error: {error}", file=sys.stderr)
         status = 2
