@@ -43,6 +43,13 @@ def test_reference_cases(case, shape, array):
             assert result.dtype == uav_m.dtype
 
 
+@pytest.mark.parametrize("whole", [np.asarray, torch.tensor], ids=["numpy", "torch"])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case["name"])
+def test_whole_metres_lose_no_digits(case, whole):
+    distance_m = radio.distance(whole(case["uav_m"]), whole(case["users_m"]))
+    np.testing.assert_allclose(distance_m, case["distance_m"], **EXACT)
+
+
 def test_positions_of_the_uav_broadcast_over_one_set_of_users(array):
     rng = np.random.default_rng(1)
     users_m = rng.uniform(0.0, 1000.0, (7, 2))

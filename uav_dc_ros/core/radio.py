@@ -16,13 +16,13 @@ def distance(uav_m: Array, users_m: Array) -> Array:
 
     Args:
         uav_m: UAV position x, y, altitude, metres, `[..., 3]`.
-        users_m: user positions x, y, metres, `[..., U, 2]`.
+        users_m: user positions x, y, metres, `[..., U, 2]`. Whole metres in integers become float64.
 
     Returns:
         Distance, metres, `[..., U]`.
     """
     xp = array_namespace(uav_m, users_m)
-    uav_m = uav_m[..., None, :]
+    uav_m, users_m = _floating(uav_m)[..., None, :], _floating(users_m)
     dx = uav_m[..., 0] - users_m[..., 0]
     dy = uav_m[..., 1] - users_m[..., 1]
     return xp.sqrt(dx * dx + dy * dy + uav_m[..., 2] * uav_m[..., 2])
@@ -93,6 +93,12 @@ def rate_bps(sinr: Array, bandwidth_hz: float) -> Array:
     """
     # log1p keeps the digits that 1 + sinr would drop for a user far below the noise.
     return (bandwidth_hz / math.log(2.0)) * array_namespace(sinr).log1p(sinr)
+
+
+def _floating(values: Array) -> Array:
+    """Integers as float64: torch would take their square root in float32."""
+    xp = array_namespace(values)
+    return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.float64)
 
 
 def _sum_of_others(received_w: Array) -> Array:
