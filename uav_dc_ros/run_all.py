@@ -5,20 +5,19 @@ python -m uav_dc_ros.run_all --scenario five_clusters --seed 3
 
 import argparse
 import os
-import sys
-from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
-from uav_dc_ros import __version__
-from uav_dc_ros.errors import UavDcError
+from uav_dc_ros import __version__, cli
 
+PROG = "python -m uav_dc_ros.run_all"
 WATCHABLE_PACE = 90.0  # a mission of sixty steps of 15 s in ten seconds
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> cli.Parser:
     """The command line."""
-    options = argparse.ArgumentParser(
-        prog="python -m uav_dc_ros.run_all",
+    options = cli.Parser(
+        prog=PROG,
         description="Fly recorded missions with a trained policy: world, channel monitor, policy and "
         "recorder as separate ROS 2 nodes.",
     )
@@ -34,11 +33,15 @@ def parser() -> argparse.ArgumentParser:
         help="shipped policy, or its folder (default: the scenario's name with '_dueling')",
     )
     options.add_argument(
-        "--seed", type=_whole(0), default=0, metavar="N", help="seed of the users (default: %(default)s)"
+        "--seed",
+        type=cli.whole_number(0),
+        default=0,
+        metavar="N",
+        help="seed of the users (default: %(default)s)",
     )
     options.add_argument(
         "--missions",
-        type=_whole(1),
+        type=cli.count,
         default=1,
         metavar="N",
         help="missions, with seeds N, N+1, ... (default: %(default)s)",
@@ -60,18 +63,17 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; returns its exit status."""
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command, and exit."""
     options = parser().parse_args(arguments)
     _prepare_ros()  # before it is imported
-    from uav_dc_ros.nodes.flight import Flight
 
-    try:
-        flight = Flight(options)
-    except UavDcError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return flight.run()
+    def command() -> int:
+        from uav_dc_ros.nodes.flight import Flight
+
+        return Flight(options).run()
+
+    cli.run(command, PROG)
 
 
 def _prepare_ros() -> None:
@@ -84,19 +86,6 @@ def _prepare_ros() -> None:
     if not any(name in os.environ for name in names):
         profiles = str(Path(__file__).parent / "nodes" / "fastdds.xml")
         os.environ.update(dict.fromkeys(names, profiles))
-
-
-def _whole(least: int) -> Callable[[str], int]:
-    def whole(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
-        if not least <= value < 2**62:
-            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number of at least {least}")
-        return value
-
-    return whole
 
 
 def _pace(text: str) -> str | float:
@@ -112,4 +101,4 @@ def _pace(text: str) -> str | float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -16,9 +16,9 @@ def refused(ros: Ros, *arguments: object) -> str:
     assert status == 2, output
     assert "Traceback" not in output
     assert sorted(path for path in ros.folder.rglob("*") if path.name != "log") == before
-    lines = [line for line in output.splitlines() if "error: " in line]
-    assert len(lines) == 1, output
-    return lines[0]
+    assert output.startswith("python -m uav_dc_ros.run_all: ")
+    assert len(output.splitlines()) == 1, output
+    return output
 
 
 @pytest.mark.parametrize(

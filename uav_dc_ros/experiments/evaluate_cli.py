@@ -7,10 +7,9 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from uav_dc_ros import scenarios
+from uav_dc_ros import cli, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments import cli
 from uav_dc_ros.experiments.evaluate import Evaluation, evaluate, rows, save_mission_picture
 
 PROG = "python -m uav_dc_ros.evaluate"

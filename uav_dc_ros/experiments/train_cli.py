@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any, get_args
 import msgspec
 from rich.console import Console
 
-from uav_dc_ros import __version__, scenarios
+from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import network, policy
 from uav_dc_ros.agents.policy import Algorithm, Hyperparameters, PolicyConfig
 from uav_dc_ros.core.reward import RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments import cli
 from uav_dc_ros.experiments.card import card, checkpoint_card
 from uav_dc_ros.experiments.progress import Display
 

@@ -12,7 +12,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from uav_dc_ros import scenarios
+from uav_dc_ros import cli, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
 from uav_dc_ros.messages import Phase
@@ -23,7 +23,6 @@ from uav_dc_ros.nodes.table import NODES
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 CHECK_PERIOD_S = 0.05
-INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 
 
 class Flight:
@@ -78,7 +77,7 @@ class Flight:
             node.destroy_node()
             rclpy.try_shutdown()
         self._tell()
-        return INTERRUPTED if self._interrupted else status
+        return cli.INTERRUPTED if self._interrupted else status
 
     def _follow(self, launcher: Launcher, node: observer.Observer, executor: SingleThreadedExecutor) -> None:
         """Spin until all missions are over, or Ctrl-C.

@@ -1,4 +1,4 @@
-"""What the command lines of the experiments share: mistakes become one line and exit status 2."""
+"""What the command lines share: mistakes become one line and exit status 2."""
 
 import argparse
 import sys
@@ -22,11 +22,22 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-def count(text: str) -> int:
-    """A whole number of at least 1."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number of at least 1")
-    return int(text)
+def whole_number(least: int) -> Callable[[str], int]:
+    """The type of an option that is a whole number of at least `least`."""
+
+    def whole(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value < 2**62:  # so that sums of it still fit into 64 bits
+            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number of at least {least}")
+        return value
+
+    return whole
+
+
+count = whole_number(1)
 
 
 def run(command: Callable[[], int], prog: str) -> NoReturn:
