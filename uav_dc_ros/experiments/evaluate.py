@@ -1,4 +1,4 @@
-"""Evaluation of trained policies over many missions. Needs numpy only, but for the picture."""
+"""Evaluation of policies over many missions. Needs numpy only, but for the picture."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -32,7 +32,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     """How a policy does in a scenario.
 
     Attributes:
-        policy, sha256: which policy, and the hash of its config and model.
+        policy, sha256: which policy, and the hash of its config and model; none for a planner.
         scenario, fingerprint: which world, and the hash of its values.
         version: of the package that flew.
         seeds: first seed and number of seeds.
@@ -47,7 +47,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     policy: str
-    sha256: str
+    sha256: str | None
     scenario: str
     fingerprint: str
     version: str
@@ -75,11 +75,16 @@ def steer(policy: Policy, scenario: Scenario) -> Act:
 
 def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Evaluation:
     """Flies one mission per seed, greedily; raises PolicyError when the policy does not fit."""
-    missions = fly(scenario, steer(policy, scenario), seeds)
+    return judge(policy.name, policy.sha256, steer(policy, scenario), scenario, seeds)
+
+
+def judge(name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Sequence[int]) -> Evaluation:
+    """Flies one mission per seed with whoever steers by `act`."""
+    missions = fly(scenario, act, seeds)
     figures = {f.name: _figure(getattr(missions, f.name)) for f in fields(Missions) if f.name != "landed"}
     return Evaluation(
-        policy=policy.name,
-        sha256=policy.sha256,
+        policy=name,
+        sha256=sha256,
         scenario=scenario.name,
         fingerprint=scenario.fingerprint,
         version=__version__,
@@ -122,11 +127,10 @@ def rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
     return table
 
 
-def save_mission_picture(policy: Policy, scenario: Scenario, seed: int, path: Path) -> None:
+def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) -> None:
     """Flies the mission with this seed, and writes its picture.
 
     Raises:
-        PolicyError: the policy does not fit the scenario.
         UavDcError: matplotlib is not installed, or the picture cannot be written.
     """
     try:
@@ -140,7 +144,7 @@ def save_mission_picture(policy: Policy, scenario: Scenario, seed: int, path: Pa
         return type(batch)(**{f.name: getattr(batch, f.name)[0] for f in fields(batch)})
 
     track = Track(scenario)
-    for state, outcome in flight(scenario, steer(policy, scenario), [seed]):
+    for state, outcome in flight(scenario, act, [seed]):
         link: world.Link | None = first(outcome.link) if outcome else None
         track.add(first(state), link)
         if outcome and (outcome.terminated | outcome.truncated)[0]:

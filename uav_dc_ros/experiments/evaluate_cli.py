@@ -10,22 +10,21 @@ from rich.table import Table
 from uav_dc_ros import cli, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments.evaluate import Evaluation, evaluate, rows, save_mission_picture
+from uav_dc_ros.experiments.evaluate import Evaluation, judge, rows, save_mission_picture, steer
+from uav_dc_ros.planners import PLANNERS
 
 PROG = "python -m uav_dc_ros.evaluate"
 
 
 def main(argv: list[str] | None = None) -> None:
     """Runs the command line, and exits."""
-    parser = cli.Parser(
-        prog=PROG, description="Fly trained policies over many missions and show how they do."
-    )
+    parser = cli.Parser(prog=PROG, description="Fly policies over many missions and show how they do.")
     parser.add_argument(
         "--policy",
         nargs="+",
         required=True,
         metavar="NAME|DIR",
-        help=f"shipped: {', '.join(policies.names())}",
+        help=f"shipped: {', '.join(policies.names())}; to compare with: {', '.join(PLANNERS)}",
     )
     parser.add_argument(
         "--scenario",
@@ -42,11 +41,20 @@ def main(argv: list[str] | None = None) -> None:
             raise UavDcError(f"--picture with {len(options.policy)} policies; expected one policy")
         results = []
         for name in options.policy:
-            policy = policies.load(name)
-            scenario = scenarios.load(options.scenario or policy.scenario.name)
-            results.append(evaluate(policy, scenario, range(options.seeds)))
+            if name in PLANNERS:
+                if not options.scenario:
+                    raise UavDcError(
+                        f"--policy {name}: a planner has no scenario of its own; expected --scenario"
+                    )
+                scenario, sha256 = scenarios.load(options.scenario), None
+                act = PLANNERS[name](scenario)
+            else:
+                policy = policies.load(name)
+                scenario, sha256 = scenarios.load(options.scenario or policy.scenario.name), policy.sha256
+                act, name = steer(policy, scenario), policy.name
+            results.append(judge(name, sha256, act, scenario, range(options.seeds)))
             if options.picture:
-                save_mission_picture(policy, scenario, 0, options.picture)
+                save_mission_picture(act, scenario, 0, options.picture)
         for result in results:
             show(result)
         if options.json:
