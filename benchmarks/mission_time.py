@@ -15,6 +15,9 @@ from pathlib import Path
 
 from rosbags.highlevel import AnyReader
 
+from uav_dc_ros import scenarios
+
+STEPS = scenarios.load("five_clusters").mission.max_steps
 BARE = "import rclpy, numpy; rclpy.init(); rclpy.create_node('bare').destroy_node(); rclpy.shutdown()"
 ENVIRONMENT = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
@@ -54,6 +57,8 @@ def main() -> None:
         print(
             f"{part:>10}  median {statistics.median(values):6.2f}  {min(values):6.2f} to {max(values):6.2f}"
         )
+    rates = [STEPS / run["flight"] for run in flown]
+    print(f"steps per second in flight: median {statistics.median(rates):.0f}")
     ratio = statistics.median(run["total"] / run["bare node"] for run in flown)
     print(f"total / bare node: {ratio:.1f} (five processes on {os.cpu_count()} cores)")
 

@@ -1,8 +1,10 @@
 """What the command lines share: mistakes become one line and exit status 2."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn
 
 from uav_dc_ros.errors import UavDcError
@@ -31,7 +33,9 @@ def whole_number(least: int) -> Callable[[str], int]:
         except ValueError:
             value = least - 1
         if not least <= value < 2**62:  # so that sums of it still fit into 64 bits
-            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number of at least {least}")
+            raise argparse.ArgumentTypeError(
+                f"{text!r}; expected a whole number of at least {least}, and below 2^62"
+            )
         return value
 
     return whole
@@ -50,3 +54,13 @@ def run(command: Callable[[], int], prog: str) -> NoReturn:
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Writes a file in one move, so that it is there in full or not at all."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    except OSError as error:
+        raise UavDcError(f"{path} cannot be written: {error.strerror}") from None

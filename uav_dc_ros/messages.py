@@ -54,7 +54,7 @@ class Stepped(Payload, frozen=True):
 
 
 class Users(Stepped, frozen=True):
-    """Positions of the users on the ground, frame `map` (ENU). Columns have one entry per user."""
+    """Positions of the users, frame `map` (ENU). Columns are of one length, an entry per user."""
 
     stamp_ns: Annotated[
         StampNs,
@@ -70,7 +70,7 @@ class Users(Stepped, frozen=True):
 
 
 class Rates(Stepped, frozen=True):
-    """The channel during a step, and the data up to its end. Columns have one entry per user."""
+    """The channel during a step, and the data up to its end. Columns are of one length, an entry per user."""
 
     sum_rate_bps: Annotated[NotNegative, Meta(description="sum of the rates of the served users, bit/s")]
     sinr: Annotated[list[NotNegative], Meta(description="signal over interference and noise, linear")]

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from uav_dc_ros import __version__, cli
+from uav_dc_ros.errors import ParameterError
 
 PROG = "python -m uav_dc_ros.run_all"
+DOMAIN_MAX = 232  # the ports of higher ones do not exist
 WATCHABLE_PACE = 90.0  # a mission of sixty steps of 15 s in ten seconds
 
 
@@ -66,9 +68,9 @@ def parser() -> cli.Parser:
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command, and exit."""
     options = parser().parse_args(arguments)
-    _prepare_ros()  # before it is imported
 
     def command() -> int:
+        _prepare_ros()  # before it is imported
         from uav_dc_ros.nodes.flight import Flight
 
         return Flight(options).run()
@@ -77,7 +79,14 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _prepare_ros() -> None:
-    """What holds for this command and its nodes, unless the user's environment says otherwise."""
+    """What holds for this command and its nodes, unless the user's environment says otherwise.
+
+    Raises:
+        ParameterError: an environment in which ROS cannot start.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    if not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
+        raise ParameterError(f"ROS_DOMAIN_ID is {domain!r}; expected a whole number from 0 to {DOMAIN_MAX}")
     # Nobody else on the network should see these nodes by accident.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "{severity}: {message}")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import time
 from pathlib import Path
@@ -105,13 +106,38 @@ def test_ctrl_c_while_the_nodes_start(ros: Ros, arguments: list[object]) -> None
     assert "Traceback" not in output
 
 
-def test_a_node_that_cannot_start_is_told_with_its_reason(
+def test_a_full_disk_ends_the_mission_with_its_reason(ros: Ros, arguments: list[object]) -> None:
+    """A limit on the size of files stands in for the disk; the kernel's signal is ignored, as Python does."""
+    process = ros.start(
+        "uav_dc_ros.run_all",
+        *arguments,
+        *("--missions", 200, "--pace", "lockstep"),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000)),
+    )
+    status, output = finish(process)
+    assert status == 1, output
+    assert "error: node recorder ended with 1: error: bag" in output
+    assert "cannot be written any further: File too large" in output
+    assert "Traceback" not in output
+
+
+def test_a_closed_pipe_ends_no_mission(ros: Ros, arguments: list[object], tmp_path: Path) -> None:
+    process = ros.start("uav_dc_ros.run_all", *arguments, *("--pace", 100, "--missions", 2))
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(60) == 0
+    summaries = json.loads((tmp_path / "summary.json").read_text())
+    assert [summary["steps"] for summary in summaries] == [30, 30]
+
+
+def test_a_summary_names_no_bag_that_was_never_made(
     ros: Ros, arguments: list[object], tmp_path: Path
 ) -> None:
-    """Only the recorder can see that its folder cannot be made: the rest was checked before."""
-    (tmp_path / "file").write_text("")
-    at = arguments.index("--bag")
-    status, output = ros.run_all(*arguments[:at], "--bag", tmp_path / "file" / "bag", *arguments[at + 2 :])
-    assert status == 1, output
-    assert "error: node recorder ended with 2: error: bag folder" in output
-    assert "Traceback" not in output
+    process = ros.start("uav_dc_ros.run_all", *arguments)
+    ros.node("world")
+    process.send_signal(signal.SIGINT)
+    status, output = finish(process)
+    assert status == 130, output
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["bag"] is not None) == (tmp_path / "bag").is_dir()

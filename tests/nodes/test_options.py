@@ -34,6 +34,13 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--seed", "x"), "argument --seed: 'x'; expected a whole number"),
         (("--missions", "0"), "argument --missions: '0'; expected a whole number of at least 1"),
         (("--pace", "0"), "argument --pace: '0'; expected 'lockstep' or a number above 0"),
+        (("--pace", "1e6"), "pace: 1e+06; expected at most 3000, which makes steps of 5 ms, or 'lockstep'"),
+        (
+            ("--missions", "3000000"),
+            "missions: 3000000 of 60 steps of 15 s are 2.745e+09 s; expected less than",
+        ),
+        (("--bag", "/dev/null/bag"), "--bag /dev/null/bag: /dev/null is not a folder that can be written"),
+        (("--bag", "x", "--summary", "x"), "--summary x: expected a file"),
         (("--pace", "nan"), "argument --pace: 'nan'; expected 'lockstep' or a number above 0"),
         (("--pace", "fast"), "argument --pace: 'fast'; expected 'lockstep' or a number above 0"),
         (("--no-record", "--bag", "b"), "not allowed with argument"),
@@ -96,6 +103,20 @@ def test_a_machine_without_ros(ros: Ros) -> None:
         assert output.startswith("ROS 2 is missing: no module rclpy."), output
         assert "pip install 'uav_dc_ros[ros]'" in output
         assert len(output.splitlines()) == 1
+
+
+def test_a_domain_that_does_not_exist(ros: Ros) -> None:
+    for domain in ("abc", "300"):
+        ros.environment["ROS_DOMAIN_ID"] = domain
+        assert f"ROS_DOMAIN_ID is '{domain}'; expected a whole number from 0 to 232" in refused(ros)
+
+
+def test_a_policy_from_another_world_is_told(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
+    small_scenario.write_text(small_scenario.read_text().replace("v_max_mps = 1.0", "v_max_mps = 2.0"))
+    options = ("--scenario", small_scenario, "--policy", small_policy, "--pace", "lockstep", "--no-record")
+    status, output = ros.run_all(*options)
+    assert status == 0, output
+    assert "note: policy untrained learnt in another world" in output
 
 
 def test_help_and_version_need_no_ros(ros: Ros) -> None:

@@ -4,7 +4,9 @@ N independent runs learn side by side, with parameters `[N, ...]`; N = 1 is a si
 nothing but the arithmetic: the loss is summed over runs, and Adam works element by element.
 
 Departures from the text of the paper, which has slips here: the dueling target uses the target
-network's own streams (theta_A', theta_V') and has the terminal case of the first algorithm.
+network's own streams (theta_A', theta_V') and has the terminal case of the first algorithm. Departures of
+choice: theta' starts as a copy of theta, where the paper draws both at random, and learning begins with
+the first transition, where the prose waits for a full buffer.
 """
 
 import numpy as np

@@ -4,6 +4,7 @@ Messages are stored as they came, serialised; nothing is decoded. The MCAP file 
 by itself, so a folder whose metadata.yaml was never written loses nothing but convenience.
 """
 
+import contextlib
 import os
 import time
 from collections.abc import Iterable, Mapping
@@ -101,22 +102,47 @@ class BagWriter:
             data: the message, serialised (CDR).
             log_time_ns: when it was received, nanoseconds since the epoch.
             publish_time_ns: when it was published.
+
+        Raises:
+            BagError: the disk is full, or gone.
         """
         self._counts[topic] += 1
-        self._mcap.add_message(
-            self._channels[topic],
-            log_time_ns,
-            data,
-            publish_time_ns,
-            sequence=self._counts[topic],
-        )
+        try:
+            self._mcap.add_message(
+                self._channels[topic],
+                log_time_ns,
+                data,
+                publish_time_ns,
+                sequence=self._counts[topic],
+            )
+        except OSError as error:
+            raise self._failure(error) from None
         self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
         self._last_ns = max(self._last_ns, log_time_ns)
 
     def close(self) -> None:
-        """Finish the file and write metadata.yaml. Closing twice does nothing."""
+        """Finish the file and write metadata.yaml. Closing twice does nothing.
+
+        Raises:
+            BagError: the disk is full, or gone.
+        """
         if self._file.closed:
             return
+        try:
+            self._finish()
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def _failure(self, error: OSError) -> BagError:
+        """Give the file up as it is: what was written until now stays."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        return BagError(
+            f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no index, "
+            "and holds what was written until now"
+        )
+
+    def _finish(self) -> None:
         metadata = self._metadata()
         self._mcap.add_metadata("rosbag2", {"serialized_metadata": _yaml(metadata)})
         self._mcap.finish()  # type: ignore[no-untyped-call]

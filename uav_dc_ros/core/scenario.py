@@ -24,6 +24,8 @@ from uav_dc_ros.core.radio import Interference
 from uav_dc_ros.core.reward import RewardForm, RPlus
 from uav_dc_ros.errors import ScenarioError
 
+TIME_MAX_S = 2.0**31  # the seconds of a ROS time are 32 bits with a sign
+
 EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
@@ -284,6 +286,11 @@ def _check_together(scenario: Scenario, source: str) -> None:
         raise ScenarioError(
             f"{source}: mission.max_steps = {mission.max_steps}; expected at least {away}, "
             "the moves from start to dock"
+        )
+    if (mission.max_steps + 1) * mission.step_s >= TIME_MAX_S:
+        raise ScenarioError(
+            f"{source}: mission.step_s = {mission.step_s:g}; expected less than "
+            f"{TIME_MAX_S / (mission.max_steps + 1):g}, so that mission.max_steps of it fit into a ROS time"
         )
     if grid.altitude_min_m > mission.d_cons_m:
         raise ScenarioError(

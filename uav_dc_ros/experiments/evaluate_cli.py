@@ -1,6 +1,5 @@
 """The command line of `python -m uav_dc_ros.evaluate`."""
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -58,7 +57,7 @@ def main(argv: list[str] | None = None) -> None:
         for result in results:
             show(result)
         if options.json:
-            write(options.json, msgspec.json.format(msgspec.json.encode(results), indent=2) + b"\n")
+            cli.write_whole(options.json, msgspec.json.format(msgspec.json.encode(results), indent=2) + b"\n")
         return 0
 
     cli.run(command, PROG)
@@ -78,13 +77,3 @@ def show(result: Evaluation) -> None:
     for row in rows(result):
         table.add_row(*row)
     Console().print(table)
-
-
-def write(path: Path, content: bytes) -> None:
-    """Writes a file in one move, so that it is there in full or not at all."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    except OSError as error:
-        raise UavDcError(f"{path} cannot be written: {error.strerror}") from None

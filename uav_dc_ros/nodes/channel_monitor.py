@@ -82,6 +82,15 @@ class ChannelMonitor(runtime.MissionNode):
                     "collected before is not known; expected a mission from its step 0",
                 )
             self._forget()
+        elif users.step != said.step + 1:
+            self.reject(
+                "users",
+                MessageError(
+                    "gap",
+                    f"step {users.step} of mission {users.mission} after step {said.step}; expected "
+                    f"{said.step + 1}: nothing is booked for what was not heard",
+                ),
+            )
         link = core.measure(self.scenario, uav_m, convert.users_m(users, self.scenario), self._collected)
         if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in
             self._data_bits, self._collected = core.collect(

@@ -1,10 +1,12 @@
 """What run_all shows: a live line on a terminal, plain lines elsewhere, and the summary."""
 
+import os
+import sys
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -12,6 +14,15 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes.observer import MissionSoFar, Summary
 
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
+
+
+class _Console(Console):
+    """A console that falls silent when nobody reads it any more (`| head`): the mission flies on."""
+
+    def on_broken_pipe(self) -> None:
+        """Say nothing from now on."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Display:
@@ -25,7 +36,7 @@ class Display:
     def __init__(self, scenario: Scenario, missions: int) -> None:
         self.scenario = scenario
         self.missions = missions
-        self.console = Console(highlight=False, soft_wrap=True)
+        self.console = _Console(highlight=False, soft_wrap=True)
         self.errors = Console(stderr=True, highlight=False, soft_wrap=True)
         self._every = max(1, scenario.mission.max_steps // PLAIN_LINES)
         self._bar = Progress(
@@ -47,13 +58,16 @@ class Display:
             f"{now.sum_rate_bps / 1e6:.2f} Mbit/s, {now.dock_distance_m:.0f} m to the dock"
         )
         self._bar.update(self._task, description=title, completed=now.step, told=told)
-        last = now.step == self.scenario.mission.max_steps
-        if self._bar.disable and (now.step % self._every == 0 or last):
+        if self._bar.disable and (now.step % self._every == 0 or now.over):
             self.console.print(f"{title}: step {now.step}/{self.scenario.mission.max_steps}: {told}")
 
     def node_line(self, node: str, line: str) -> None:
         """Pass on a line that a node printed."""
         self._bar.console.print(f"{node}: {line}", markup=False)
+
+    def note(self, text: str) -> None:
+        """Tell what the user should know."""
+        self.console.print(f"note: {text}", markup=False)
 
     def error(self, text: str) -> None:
         """Tell what went wrong."""
@@ -63,7 +77,8 @@ class Display:
         """Show the missions as a table, and where the bag is."""
         table = Table(box=None, pad_edge=False, header_style="bold")
         for name in ("seed", "outcome", "steps", "users", "data", "sum-rate", "flown", "reward"):
-            table.add_column(name, justify="left" if name == "outcome" else "right")
+            justify: JustifyMethod = "left" if name == "outcome" else "right"
+            table.add_column(name, justify=justify, no_wrap=True, overflow="fold")
         for mission in summaries:
             table.add_row(
                 str(mission.seed),

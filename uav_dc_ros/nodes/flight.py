@@ -20,6 +20,7 @@ from uav_dc_ros.nodes import observer
 from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.launcher import Launcher
 from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.world import check_pace, check_time
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 CHECK_PERIOD_S = 0.05
@@ -37,10 +38,18 @@ class Flight:
         self.scenario = scenarios.load(options.scenario)
         self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
         self.policy.check(self.scenario)
+        check_pace(self.scenario, None if options.pace == "lockstep" else options.pace)
+        check_time(self.scenario, options.missions)
         self.bag = None if options.no_record else _new_bag(options.bag)
         if options.summary is not None:
-            _check_writable(options.summary)
+            _check_writable(options.summary, self.bag)
         self.display = Display(self.scenario, options.missions)
+        if self.policy.scenario.fingerprint != self.scenario.fingerprint:
+            self.display.note(
+                f"policy {self.policy.name} learnt in another world ({self.policy.scenario.name} "
+                f"{self.policy.scenario.fingerprint}) than it flies in ({self.scenario.name} "
+                f"{self.scenario.fingerprint})"
+            )
         self.summaries: list[observer.Summary] = []
         self._interrupted = False
         self._step_s = 0.0  # when the last step came, monotonic clock
@@ -65,11 +74,7 @@ class Flight:
             except NodeError as error:
                 self.display.error(str(error))
                 status = 1
-            ended = launcher.stop().items()
-            failed = [f"{name} ended with {code}" for name, code in ended if code not in (0, -signal.SIGTERM)]
-            if failed and not status:
-                self.display.error(f"while stopping: {', '.join(failed)}")
-                status = 1
+            status = max(status, self._stopped(launcher.stop()))
             if (flown := len(self.summaries)) < self.options.missions:
                 not_begun = observer.MissionSoFar(mission=flown, seed=self.options.seed + flown)
                 now = node.mission or not_begun
@@ -78,6 +83,13 @@ class Flight:
             rclpy.try_shutdown()
         self._tell()
         return cli.INTERRUPTED if self._interrupted else status
+
+    def _stopped(self, statuses: dict[str, int]) -> int:
+        """Tell which nodes did not end as they should; 1 if that spoilt anything: the recorder's bag."""
+        odd = {name: code for name, code in statuses.items() if code not in (0, -signal.SIGTERM)}
+        for name, code in odd.items():
+            self.display.error(f"node {name} ended with {code} when it was asked to stop")
+        return int("recorder" in odd)
 
     def _follow(self, launcher: Launcher, node: observer.Observer, executor: SingleThreadedExecutor) -> None:
         """Spin until all missions are over, or Ctrl-C.
@@ -133,17 +145,20 @@ class Flight:
         self.summaries.append(observer.summary(mission, outcome, self.scenario, self.policy.name, bag))
 
     def _tell(self) -> None:
-        """Print the summary, and write it where it was asked for."""
-        self.display.summary(self.summaries)
+        """Write the summary where it was asked for, and print it."""
+        if self.bag is not None and not self.bag.is_dir():  # the recorder never came so far
+            self.summaries = [msgspec.structs.replace(mission, bag=None) for mission in self.summaries]
         if self.options.summary is not None:
             told = self.summaries[0] if self.options.missions == 1 else self.summaries
             text = msgspec.json.format(msgspec.json.encode(told), indent=2)
-            self.options.summary.write_bytes(text + b"\n")
+            cli.write_whole(self.options.summary, text + b"\n")
+        self.display.summary(self.summaries)
 
 
-def _check_writable(summary: Path) -> None:
+def _check_writable(summary: Path, bag: Path | None) -> None:
     folder = summary.absolute().parent
-    if summary.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+    taken = summary.is_dir() or summary.absolute() == bag
+    if taken or not folder.is_dir() or not os.access(folder, os.W_OK):
         raise ParameterError(
             f"--summary {summary}: expected a file in an existing folder that can be written"
         )
@@ -153,7 +168,7 @@ def _new_bag(wanted: Path | None) -> Path:
     """Folder of the new bag: the one wanted, or a dated one.
 
     Raises:
-        BagError: it exists.
+        BagError: it exists, or cannot be made.
     """
     if wanted is None:
         dated = Path("bags") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
@@ -165,4 +180,8 @@ def _new_bag(wanted: Path | None) -> Path:
         raise BagError(
             f"--bag {wanted}: it exists already, and no bag is ever overwritten; expected a new folder"
         )
-    return wanted.absolute()
+    wanted = wanted.absolute()
+    above = next(parent for parent in wanted.parents if parent.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise BagError(f"--bag {wanted}: {above} is not a folder that can be written; expected one")
+    return wanted

@@ -8,8 +8,8 @@ import numpy as np
 
 from uav_dc_ros import messages
 from uav_dc_ros.core import mission as core_mission
-from uav_dc_ros.core import reward as core_reward
 from uav_dc_ros.core import world as core
+from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes import convert, runtime
@@ -28,7 +28,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         data_bits: data collected from all users, bit.
         sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
         distance_m: length of the path flown, metres.
-        reward: sum of the rewards of all steps.
+        reward: r^t at the end (eq. 7), as `evaluate` and the policies' cards have it.
         bag: folder of the bag, or null.
     """
 
@@ -59,6 +59,7 @@ class MissionSoFar:
     dock_distance_m: float = 0.0
     distance_m: float = 0.0
     reward: float = 0.0
+    over: bool = False
     sum_of_sum_rates_bps: float = 0.0
 
 
@@ -85,6 +86,7 @@ class Observer(runtime.MissionNode):
         super().__init__("observer")
         self.scenario = scenario
         self.seed = seed
+        self._position_m: Array = None  # before the first step
         self.mission: MissionSoFar | None = None
         self._on_step, self._on_end = on_step, on_end
         self._steps = StepPairs()
@@ -97,7 +99,7 @@ class Observer(runtime.MissionNode):
         """Follow the vehicle.
 
         Raises:
-            NodeError: it flies for somebody else.
+            NodeError: it flies for somebody else, or a step was not heard.
         """
         convert.check_world(payload, self.scenario)
         if payload.seed != self.seed + payload.mission:
@@ -119,18 +121,23 @@ class Observer(runtime.MissionNode):
         data_bits, collected = convert.collection(rates, self.scenario)
         cell = np.asarray(mission.cell)
         position_m = self.scenario.grid.centre_m(cell, like=data_bits)
-        total = float(core.total_reward(self.scenario, cell, data_bits))
-        if now is None or now.mission != mission.mission:
-            now = MissionSoFar(mission=mission.mission, seed=mission.seed)
-            self._total, self._position_m = 0.0, position_m
-        elif mission.step <= now.step:
+        if now is not None and (mission.mission, mission.step) <= (now.mission, now.step):
             return  # a repeated step
+        if now is None or now.over:
+            expected = (0 if now is None else now.mission + 1, 0)
+            now = MissionSoFar(mission=mission.mission, seed=mission.seed)
         else:
+            expected = (now.mission, now.step + 1)
             now.sum_of_sum_rates_bps += rates.sum_rate_bps
-            now.reward += float(core_reward.earned(total, self._total, self.scenario.reward.form))
             now.distance_m += float(np.linalg.norm(position_m - self._position_m))
-            self._total, self._position_m = total, position_m
-        self.mission = now
+        if (mission.mission, mission.step) != expected:
+            raise NodeError(
+                f"heard of step {mission.step} of mission {mission.mission}; expected step {expected[1]} of "
+                f"mission {expected[0]}: the nodes cannot keep up; fly at a slower pace, or in lockstep"
+            )
+        self.mission, self._position_m = now, position_m
+        now.reward = float(core.total_reward(self.scenario, cell, data_bits)) if mission.step else 0.0
+        now.over = mission.phase.is_over
         now.step = mission.step
         now.users_collected = int(collected.sum())
         now.data_bits = float(data_bits.sum())

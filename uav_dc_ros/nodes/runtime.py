@@ -37,6 +37,7 @@ PEERS_PERIOD_S = 0.02
 ACKNOWLEDGE_S = 0.5
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.05
+LEAVE_S = 1.0
 # Messages kept by a subscription that acts on them: a burst of rubbish must not push out a real one.
 NEWEST = 100
 MESSAGE_TYPES: dict[str, type] = {topics.JSON: String, topics.POSE: PoseStamped}
@@ -251,9 +252,10 @@ def main(make: Callable[[], MissionNode]) -> NoReturn:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     executor = SingleThreadedExecutor()
     stopper = Stopper(executor.wake)
-    status = 0
+    status, failed = 0, 2  # 2: it never began
     try:
         node = make()
+        failed = 1
         executor.add_node(node)
         try:
             _spin(executor, lambda: stopper.requested)
@@ -262,9 +264,12 @@ def main(make: Callable[[], MissionNode]) -> NoReturn:
                 _spin(executor, lambda: time.monotonic() > deadline_s, DRAIN_QUIET_S)
         finally:
             node.finish()  # also when it failed: a recorder still closes its bag
-            node.destroy_node()
     except UavDcError as error:
         print(f"error: {error}", file=sys.stderr)
-        status = 2
+        status = failed
+    # All is said and written. The middleware has been seen to hang while several of its participants leave
+    # at once; that must not turn a good ending into a killed process.
+    sys.stderr.flush()
+    threading.Timer(LEAVE_S, os._exit, (status,)).start()
     rclpy.try_shutdown()
-    sys.exit(status)
+    os._exit(status)

@@ -14,10 +14,12 @@ from uav_dc_ros import messages
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.scenario import TIME_MAX_S, Scenario
 from uav_dc_ros.errors import MessageError, NodeError, ParameterError
 from uav_dc_ros.nodes import convert, runtime
 
 LOCKSTEP = "lockstep"
+PERIOD_MIN_S = 0.005  # of a step at a pace: five nodes answer each other in about three milliseconds
 STALL_S = 2.0  # a lockstep that stands still for so long repeats its last messages
 
 
@@ -32,10 +34,14 @@ class World(runtime.MissionNode):
         self.pace = _pace(
             self.parameter("pace", LOCKSTEP, "'lockstep', or how many times faster than real time")
         )
+        check_pace(self.scenario, self.pace)
+        check_time(self.scenario, self.missions)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
         self._mission, self._step = -1, 0
         self._phase: messages.Phase | None = None  # none before the first mission
+        self._action: Action | None = None  # that has come for this step
+        self._hovered = 0  # steps without a move in time
         self._seen_by_tick: tuple[int, int] | None = None
         self.listen()
 
@@ -69,7 +75,7 @@ class World(runtime.MissionNode):
         self._users_m = core.place_users(self.scenario, self._draw())
         self._cell = np.asarray(self.scenario.start_cell)
         self._phase = messages.Phase.READY
-        self._action = Action.HOVER
+        self._action = None
         self._tell()
 
     def _draw(self) -> Array:
@@ -100,10 +106,13 @@ class World(runtime.MissionNode):
         return before == self._seen_by_tick
 
     def _fly(self) -> None:
-        self._cell = self.scenario.grid.move(self._cell, np.asarray(int(self._action)))
+        if self._action is None:
+            self._hovered += 1
+        action = Action.HOVER if self._action is None else self._action
+        self._cell = self.scenario.grid.move(self._cell, np.asarray(int(action)))
         self._users_m = core.walk_users(self.scenario, self._users_m, self._draw())
         self._step += 1
-        self._action = Action.HOVER
+        self._action = None
         terminated, truncated, landed = core.ends(self.scenario, np.asarray(self._step), self._cell)
         if terminated or truncated:
             self._phase = messages.Phase.LANDED if landed else messages.Phase.TIMEOUT
@@ -112,7 +121,9 @@ class World(runtime.MissionNode):
             self._begin(self._mission + 1)
 
     def on_stop(self) -> None:
-        """Say that a mission was stopped before its end."""
+        """Say that a mission was stopped before its end, and what happened for want of a move."""
+        if self._hovered:
+            self.get_logger().warning(f"{self._hovered} steps were hovered: no move came in time")
         if self._phase is messages.Phase.READY:
             self._phase = messages.Phase.ABORTED
             self.say("mission", self._status())
@@ -151,6 +162,34 @@ class World(runtime.MissionNode):
         """Mission time; missions follow each other one step apart."""
         steps = self._mission * (self.scenario.mission.max_steps + 1) + self._step
         return round(steps * self.scenario.mission.step_s * 1e9)
+
+
+def check_pace(scenario: Scenario, pace: float | None) -> None:
+    """Refuse a pace at which steps are shorter than the nodes need for one.
+
+    Raises:
+        ParameterError: it is too fast.
+    """
+    fastest = scenario.mission.step_s / PERIOD_MIN_S
+    if pace is not None and pace > fastest:
+        raise ParameterError(
+            f"pace: {pace:g}; expected at most {fastest:g}, which makes steps of {PERIOD_MIN_S * 1e3:g} ms, "
+            f"or '{LOCKSTEP}', which is as fast as the nodes can"
+        )
+
+
+def check_time(scenario: Scenario, missions: int) -> None:
+    """Refuse more mission time than a ROS time can hold.
+
+    Raises:
+        ParameterError: it is too much.
+    """
+    seconds = missions * (scenario.mission.max_steps + 1) * scenario.mission.step_s
+    if seconds >= TIME_MAX_S:
+        raise ParameterError(
+            f"missions: {missions} of {scenario.mission.max_steps} steps of {scenario.mission.step_s:g} s "
+            f"are {seconds:g} s; expected less than the {TIME_MAX_S:g} s that a ROS time holds"
+        )
 
 
 def _pace(text: str) -> float | None:
