@@ -138,6 +138,11 @@ def total_reward(scenario: Scenario, cell: Array, data_bits: Array) -> Array:
     )
 
 
+def dock_distance_m(scenario: Scenario, cell: Array, like: Array) -> Array:
+    """Horizontal distance from `cell` `[..., 3]` to the dock, metres, `[...]`, with the dtype of `like`."""
+    return mission.dock_distance_cells(cell, scenario.dock_cell, like) * scenario.grid.cell_m
+
+
 def ends(scenario: Scenario, step: Array, cell: Array) -> tuple[Array, Array, Array]:
     """Whether the mission has terminated, was truncated, and has landed, bool `[...]` each.
 

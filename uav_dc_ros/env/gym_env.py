@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core import mission, world
+from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.scenario import Scenario
@@ -139,7 +139,6 @@ def spaces_of(scenario: Scenario, observation: Observation) -> tuple[spaces.Box,
 
 def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None = None) -> dict[str, Any]:
     """What `reset` and `step` tell beside the observation, with the batch dimensions of `state`."""
-    distance = mission.dock_distance_cells(state.cell, scenario.dock_cell, like=state.data_bits)
     nothing, nobody = np.zeros_like(state.data_bits), np.zeros_like(state.collected)
     link = outcome.link if outcome else None
     return {
@@ -149,7 +148,7 @@ def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None =
         "data_bits": state.data_bits,
         "collected": state.collected,
         "landed": outcome.landed if outcome else nobody[..., 0],
-        "dock_distance_m": distance * scenario.grid.cell_m,
+        "dock_distance_m": world.dock_distance_m(scenario, state.cell, like=state.data_bits),
         "served": link.served if link else nobody,
         "sinr": link.sinr if link else nothing,
         "rate_bps": link.rate_bps if link else nothing,

@@ -7,7 +7,6 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import messages
-from uav_dc_ros.core import mission as core_mission
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
@@ -142,8 +141,7 @@ class Observer(runtime.MissionNode):
         now.users_collected = int(collected.sum())
         now.data_bits = float(data_bits.sum())
         now.sum_rate_bps = rates.sum_rate_bps
-        away = core_mission.dock_distance_cells(cell, self.scenario.dock_cell, like=data_bits)
-        now.dock_distance_m = float(away) * self.scenario.grid.cell_m
+        now.dock_distance_m = float(core.dock_distance_m(self.scenario, cell, like=data_bits))
         self._on_step(now)
         if mission.phase.is_over:
             self._on_end(now, mission.phase)
