@@ -19,7 +19,7 @@ from uav_dc_ros.errors import MessageError, NodeError, ParameterError
 from uav_dc_ros.nodes import convert, runtime
 
 LOCKSTEP = "lockstep"
-PERIOD_MIN_S = 0.005  # of a step at a pace: five nodes answer each other in about three milliseconds
+PERIOD_MIN_S = 0.005  # of a step at a pace: a step in lockstep takes about four
 STALL_S = 2.0  # a lockstep that stands still for so long repeats its last messages
 
 
