@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from uav_dc_ros import __version__, cli
+from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
 
 PROG = "python -m uav_dc_ros.run_all"
@@ -97,16 +98,11 @@ def _prepare_ros() -> None:
         os.environ.update(dict.fromkeys(names, profiles))
 
 
-def _pace(text: str) -> str | float:
-    if text == "lockstep":
-        return text
+def _pace(text: str) -> float | None:
     try:
-        factor = float(text)
-    except ValueError:
-        factor = 0.0
-    if not 0.0 < factor <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected 'lockstep' or a number above 0, at most 1e6")
-    return factor
+        return pace.parse(text)
+    except ParameterError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 if __name__ == "__main__":

@@ -2,13 +2,10 @@
 
 from pathlib import Path
 
-import msgspec
-import numpy as np
 import pytest
 
+from tests.small_worlds import saved
 from uav_dc_ros import scenarios
-from uav_dc_ros.agents import network
-from uav_dc_ros.agents.policy import Hyperparameters, PolicyConfig, save
 
 SMALL = """
 name = "small"
@@ -59,18 +56,4 @@ def small_scenario(tmp_path: Path) -> Path:
 @pytest.fixture
 def small_policy(tmp_path: Path, small_scenario: Path) -> Path:
     """An untrained policy for the small world."""
-    scenario = scenarios.load(small_scenario)
-    config = PolicyConfig(
-        name="untrained",
-        algorithm="dueling_dqn",
-        observation="mission",
-        hidden=(8, 8),
-        hyperparameters=Hyperparameters(),
-        seed=0,
-        episode=0,
-        version="0",
-        scenario=msgspec.to_builtins(scenario),
-    )
-    parameters = network.initial(config.architecture(scenario), np.random.default_rng(0))
-    save(tmp_path / "untrained", config, parameters, card=lambda policy: f"# {policy.name}\n")
-    return tmp_path / "untrained"
+    return saved(tmp_path / "untrained", scenarios.load(small_scenario), name="untrained")

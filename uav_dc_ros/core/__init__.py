@@ -10,5 +10,6 @@ a node and thousands of worlds on a GPU. Random draws are arguments.
     grid       cells, actions, moves
     mission    who is served, what is collected, has it landed
     reward     R_plus, the reward, its immediate and its episode form
+    pace       lockstep, or a multiple of real time
     world      State, initial(), step(): the composition of the above
 """

@@ -20,11 +20,10 @@ from msgspec import Meta
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Grid
+from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.radio import Interference
 from uav_dc_ros.core.reward import RewardForm, RPlus
 from uav_dc_ros.errors import ScenarioError
-
-TIME_MAX_S = 2.0**31  # the seconds of a ROS time are 32 bits with a sign
 
 EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
 

@@ -14,13 +14,13 @@ from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros import cli, scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import observer
 from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.launcher import Launcher
 from uav_dc_ros.nodes.table import NODES
-from uav_dc_ros.nodes.world import check_pace, check_time
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 CHECK_PERIOD_S = 0.05
@@ -38,8 +38,7 @@ class Flight:
         self.scenario = scenarios.load(options.scenario)
         self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
         self.policy.check(self.scenario)
-        check_pace(self.scenario, None if options.pace == "lockstep" else options.pace)
-        check_time(self.scenario, options.missions)
+        pace.check(self.scenario, options.pace, options.missions)
         self.bag = None if options.no_record else _new_bag(options.bag)
         if options.summary is not None:
             _check_writable(options.summary, self.bag)
@@ -97,9 +96,7 @@ class Flight:
         Raises:
             NodeError: a node ended, or no step came for too long.
         """
-        step_s = 0.0
-        if self.options.pace != "lockstep":
-            step_s = self.scenario.mission.step_s / self.options.pace
+        patience_s = SILENCE_S + pace.period_s(self.scenario, self.options.pace)
         self._step_s = time.monotonic()
         check_s = 0.0
         while len(self.summaries) < self.options.missions and not self._interrupted:
@@ -109,9 +106,9 @@ class Flight:
                 continue
             check_s = now_s + CHECK_PERIOD_S
             launcher.check()
-            if now_s - self._step_s > SILENCE_S + step_s:
+            if now_s - self._step_s > patience_s:
                 silent = "no step came" if node.mission else "the nodes did not find each other"
-                raise NodeError(f"{silent} within {SILENCE_S + step_s:.0f} s")
+                raise NodeError(f"{silent} within {patience_s:.0f} s")
 
     def _parameters(self) -> dict[str, dict[str, object]]:
         """ROS parameters of the nodes to start."""
@@ -123,7 +120,7 @@ class Flight:
         if scenario not in scenarios.names():
             scenario = str(Path(scenario).absolute())
         shared: dict[str, object] = {"scenario": scenario, "peers": [*names, "observer"]}
-        course = {"seed": options.seed, "missions": options.missions, "pace": str(options.pace)}
+        course = {"seed": options.seed, "missions": options.missions, "pace": pace.text(options.pace)}
         policy = {"policy": str(self.policy.folder.absolute())}
         own: dict[str, dict[str, object]] = {
             "world": {**course},

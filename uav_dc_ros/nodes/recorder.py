@@ -62,7 +62,7 @@ class Recorder(runtime.MissionNode):
             runtime.MESSAGE_TYPES[topic.type],
             topic.name,
             callback,
-            runtime.requested_qos(topic, all=True),
+            runtime.requested_qos(topic, all=self.row.hears_all),
             raw=True,
         )
 

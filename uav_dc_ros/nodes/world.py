@@ -11,15 +11,13 @@ give equal messages at any pace.
 import numpy as np
 
 from uav_dc_ros import messages
+from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.core.scenario import TIME_MAX_S, Scenario
 from uav_dc_ros.errors import MessageError, NodeError, ParameterError
 from uav_dc_ros.nodes import convert, runtime
 
-LOCKSTEP = "lockstep"
-PERIOD_MIN_S = 0.005  # of a step at a pace: a step in lockstep takes about four
 STALL_S = 2.0  # a lockstep that stands still for so long repeats its last messages
 
 
@@ -31,11 +29,12 @@ class World(runtime.MissionNode):
         self.scenario = self.scenario_parameter()
         self.seed = self.whole_number("seed", 0, 0, "seed of the first mission's users")
         self.missions = self.whole_number("missions", 1, 1, "missions to fly, one after the other")
-        self.pace = _pace(
-            self.parameter("pace", LOCKSTEP, "'lockstep', or how many times faster than real time")
-        )
-        check_pace(self.scenario, self.pace)
-        check_time(self.scenario, self.missions)
+        wanted = self.parameter("pace", pace.LOCKSTEP, "'lockstep', or how many times faster than real time")
+        try:
+            self.pace = pace.parse(wanted)
+        except ParameterError as error:
+            raise ParameterError(f"pace: {error}") from None
+        pace.check(self.scenario, self.pace, self.missions)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
         self._mission, self._step = -1, 0
@@ -62,9 +61,7 @@ class World(runtime.MissionNode):
             if self.count_publishers("mission") > 1:
                 raise NodeError(runtime.ANOTHER_MISSION)
             self._begin(0)
-            period_s = STALL_S
-            if self.pace is not None:
-                period_s = self.scenario.mission.step_s / self.pace
+            period_s = pace.period_s(self.scenario, self.pace) or STALL_S
             self._timer = self.create_timer(period_s, self._tick, clock=self.steady)
 
     # Missions.
@@ -162,47 +159,6 @@ class World(runtime.MissionNode):
         """Mission time; missions follow each other one step apart."""
         steps = self._mission * (self.scenario.mission.max_steps + 1) + self._step
         return round(steps * self.scenario.mission.step_s * 1e9)
-
-
-def check_pace(scenario: Scenario, pace: float | None) -> None:
-    """Refuse a pace at which steps are shorter than the nodes need for one.
-
-    Raises:
-        ParameterError: it is too fast.
-    """
-    fastest = scenario.mission.step_s / PERIOD_MIN_S
-    if pace is not None and pace > fastest:
-        raise ParameterError(
-            f"pace: {pace:g}; expected at most {fastest:g}, which makes steps of {PERIOD_MIN_S * 1e3:g} ms, "
-            f"or '{LOCKSTEP}', which is as fast as the nodes can"
-        )
-
-
-def check_time(scenario: Scenario, missions: int) -> None:
-    """Refuse more mission time than a ROS time can hold.
-
-    Raises:
-        ParameterError: it is too much.
-    """
-    seconds = missions * (scenario.mission.max_steps + 1) * scenario.mission.step_s
-    if seconds >= TIME_MAX_S:
-        raise ParameterError(
-            f"missions: {missions} of {scenario.mission.max_steps} steps of {scenario.mission.step_s:g} s "
-            f"are {seconds:g} s; expected less than the {TIME_MAX_S:g} s that a ROS time holds"
-        )
-
-
-def _pace(text: str) -> float | None:
-    """How many times faster than real time, or None for lockstep."""
-    if text == LOCKSTEP:
-        return None
-    try:
-        pace = float(text)
-    except ValueError:
-        pace = 0.0
-    if not 0.0 < pace <= 1e6:
-        raise ParameterError(f"pace: {text!r}; expected '{LOCKSTEP}' or a number above 0, at most 1e6")
-    return pace
 
 
 if __name__ == "__main__":
