@@ -1,14 +1,18 @@
 """The bag writer: whole rosbag2 folders that independent readers understand."""
 
+import contextlib
 from pathlib import Path
 
 import pytest
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from uav_dc_ros.bags.write import METADATA_NAME, BagWriter
+from uav_dc_ros.bags.write import CHUNK_BYTES, METADATA_NAME, BagWriter
 from uav_dc_ros.errors import BagError
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -95,6 +99,23 @@ def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(BagError, match="cannot be made"):
         BagWriter(tmp_path / "file" / "bag", {})
+
+
+def test_a_writer_that_is_killed_loses_its_last_chunk_at_most(tmp_path: Path) -> None:
+    """The file as it lies on the disk while the writer still holds it open."""
+    bag = BagWriter(tmp_path / "bag", {})
+    bag.add_topic("/a", STRING)
+    messages = [text(f"{i:04d}" + 1000 * "x") for i in range(1000)]  # chunks that compress to little
+    for i, message in enumerate(messages):
+        bag.write("/a", message, log_time_ns=i, publish_time_ns=i)
+    read = []
+    with (tmp_path / "bag" / "bag_0.mcap").open("rb") as file, contextlib.suppress(EndOfFile):
+        for record in StreamReader(file).records:
+            if isinstance(record, Message):
+                read.append(record.data)
+    bag.close()
+    assert read == messages[: len(read)]
+    assert sum(map(len, messages[len(read) :])) <= CHUNK_BYTES
 
 
 def test_what_was_written_before_a_failure_is_readable(tmp_path: Path) -> None:

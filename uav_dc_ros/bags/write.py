@@ -115,6 +115,7 @@ class BagWriter:
                 publish_time_ns,
                 sequence=self._counts[topic],
             )
+            self._file.flush()  # a chunk that is finished is out of this process, whatever happens to it
         except OSError as error:
             raise self._failure(error) from None
         self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
