@@ -1,0 +1,63 @@
+"""What a run of the learner is, and which runs can share one batch. Needs no torch."""
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from uav_dc_ros.agents import network
+from uav_dc_ros.agents.policy import Algorithm, Hyperparameters
+from uav_dc_ros.core.scenario import Reward, Scenario
+from uav_dc_ros.env.observations import Observation
+from uav_dc_ros.errors import TrainingError
+
+
+class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One run: everything in which it may differ from the others of its population.
+
+    Attributes:
+        seed: of the run's own generator, which every random number of the run comes from.
+        environment: the users stand at the start of every mission as they do in the mission with this
+            seed; None for a fresh layout in every mission.
+        algorithm: `dqn` or `dueling_dqn`.
+        aggregation: what the dueling network subtracts; without meaning for `dqn`.
+        reward: what it is paid.
+        hyperparameters: how it learns.
+    """
+
+    seed: Annotated[int, Meta(ge=0)]
+    environment: Annotated[int, Meta(ge=0)] | None = None
+    algorithm: Algorithm
+    aggregation: network.Aggregation = "mean"
+    reward: Reward
+    hyperparameters: Hyperparameters
+
+
+class Population(msgspec.Struct, frozen=True, kw_only=True):
+    """Runs that train side by side, in one batch: they share what gives the arrays their shapes.
+
+    Attributes:
+        scenario: the world of every run; its `reward` is not used.
+        observation: what the agents see.
+        hidden: units of each hidden layer.
+        runs: the N runs.
+    """
+
+    scenario: Scenario
+    observation: Observation
+    hidden: tuple[int, ...]
+    runs: tuple[Run, ...]
+
+    def __post_init__(self) -> None:
+        """Raises TrainingError for no runs, or runs that cannot share a batch."""
+        if not self.runs:
+            raise TrainingError("a population has 0 runs; expected at least 1")
+        for name in ("episodes", "buffer_size", "target_every"):
+            values = sorted({getattr(run.hyperparameters, name) for run in self.runs})
+            if len(values) > 1:
+                raise TrainingError(f"{name} of the runs of a population is {values}; expected one value for all")
+
+    @property
+    def n_episodes(self) -> int:
+        """Episodes of each run."""
+        return self.runs[0].hyperparameters.episodes
