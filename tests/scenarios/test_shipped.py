@@ -54,7 +54,7 @@ def test_the_papers_table_is_in_every_scenario(name):
 def test_the_two_settings_of_the_paper(name, clusters, users):
     scenario = scenarios.load(name)
     assert (scenario.n_clusters, scenario.n_users) == (clusters, users)
-    assert scenario.user_centres_m.shape == (users, 2)
+    assert np.shape(scenario.user_centres_m) == (users, 2)
     np.testing.assert_array_equal(np.bincount(scenario.user_cluster), [10] * clusters)
     centres = np.asarray(scenario.users.cluster_centres_m)
     np.testing.assert_array_equal(scenario.user_centres_m, centres[scenario.user_cluster])

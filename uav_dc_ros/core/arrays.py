@@ -1,5 +1,6 @@
 """The array type, and the one place that asks which library an array belongs to."""
 
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 from array_api_compat import array_namespace, device
@@ -10,6 +11,18 @@ Array: TypeAlias = Any
 __all__ = ["Array", "array_namespace", "constant"]
 
 
-def constant(values: Any, like: Array) -> Array:
-    """`values` as an array of the library and on the device of `like`."""
-    return array_namespace(like).asarray(values, device=device(like))
+def constant(values: tuple[Any, ...] | range, like: Array, dtype: Any = None) -> Array:
+    """Fixed `values` as an array of the library and on the device of `like`; not to be written to.
+
+    Args:
+        values: numbers, or tuples of them, of equal lengths.
+        like: an array whose library and device the result takes.
+        dtype: type of the result; that of `like` unless told.
+    """
+    return _constant(values, array_namespace(like), device(like), like.dtype if dtype is None else dtype)
+
+
+@lru_cache(maxsize=256)
+def _constant(values: tuple[Any, ...], xp: Any, device: Any, dtype: Any) -> Array:
+    # Kept, since a copy from the host at every step would make a GPU wait for it.
+    return xp.asarray(values, dtype=dtype, device=device)

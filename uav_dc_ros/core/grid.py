@@ -94,8 +94,8 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             x, y, altitude, metres, `[..., 3]`.
         """
         xp = array_namespace(cell)
-        spacing = xp.astype(constant((self.cell_m, self.cell_m, self.altitude_step_m), like), like.dtype)
-        origin = xp.astype(constant((0.0, 0.0, self.altitude_min_m), like), like.dtype)
+        spacing = constant((self.cell_m, self.cell_m, self.altitude_step_m), like)
+        origin = constant((0.0, 0.0, self.altitude_min_m), like)
         return origin + xp.astype(cell, like.dtype) * spacing
 
     def cell_at(self, position_m: tuple[float, float, float]) -> tuple[int, int, int] | None:

@@ -148,9 +148,9 @@ class Scenario(_Section, frozen=True, dict=True):
         return np.repeat(np.arange(self.n_clusters), self.users.users_per_cluster)
 
     @cached_property
-    def user_centres_m(self) -> Array:
+    def user_centres_m(self) -> tuple[tuple[float, float], ...]:
         """Centre of each user's cluster, metres, `[U, 2]`."""
-        return np.asarray(self.users.cluster_centres_m, dtype=np.float64)[self.user_cluster]
+        return tuple(self.users.cluster_centres_m[i] for i in self.user_cluster)
 
     @cached_property
     def start_cell(self) -> tuple[int, int, int]:

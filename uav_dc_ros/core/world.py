@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from uav_dc_ros.core import mission, mobility, radio, reward
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 
 
@@ -76,12 +77,12 @@ def initial(scenario: Scenario, draws: Array) -> State:
         draws: uniform in [0, 1), `[..., U, 2]`; their library, dtype and device carry over.
     """
     xp = array_namespace(draws)
-    cell = constant(scenario.start_cell, draws)
     nothing = xp.zeros_like(draws[..., 0])
     zero = xp.sum(nothing, axis=-1)
+    step = xp.astype(zero, xp.int64)
     return State(
-        step=xp.astype(zero, cell.dtype),
-        cell=xp.broadcast_to(cell, (*zero.shape, 3)),
+        step=step,
+        cell=step[..., None] + constant(scenario.start_cell, step),
         users_m=place_users(scenario, draws),
         data_bits=nothing,
         collected=nothing > 0.0,
@@ -91,8 +92,7 @@ def initial(scenario: Scenario, draws: Array) -> State:
 
 def place_users(scenario: Scenario, draws: Array) -> Array:
     """Users at their start, metres, `[..., U, 2]`; draws as in `initial`."""
-    xp = array_namespace(draws)
-    centres_m = xp.astype(constant(scenario.user_centres_m, draws), draws.dtype)
+    centres_m = constant(scenario.user_centres_m, draws)
     return mobility.scatter(centres_m, scenario.users.cluster_radius_m, draws)
 
 
@@ -129,9 +129,11 @@ def collect(scenario: Scenario, link: Link, data_bits: Array, collected: Array) 
     )
 
 
-def total_reward(scenario: Scenario, cell: Array, data_bits: Array) -> Array:
+def total_reward(
+    scenario: Scenario, cell: Array, data_bits: Array, rewards: Rewards | None = None
+) -> Array:
     """r^t (eq. 7) of a UAV in `cell` `[..., 3]` that holds `data_bits` `[..., U]`; shape `[...]`."""
-    values = scenario.reward
+    values = rewards or scenario.reward
     distance = mission.dock_distance_cells(cell, scenario.dock_cell, like=data_bits)
     return reward.total(
         data_bits, reward.r_plus(distance, values.r_plus), values.beta, values.zeta, values.data_scale_bits
@@ -156,7 +158,9 @@ def ends(scenario: Scenario, step: Array, cell: Array) -> tuple[Array, Array, Ar
     return out_of_steps, out_of_steps & ~out_of_steps, out_of_steps & docked
 
 
-def step(scenario: Scenario, state: State, action: Array, draws: Array) -> tuple[State, Outcome]:
+def step(
+    scenario: Scenario, state: State, action: Array, draws: Array, rewards: Rewards | None = None
+) -> tuple[State, Outcome]:
     """One step of the world.
 
     Args:
@@ -164,6 +168,7 @@ def step(scenario: Scenario, state: State, action: Array, draws: Array) -> tuple
         state: the world before the step.
         action: value of a `grid.Action`, integers `[...]`.
         draws: uniform in [0, 1), `[..., U, 2]`.
+        rewards: how each world is paid, `[...]`; as the scenario says unless told.
 
     Returns:
         The world after the step, and what the step brought.
@@ -173,7 +178,7 @@ def step(scenario: Scenario, state: State, action: Array, draws: Array) -> tuple
     uav_m = scenario.grid.centre_m(cell, like=users_m)
     link = measure(scenario, uav_m, users_m, state.collected)
     data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
-    total = total_reward(scenario, cell, data_bits)
+    total = total_reward(scenario, cell, data_bits, rewards)
     n_steps = state.step + 1
     terminated, truncated, landed = ends(scenario, n_steps, cell)
     after = State(
@@ -185,7 +190,7 @@ def step(scenario: Scenario, state: State, action: Array, draws: Array) -> tuple
         total_reward=total,
     )
     outcome = Outcome(
-        reward=reward.earned(total, state.total_reward, scenario.reward.form),
+        reward=reward.earned(total, state.total_reward, (rewards or scenario.reward).form),
         terminated=terminated,
         truncated=truncated,
         landed=landed,

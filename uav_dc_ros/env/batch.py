@@ -7,6 +7,7 @@ from dataclasses import fields
 
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array, array_namespace
+from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env import observations
 from uav_dc_ros.env.observations import Observation
@@ -32,14 +33,21 @@ class BatchWorld:
         state: all worlds between two steps, `[N, ...]`.
     """
 
-    def __init__(self, scenario: Scenario, draws: Array) -> None:
-        """Worlds before their first step; draws uniform in [0, 1), `[N, U, 2]`."""
+    def __init__(self, scenario: Scenario, draws: Array, rewards: Rewards | None = None) -> None:
+        """Worlds before their first step.
+
+        Args:
+            scenario: the values of every world.
+            draws: uniform in [0, 1), `[N, U, 2]`.
+            rewards: how each world is paid, `[N]`; all as the scenario says unless told.
+        """
         self.scenario = scenario
+        self._rewards = rewards
         self.state = world.initial(scenario, draws)
 
     def step(self, action: Array, draws: Array) -> world.Outcome:
         """One step of every world: integers `[N]`, and uniform draws `[N, U, 2]`."""
-        self.state, outcome = world.step(self.scenario, self.state, action, draws)
+        self.state, outcome = world.step(self.scenario, self.state, action, draws, self._rewards)
         return outcome
 
     def restart(self, where: Array, draws: Array) -> None:

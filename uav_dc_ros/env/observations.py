@@ -35,7 +35,7 @@ def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
     """Lowest and highest value of each entry of the encoding, float32 `[D]` each."""
     low, high = np.zeros(size(kind, scenario), np.float32), np.ones(size(kind, scenario), np.float32)
     if kind == "map":
-        goals = _goals_cells(scenario)
+        goals = np.asarray(_goals(scenario), np.float32)
         span = np.asarray(_spans(scenario)[:2], np.float32)
         start = size("mission", scenario)
         low[start:] = ((goals - span) / span).reshape(-1)
@@ -78,7 +78,7 @@ def encode(
             xp.astype(cell[..., i : i + 1] == constant(range(n), cell), xp.float32)
             for i, n in enumerate(scenario.grid.shape)
         ]
-        ways_cells = constant(_goals_cells(scenario), cell_f) - cell_f[..., None, :2]
+        ways_cells = constant(_goals(scenario), cell_f) - cell_f[..., None, :2]
         reach_cells = scenario.mission.d_cons_m / scenario.grid.cell_m
         ways_reach = ways_cells[..., :-1, :] / reach_cells
         closeness = xp.exp(-0.5 * xp.sum(ways_reach * ways_reach, axis=-1))
@@ -89,20 +89,21 @@ def encode(
     return xp.concat(parts, axis=-1)
 
 
-def _spans(scenario: Scenario) -> list[int]:
+def _spans(scenario: Scenario) -> tuple[int, ...]:
     """Highest index in each direction, at least 1."""
-    return [max(n - 1, 1) for n in scenario.grid.shape]
+    return tuple(max(n - 1, 1) for n in scenario.grid.shape)
 
 
 def _span(scenario: Scenario, like: Array) -> Array:
     """`_spans` as an array of the library and dtype of `like`, `[3]`."""
-    return array_namespace(like).astype(constant(_spans(scenario), like), like.dtype)
+    return constant(_spans(scenario), like)
 
 
-def _goals_cells(scenario: Scenario) -> Array:
-    """The clusters' centres and the dock, in cells from the grid's origin, float32 numpy `[M + 1, 2]`."""
-    goals_m = np.asarray([*scenario.users.cluster_centres_m, scenario.mission.dock_m], dtype=np.float32)
-    return goals_m / np.float32(scenario.grid.cell_m)
+def _goals(scenario: Scenario) -> tuple[tuple[float, float], ...]:
+    """The clusters' centres and the dock, in cells from the grid's origin, `[M + 1, 2]`."""
+    cell_m = scenario.grid.cell_m
+    goals_m = (*scenario.users.cluster_centres_m, scenario.mission.dock_m)
+    return tuple((x_m / cell_m, y_m / cell_m) for x_m, y_m in goals_m)
 
 
 def _cluster_means(scenario: Scenario, per_user: Array) -> Array:

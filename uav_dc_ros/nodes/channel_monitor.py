@@ -30,7 +30,7 @@ class ChannelMonitor(runtime.MissionNode):
         core.measure(  # the first time takes longest
             self.scenario,
             np.asarray(self.scenario.mission.start_m),
-            self.scenario.user_centres_m,
+            np.asarray(self.scenario.user_centres_m),
             self._collected,
         )
         self.listen()
