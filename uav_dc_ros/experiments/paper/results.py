@@ -1,0 +1,307 @@
+"""What the sweep measured, in memory and on disk.
+
+Two Parquet files: `runs.parquet`, a row for each run; `curves.parquet`, a row for each point of each run's
+curves. Each carries the metadata as JSON under the key `uav_dc_ros`.
+"""
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow as pa  # type: ignore[import-untyped]
+from pyarrow import parquet
+
+from uav_dc_ros import __version__
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments.paper.setting import Planned, Scale, Setting
+
+# Of the missions flown to learn, exploration included, as in the paper's curves:
+#   reward            r^t at the end of the mission (eq. 7), which both forms of the reward share
+#   episode_return    what the agent was paid, undiscounted
+#   throughput_bps    sum-rate of the served users, mean over the mission's steps, bit/s
+#   users_collected   users collected
+#   landing_rate      share of missions that ended over the dock
+#   arrival_step      step after which the UAV stayed over the dock; max_steps when it did not land
+METRICS = (
+    "reward",
+    "episode_return",
+    "throughput_bps",
+    "users_collected",
+    "landing_rate",
+    "arrival_step",
+)
+# The same of greedy missions after training, in the run's environment.
+GREEDY = (
+    "greedy_reward",
+    "greedy_return",
+    "greedy_throughput_bps",
+    "greedy_users_collected",
+    "greedy_landing_rate",
+    "greedy_arrival_step",
+)
+RUNS_FILE, CURVES_FILE = "runs.parquet", "curves.parquet"
+_KEY = b"uav_dc_ros"
+
+_TYPES = {str: pa.string(), int: pa.int32(), float: pa.float64()}
+_RUNS_SCHEMA = pa.schema(
+    [
+        ("run", pa.int32()),
+        *((f.name, _TYPES.get(f.type, pa.string())) for f in msgspec.structs.fields(Setting)),
+        ("environment", pa.int32()),
+        ("repeat", pa.int32()),
+        ("seed", pa.int64()),
+        *((name, pa.float32()) for name in GREEDY),
+    ]
+)
+_CURVES_SCHEMA = pa.schema(
+    [("run", pa.int32()), ("episode", pa.int32()), *((name, pa.float32()) for name in METRICS)]
+)
+
+
+class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What reading the results takes of a scenario.
+
+    Attributes:
+        fingerprint: hash of the scenario's values.
+        n_users: users in the field.
+        max_steps: steps of a mission.
+        data_per_bps: the data term of r^t for a throughput of 1 bit/s over the whole mission, with beta = 1:
+            seconds of a mission / (users x data_scale_bits). A mission flies all its steps, so the
+            throughput determines the data term.
+    """
+
+    fingerprint: str
+    n_users: int
+    max_steps: int
+    data_per_bps: float
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> "World":
+        """Raises TrainingError when missions end on arrival: the throughput would not give the data."""
+        values = scenario.mission
+        if values.episode_end != "at_time_limit":
+            raise TrainingError(
+                f"{scenario.name}: mission.episode_end = {values.episode_end!r}; expected 'at_time_limit', "
+                "or missions of different lengths would be compared"
+            )
+        return cls(
+            fingerprint=scenario.fingerprint,
+            n_users=scenario.n_users,
+            max_steps=values.max_steps,
+            data_per_bps=values.max_steps
+            * values.step_s
+            / (scenario.n_users * scenario.reward.data_scale_bits),
+        )
+
+
+class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where results come from.
+
+    Attributes:
+        command: the command that made them.
+        scale: how much of the sweep it ran.
+        worlds: by the names of the scenarios.
+        greedy_missions: greedy missions flown by each run after training.
+        wall_time_s: how long it took, seconds.
+        device: what computed it, in words.
+        version: of the package.
+    """
+
+    command: str
+    scale: Scale
+    worlds: dict[str, World]
+    greedy_missions: int
+    wall_time_s: float | None = None
+    device: str = ""
+    version: str = __version__
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """Runs and what they measured.
+
+    Attributes:
+        metadata: where they come from.
+        planned: the runs.
+        episode: number of the last episode of each point, `[n_points]`.
+        curves: by `METRICS`: a mean over the episodes of each point, float32 `[n_runs, n_points]`.
+        greedy: by `GREEDY`: a mean over missions, float32 `[n_runs]`.
+    """
+
+    metadata: Metadata
+    planned: tuple[Planned, ...]
+    episode: Array
+    curves: dict[str, Array]
+    greedy: dict[str, Array]
+
+    def __post_init__(self) -> None:
+        """Raises TrainingError for a shape or name that does not fit, a number not finite, or a run twice."""
+        _check_arrays("curves", self.curves, METRICS, (len(self.planned), len(self.episode)))
+        _check_arrays("greedy", self.greedy, GREEDY, (len(self.planned),))
+        if len(set(self.planned)) < len(self.planned):
+            raise TrainingError(
+                f"{len(self.planned)} runs; expected each setting, environment and repeat once"
+            )
+        scale = self.metadata.scale
+        if list(self.episode) != [scale.episodes_per_point * (i + 1) for i in range(scale.n_points)]:
+            raise TrainingError(
+                f"points after episodes {list(self.episode)[:3]} ...; expected {scale.n_points} points of "
+                f"{scale.episodes_per_point} episodes"
+            )
+        if unknown := {run.setting.scenario for run in self.planned} - self.metadata.worlds.keys():
+            raise TrainingError(f"no world of scenario {min(unknown)!r} in the metadata")
+
+    def of(self, setting: Setting) -> Array:
+        """Indices of a setting's runs by environment, then repeat, integers `[n]`; empty without any."""
+        return self._ordered(self._by_setting.get(setting, []))
+
+    def select(self, **criteria: Any) -> Array:
+        """Indices of the runs that meet all criteria, by environment, then repeat, integers `[n]`.
+
+        Args:
+            criteria: fields of `Setting`, `ratio`, `environment` or `repeat`; what is not named may be any.
+
+        Raises:
+            TrainingError: no such criterion.
+        """
+        found = []
+        for i, run in enumerate(self.planned):
+            values = {
+                **msgspec.structs.asdict(run.setting),
+                "ratio": run.setting.ratio,
+                "environment": run.environment,
+                "repeat": run.repeat,
+            }
+            if unknown := criteria.keys() - values.keys():
+                raise TrainingError(f"no criterion {min(unknown)!r}; expected one of {', '.join(values)}")
+            if all(values[name] == wanted for name, wanted in criteria.items()):
+                found.append(i)
+        return self._ordered(found)
+
+    @cached_property
+    def _by_setting(self) -> dict[Setting, list[int]]:
+        found: dict[Setting, list[int]] = {}
+        for i, run in enumerate(self.planned):
+            found.setdefault(run.setting, []).append(i)
+        return found
+
+    def _ordered(self, runs: list[int]) -> Array:
+        return np.array(sorted(runs, key=lambda i: self.planned[i][1:]), np.intp)
+
+    def save(self, folder: Path) -> None:
+        """Writes both files into an existing folder, each in one move.
+
+        Raises:
+            TrainingError: they cannot be written.
+        """
+        n_runs, n_points = len(self.planned), len(self.episode)
+        rows = [
+            {
+                "run": i,
+                **msgspec.structs.asdict(run.setting),
+                "environment": run.environment,
+                "repeat": run.repeat,
+                "seed": run.seed,
+            }
+            for i, run in enumerate(self.planned)
+        ]
+        columns = {name: [row[name] for row in rows] for name in _RUNS_SCHEMA.names if name not in GREEDY}
+        curves = {
+            "run": np.repeat(np.arange(n_runs, dtype=np.int32), n_points),
+            "episode": np.tile(np.asarray(self.episode, np.int32), n_runs),
+            **{name: np.asarray(self.curves[name], np.float32).ravel() for name in METRICS},
+        }
+        greedy = {name: np.asarray(self.greedy[name], np.float32) for name in GREEDY}
+        metadata = {_KEY: msgspec.json.encode(self.metadata)}
+        _write(folder / CURVES_FILE, curves, _CURVES_SCHEMA.with_metadata(metadata))
+        _write(folder / RUNS_FILE, columns | greedy, _RUNS_SCHEMA.with_metadata(metadata))
+
+    @classmethod
+    def load(cls, folder: Path) -> "Results":
+        """Reads what `save` wrote.
+
+        Raises:
+            TrainingError: a file is missing or damaged, has other columns, or does not belong to the other.
+        """
+        runs, metadata = _read(folder / RUNS_FILE, _RUNS_SCHEMA)
+        curves, other = _read(folder / CURVES_FILE, _CURVES_SCHEMA)
+        if metadata != other:
+            raise TrainingError(f"{folder}: {RUNS_FILE} and {CURVES_FILE} are of different sweeps")
+        settings = [f.name for f in msgspec.structs.fields(Setting)]
+        planned = []
+        for row in runs.to_pylist():
+            try:
+                setting = msgspec.convert({name: row[name] for name in settings}, Setting)
+            except msgspec.ValidationError as error:
+                raise TrainingError(f"{folder / RUNS_FILE}: run {row['run']}: {error}") from None
+            planned.append(Planned(setting, row["environment"], row["repeat"]))
+        n_runs, n_points = len(planned), metadata.scale.n_points
+        values = {name: curves[name].to_numpy() for name in _CURVES_SCHEMA.names}
+        episode = values["episode"][:n_points]
+        if not (
+            np.array_equal(runs["run"].to_numpy(), np.arange(n_runs))
+            and np.array_equal(values["run"], np.repeat(np.arange(n_runs), n_points))
+            and np.array_equal(values["episode"], np.tile(episode, n_runs))
+        ):
+            raise TrainingError(
+                f"{folder / CURVES_FILE}: {len(curves)} rows; "
+                f"expected {n_points} points of each of {n_runs} runs"
+            )
+        return cls(
+            metadata=metadata,
+            planned=tuple(planned),
+            episode=episode,
+            curves={name: values[name].reshape(n_runs, n_points) for name in METRICS},
+            greedy={name: runs[name].to_numpy() for name in GREEDY},
+        )
+
+
+def _check_arrays(
+    what: str, arrays: dict[str, Array], names: tuple[str, ...], shape: tuple[int, ...]
+) -> None:
+    if arrays.keys() != set(names):
+        raise TrainingError(f"{what} has {', '.join(sorted(arrays))}; expected {', '.join(sorted(names))}")
+    for name, values in arrays.items():
+        if np.shape(values) != shape:
+            raise TrainingError(f"{what}: {name} has shape {np.shape(values)}; expected {shape}")
+        if not np.isfinite(values).all():
+            raise TrainingError(f"{what}: {name} holds a number that is not finite")
+
+
+def _write(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        parquet.write_table(
+            pa.table(columns, schema=schema), partial, compression="zstd", write_page_checksum=True
+        )
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise TrainingError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def _read(path: Path, schema: pa.Schema) -> tuple[pa.Table, Metadata]:
+    if not path.is_file():
+        raise TrainingError(f"{path}: no such file")
+    try:
+        with parquet.ParquetFile(path, page_checksum_verification=True) as file:
+            table = file.read()
+        found = table.schema
+        metadata = msgspec.json.decode((found.metadata or {})[_KEY], type=Metadata)
+    except KeyError:
+        raise TrainingError(f"{path}: no metadata of a sweep; expected the key 'uav_dc_ros'") from None
+    except (OSError, pa.ArrowException, msgspec.DecodeError) as error:
+        raise TrainingError(f"{path} cannot be read: {error}") from None
+    if not found.equals(schema):
+        raise TrainingError(
+            f"{path} has columns {', '.join(found.names)}; expected {', '.join(schema.names)}"
+        )
+    if any(column.null_count for column in table.columns):
+        raise TrainingError(f"{path}: a value is missing")
+    return table, metadata
