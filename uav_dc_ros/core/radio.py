@@ -6,7 +6,7 @@ The radio knows nothing of missions: who is served is decided in `mission`.
 import math
 from typing import Literal, TypeAlias, get_args
 
-from uav_dc_ros.core.arrays import Array, array_namespace
+from uav_dc_ros.core.arrays import Array, array_namespace, constant
 
 Interference: TypeAlias = Literal["all", "associated", "none"]
 
@@ -39,7 +39,7 @@ def path_gain(distance_m: Array, ref_gain: float, exponent: float = 2.0) -> Arra
     Returns:
         Gain, linear, the shape of `distance_m`.
     """
-    return ref_gain * distance_m**-exponent
+    return ref_gain / distance_m**exponent
 
 
 def sinr(
@@ -104,11 +104,14 @@ def _floating(values: Array) -> Array:
 def _sum_of_others(received_w: Array) -> Array:
     """For each user, the sum over every other one, `[..., U]`.
 
-    Sums of what lies before and behind each user, not the total less its own share: beside a user
-    ten thousand times stronger that difference would keep only half of its digits.
+    The sum of all but the strongest, and by how much the strongest outdoes the user. The total less the
+    user's own share would be wrong: beside a user ten thousand times stronger that difference keeps only
+    half of its digits.
     """
     xp = array_namespace(received_w)
-    zero = xp.zeros_like(received_w[..., :1])
-    before = xp.cumulative_sum(received_w[..., :-1], axis=-1)
-    behind = xp.flip(xp.cumulative_sum(xp.flip(received_w[..., 1:], axis=-1), axis=-1), axis=-1)
-    return xp.concat([zero, before], axis=-1) + xp.concat([behind, zero], axis=-1)
+    strongest = xp.argmax(received_w, axis=-1, keepdims=True)
+    is_strongest = constant(range(received_w.shape[-1]), strongest) == strongest
+    weaker_w = xp.where(is_strongest, xp.zeros_like(received_w), received_w)
+    return xp.sum(weaker_w, axis=-1, keepdims=True) + (
+        xp.max(received_w, axis=-1, keepdims=True) - received_w
+    )
