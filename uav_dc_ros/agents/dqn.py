@@ -1,13 +1,18 @@
 """Deep Q-learning and its dueling variant (the paper's algorithms 1 and 2) for a population of runs.
 
 N independent runs learn side by side, with parameters `[N, ...]`; N = 1 is a single run. They share
-nothing but the arithmetic: the loss is summed over runs, and Adam works element by element.
+nothing but the arithmetic: every operation works run by run. The gradient is written out, for the sake
+of speed: of one fixed shape of network it is short, and a test holds it equal to torch's own.
 
 Departures from the text of the paper, which has slips here: the dueling target uses the target
 network's own streams (theta_A', theta_V') and has the terminal case of the first algorithm. Departures of
 choice: theta' starts as a copy of theta, where the paper draws both at random, and learning begins with
 the first transition, where the prose waits for a full buffer.
 """
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,14 +23,14 @@ from uav_dc_ros.agents.policy import Hyperparameters
 from uav_dc_ros.agents.replay import Transitions
 
 
-def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float) -> Tensor:
+def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float | Tensor) -> Tensor:
     """The target y (eq. 22): `r` when the episode terminated at s', else `r + gamma max_a' Q'(s', a')`.
 
     Args:
         reward: r, `[...]`.
         terminated: bool `[...]`; truncation is not termination, and does bootstrap.
         next_q: Q'(s', .) of the target network, `[..., A]`.
-        gamma: discount.
+        gamma: discount, a number or `[...]`.
 
     Returns:
         y, `[...]`.
@@ -33,29 +38,70 @@ def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float) 
     return reward + gamma * torch.where(terminated, 0.0, next_q.amax(dim=-1))
 
 
-class Learner:
-    """N Q-networks, their target networks and their optimiser."""
+class Member(NamedTuple):
+    """A run as the learner sees it: the sizes must be those of all others, the rest is its own."""
 
-    def __init__(
-        self,
-        architecture: network.Architecture,
-        hyperparameters: Hyperparameters,
-        rngs: list[np.random.Generator],
-        device: torch.device,
-    ) -> None:
-        """Networks with random parameters, one per generator."""
-        self.architecture = architecture
-        self.hyperparameters = hyperparameters
-        runs = [network.initial(architecture, rng) for rng in rngs]
-        self._theta = {
-            name: torch.from_numpy(np.stack([run[name] for run in runs])).to(device).requires_grad_()
-            for name in network.shapes(architecture)
-        }
-        self._theta_target = {name: values.detach().clone() for name, values in self._theta.items()}
-        self._optimiser = torch.optim.Adam(self._theta.values(), lr=hyperparameters.learning_rate, fused=True)
+    architecture: network.Architecture
+    hyperparameters: Hyperparameters
+    rng: np.random.Generator
+
+
+class Learner:
+    """N Q-networks, their target networks and their optimiser.
+
+    Every network has the two streams of the dueling one in a single last layer, `head`, whose first
+    output is V and whose others are A(a). A plain network takes its Q-values from the others alone: its
+    V has no gradient and never moves.
+    """
+
+    def __init__(self, members: Sequence[Member], device: torch.device) -> None:
+        """Networks with random parameters, each from its run's generator."""
+        self._architectures = [member.architecture for member in members]
+        settings = [member.hyperparameters for member in members]
+        self._n_hidden = len(self._architectures[0].hidden)
+        self._target_every = settings[0].target_every
         self._iterations = 0
 
-    @torch.no_grad()
+        def column(values: list[float]) -> Tensor:
+            return torch.tensor(values, dtype=torch.float32, device=device)[:, None]
+
+        self._gamma = column([values.gamma for values in settings])
+        self._epsilon = column([values.epsilon for values in settings])[:, 0]
+        self._dueling = column([float(one.dueling is not None) for one in self._architectures])
+        self._subtracts_max = column([float(one.dueling == "max") for one in self._architectures]) > 0
+        self._any_max = bool(self._subtracts_max.any())
+        sizes = [values.batch_size for values in settings]
+        # Weight of each row in its run's mean; rows beyond a run's batch size count for nothing.
+        rows = torch.arange(max(sizes), device=device)
+        self._weight = (rows < column([float(size) for size in sizes])) / column([float(s) for s in sizes])
+
+        made = [_stacked(network.initial(member.architecture, member.rng)) for member in members]
+        self._theta = {
+            name: torch.from_numpy(np.stack([one[name] for one in made])).to(device) for name in made[0]
+        }
+        self._theta_target = {name: values.clone() for name, values in self._theta.items()}
+        self._gradient = {name: torch.zeros_like(values) for name, values in self._theta.items()}
+        self._optimiser = self._adam([values.learning_rate for values in settings])
+
+    def _adam(self, rates: list[float]) -> torch.optim.Adam:
+        """Adam, with a parameter group for each stretch of neighbouring runs that share a learning rate."""
+        groups = []
+        for rate, stretch in groupby(range(len(rates)), lambda run: rates[run]):
+            runs = list(stretch)
+            own = {name: values[runs[0] : runs[-1] + 1] for name, values in self._theta.items()}
+            for name, values in own.items():
+                values.grad = self._gradient[name][runs[0] : runs[-1] + 1]
+            groups.append({"params": list(own.values()), "lr": rate})
+        return torch.optim.Adam(groups, fused=True)
+
+    def q_values(self, observation: Tensor) -> Tensor:
+        """Q(s, a) of each run's network: `[N, B, D]` to `[N, B, A]`."""
+        return self._q(self._forward(self._theta, observation)[-1]).mT
+
+    def greedy(self, observation: Tensor) -> Tensor:
+        """The greedy action of each run's network: `[N, B, D]` to integers `[N, B]`."""
+        return self.q_values(observation).argmax(dim=-1)
+
     def act(self, observation: Tensor, explore: Tensor, choice: Tensor) -> Tensor:
         """Epsilon-greedy actions (eq. 18): greedy with probability epsilon, else any one.
 
@@ -66,30 +112,119 @@ class Learner:
         Returns:
             Integers `[N]`.
         """
-        q = network.q_values(self.architecture, self._theta, observation[:, None])[:, 0]
-        anything = (choice * q.shape[-1]).to(torch.int64)
-        return torch.where(explore < self.hyperparameters.epsilon, q.argmax(dim=-1), anything)
+        anything = (choice * self._architectures[0].n_actions).to(torch.int64)
+        return torch.where(explore < self._epsilon, self.greedy(observation[:, None])[:, 0], anything)
 
     def update(self, batch: Transitions) -> Tensor:
-        """One gradient step on a mini-batch `[N, B, ...]`.
+        """One gradient step on a mini-batch `[N, B, ...]`, of which each run takes its own batch size.
 
         Returns:
             The loss of each run before the step, `[N]`.
         """
-        with torch.no_grad():
-            next_q = network.q_values(self.architecture, self._theta_target, batch.next_observation)
-            y = td_target(batch.reward, batch.terminated, next_q, self.hyperparameters.gamma)
-        q = network.q_values(self.architecture, self._theta, batch.observation)
-        loss = torch.mean((y - q.gather(-1, batch.action[..., None])[..., 0]) ** 2, dim=-1)
-        self._optimiser.zero_grad()
-        torch.sum(loss).backward()  # type: ignore[no-untyped-call]
+        next_q = self._q(self._forward(self._theta_target, batch.next_observation)[-1])
+        y = td_target(batch.reward, batch.terminated, next_q.mT, self._gamma)
+        *features, head = self._forward(self._theta, batch.observation)
+        action = batch.action[:, None]  # [N, 1, B], as the head is [N, 1 + A, B]
+        error = self._q(head).gather(1, action)[:, 0] - y
+        loss = torch.sum(self._weight * error * error, dim=-1)
+        self._backward(features, head, action, 2.0 * self._weight * error)
         self._optimiser.step()
         self._iterations += 1
-        if self._iterations % self.hyperparameters.target_every == 0:
+        if self._iterations % self._target_every == 0:
             for name, values in self._theta.items():
-                self._theta_target[name].copy_(values.detach())
-        return loss.detach()
+                self._theta_target[name].copy_(values)
+        return loss
 
-    def parameters(self) -> network.Parameters:
-        """A copy of the parameters, numpy, `[N, ...]`."""
-        return {name: values.detach().cpu().numpy().copy() for name, values in self._theta.items()}
+    def _forward(self, theta: dict[str, Tensor], observation: Tensor) -> list[Tensor]:
+        """Input of every layer, `[N, B, *]`, then the output of the head, `[N, 1 + A, B]`."""
+        outputs = [observation]
+        for i in range(self._n_hidden):
+            before = torch.bmm(outputs[-1], theta[f"hidden_{i}.weight"]).add_(theta[f"hidden_{i}.bias"])
+            outputs.append(before.clamp_min_(0.0))
+        # Transposed, since the few outputs make a matrix that is slow to multiply the other way round.
+        outputs.append(torch.bmm(theta["head.weight"], outputs[-1].mT).add_(theta["head.bias"]))
+        return outputs
+
+    def _q(self, head: Tensor) -> Tensor:
+        """Q-values from the output of the head, `[N, 1 + A, B]` to `[N, A, B]` (eqs. 28 to 30)."""
+        value, advantage = head[:, :1], head[:, 1:]
+        subtracted = advantage.mean(1, keepdim=True)
+        if self._any_max:
+            greatest = advantage.amax(1, keepdim=True)
+            subtracted = torch.where(self._subtracts_max[..., None], greatest, subtracted)
+        return advantage + self._dueling[..., None] * (value - subtracted)
+
+    def _backward(self, features: list[Tensor], head: Tensor, action: Tensor, d_q: Tensor) -> None:
+        """Writes the gradient, from that of the Q-values of the actions taken, `[N, B]`."""
+        gradient, n_actions = self._gradient, head.shape[1] - 1
+        d_value = self._dueling * d_q
+        d_head = torch.zeros_like(head)
+        d_head[:, 0] = d_value
+        d_advantage = d_head[:, 1:]
+        d_mean = torch.where(self._subtracts_max, 0.0, d_value) if self._any_max else d_value
+        d_advantage.sub_(d_mean[:, None] / n_actions)
+        if self._any_max:
+            greatest = head[:, 1:].argmax(1, keepdim=True)
+            d_advantage.scatter_add_(1, greatest, torch.where(self._subtracts_max, -d_value, 0.0)[:, None])
+        d_advantage.scatter_add_(1, action, d_q[:, None])
+
+        torch.bmm(d_head, features[-1], out=gradient["head.weight"])
+        torch.sum(d_head, 2, keepdim=True, out=gradient["head.bias"])
+        d_features = torch.bmm(d_head.mT, self._theta["head.weight"])
+        for i in reversed(range(self._n_hidden)):
+            d_before = d_features.mul_(features[i + 1].sign())  # ReLU: what passed is positive, the rest 0
+            torch.bmm(features[i].mT, d_before, out=gradient[f"hidden_{i}.weight"])
+            torch.sum(d_before, 1, keepdim=True, out=gradient[f"hidden_{i}.bias"])
+            if i > 0:
+                d_features = torch.bmm(d_before, self._theta[f"hidden_{i}.weight"].mT)
+
+    def parameters(self, run: int) -> network.Parameters:
+        """A copy of a run's parameters, numpy, as `network.shapes` names them."""
+        own = {name: values[run].cpu().numpy().copy() for name, values in self._theta.items()}
+        return _unstacked(own, self._architectures[run])
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a later `update` depends on."""
+        state = {f"theta.{name}": values for name, values in self._theta.items()}
+        state |= {f"theta_target.{name}": values for name, values in self._theta_target.items()}
+        for i, moments in self._optimiser.state_dict()["state"].items():
+            state |= {f"adam.{i}.{key}": values for key, values in moments.items()}
+        return state | {"iterations": torch.tensor(self._iterations)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Becomes what gave `state`, which had the same members."""
+        for name in self._theta:
+            self._theta[name].copy_(state[f"theta.{name}"])
+            self._theta_target[name].copy_(state[f"theta_target.{name}"])
+        adam = self._optimiser.state_dict()
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name, values in state.items():
+            if name.startswith("adam."):
+                _, i, key = name.split(".")
+                moments.setdefault(int(i), {})[key] = values
+        self._optimiser.load_state_dict(adam | {"state": moments})
+        self._iterations = int(state["iterations"])
+
+
+def _stacked(parameters: network.Parameters) -> network.Parameters:
+    """One network's parameters as the learner holds them: biases as rows, both streams in `head`."""
+    own = {name: v[None] if v.ndim == 1 else v for name, v in parameters.items() if "hidden" in name}
+    streams = {"weight": [], "bias": []}  # type: dict[str, list[np.ndarray]]
+    for name in ("value", "advantage") if "value.bias" in parameters else ("q",):
+        for part, values in streams.items():
+            values.append(np.atleast_2d(parameters[f"{name}.{part}"]))
+    head = {part: np.concatenate(values, axis=-1).T for part, values in streams.items()}
+    if "q.bias" in parameters:  # has no V: a row of zeros in its place
+        head = {part: np.concatenate([np.zeros_like(values[:1]), values]) for part, values in head.items()}
+    return own | {f"head.{part}": np.ascontiguousarray(values) for part, values in head.items()}
+
+
+def _unstacked(own: network.Parameters, architecture: network.Architecture) -> network.Parameters:
+    """The inverse of `_stacked`."""
+    rows = {"q": slice(1, None)} if architecture.dueling is None else {}
+    rows = rows or {"value": slice(0, 1), "advantage": slice(1, None)}
+    parameters = {name: v[0] if name.endswith("bias") else v for name, v in own.items() if "hidden" in name}
+    for name, row in rows.items():
+        parameters[f"{name}.weight"] = np.ascontiguousarray(own["head.weight"][row].T)
+        parameters[f"{name}.bias"] = own["head.bias"][row, 0].copy()
+    return parameters

@@ -1,7 +1,7 @@
 """A trained policy: a folder, and what flies from it. Needs numpy only.
 
-A policy is a folder of three files: `config.json` (a `PolicyConfig`), `model.safetensors` (the
-parameters of the network) and `README.md` (the card: what it is, how it was made, how it does).
+A policy is a folder: `config.json` (a `PolicyConfig`), `model.safetensors` (the parameters of the network),
+`README.md` (the card: what it is, how it was made, how it does) and its pictures.
 """
 
 import hashlib
@@ -27,6 +27,8 @@ from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import PolicyError, ScenarioError
 
 CONFIG, MODEL, CARD = "config.json", "model.safetensors", "README.md"
+# Pictures for people, which nothing reads: how it learnt, and one of its missions.
+LEARNING_CURVE, TRAJECTORY = "learning_curve.png", "trajectory.png"
 
 Algorithm: TypeAlias = Literal["dqn", "dueling_dqn"]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
@@ -106,6 +108,7 @@ class Policy:
         folder: where it was loaded from.
         config: everything about it but its parameters.
         scenario: the world it learnt in.
+        parameters: of its network, float32, as named by `network.shapes`.
         sha256: of its config and its model, in hex: names exactly what flew.
     """
 
@@ -122,11 +125,12 @@ class Policy:
         self.folder = folder
         self.config = config
         self.scenario = scenario
+        self.parameters = parameters
         self.sha256 = sha256
         self._architecture = config.architecture(scenario)
         # In float64 the last digit of a product, which depends on how many missions are asked about at
         # once, is too small to decide between two actions.
-        self._parameters = {name: np.asarray(values, np.float64) for name, values in parameters.items()}
+        self._exact = {name: np.asarray(values, np.float64) for name, values in parameters.items()}
 
     def observe(
         self, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
@@ -144,7 +148,7 @@ class Policy:
     def q_values(self, observation: Array) -> Array:
         """Q(s, a) of observations `[..., D]`, float64 `[..., A]`."""
         rows = np.asarray(observation, np.float64).reshape(-1, self._architecture.n_inputs)
-        values = network.q_values(self._architecture, self._parameters, rows)
+        values = network.q_values(self._architecture, self._exact, rows)
         return values.reshape(*observation.shape[:-1], self._architecture.n_actions)
 
     def act(self, observation: Array) -> Array:
@@ -211,7 +215,11 @@ def load(name_or_path: str | Path) -> Policy:
 
 
 def save(
-    folder: Path, config: PolicyConfig, parameters: Mapping[str, Array], card: Callable[[Policy], str]
+    folder: Path,
+    config: PolicyConfig,
+    parameters: Mapping[str, Array],
+    card: Callable[[Policy], str],
+    draw: Callable[[Policy, Path], None] | None = None,
 ) -> None:
     """Writes a policy's folder: under another name first, so that it is there in full or not at all.
 
@@ -220,6 +228,7 @@ def save(
         config: everything but the parameters.
         parameters: arrays as named by `network.shapes`.
         card: gives the text of README.md, from the policy as it was read back.
+        draw: draws pictures of the policy into the folder.
 
     Raises:
         PolicyError: `folder` exists or cannot be written, or what was written cannot be loaded.
@@ -231,7 +240,10 @@ def save(
         arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in parameters.items()}
         (partial / MODEL).write_bytes(safetensors.numpy.save(arrays))
         (partial / CONFIG).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2) + b"\n")
-        (partial / CARD).write_text(card(load(partial)), "utf-8")
+        made = load(partial)
+        (partial / CARD).write_text(card(made), "utf-8")
+        if draw:
+            draw(made, partial)
         partial.rename(folder)
     except OSError as error:
         raise PolicyError(f"policy {str(folder)!r} cannot be written: {error}") from None

@@ -1,4 +1,4 @@
-"""The replay buffer of a population: `[N, capacity, ...]`, one ring per run."""
+"""The replay buffer of a population: one ring of rows per run."""
 
 from typing import NamedTuple
 
@@ -28,18 +28,10 @@ class ReplayBuffer:
     """The latest `capacity` transitions of each run."""
 
     def __init__(self, n_runs: int, capacity: int, n_inputs: int, device: torch.device) -> None:
-        def room(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros((n_runs, capacity, *shape), dtype=dtype, device=device)
-
-        self._rings = Transitions(
-            observation=room(n_inputs),
-            action=room(dtype=torch.int64),
-            reward=room(),
-            next_observation=room(n_inputs),
-            terminated=room(dtype=torch.bool),
-        )
-        self._runs = torch.arange(n_runs, device=device)[:, None]
-        self._capacity = capacity
+        # All of a transition in one row, s, s', a, r, terminated: to fetch it is one access to memory.
+        self._rows = torch.zeros((n_runs * capacity, 2 * n_inputs + 3), device=device)
+        self._first = torch.arange(n_runs, device=device)[:, None] * capacity
+        self._n_runs, self._capacity, self._n_inputs = n_runs, capacity, n_inputs
         self._added = 0
 
     def __len__(self) -> int:
@@ -48,12 +40,31 @@ class ReplayBuffer:
 
     def add(self, transitions: Transitions) -> None:
         """Stores one transition of each run, `[N, ...]`, in place of its oldest when full."""
-        slot = self._added % self._capacity
-        for ring, values in zip(self._rings, transitions, strict=True):
-            ring[:, slot] = values
+        observation, action, reward, next_observation, terminated = transitions
+        numbers = torch.stack([action.float(), reward, terminated.float()], dim=-1)
+        rings = self._rows.view(self._n_runs, self._capacity, -1)
+        rings[:, self._added % self._capacity] = torch.cat([observation, next_observation, numbers], dim=-1)
         self._added += 1
 
     def sample(self, draws: Tensor) -> Transitions:
         """A mini-batch `[N, B, ...]`: uniform, with replacement, from uniform draws `[N, B]` in [0, 1)."""
-        slots = (draws * len(self)).to(torch.int64).clamp_(max=len(self) - 1)
-        return Transitions(*(ring[self._runs, slots] for ring in self._rings))
+        slots = (draws * len(self)).to(torch.int64).clamp_(max=len(self) - 1) + self._first
+        rows = self._rows.index_select(0, slots.view(-1)).view(*draws.shape, -1)
+        d = self._n_inputs
+        return Transitions(
+            observation=rows[..., :d],
+            action=rows[..., 2 * d].to(torch.int64),
+            reward=rows[..., 2 * d + 1],
+            next_observation=rows[..., d : 2 * d],
+            terminated=rows[..., 2 * d + 2] > 0,
+        )
+
+    def state(self) -> dict[str, Tensor]:
+        """What was stored, `[N, len, ...]`, and how much was ever added."""
+        held = self._rows.view(self._n_runs, self._capacity, -1)[:, : len(self)]
+        return {"rows": held, "added": torch.tensor(self._added)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Becomes what gave `state`, which had the same shape."""
+        self._added = int(state["added"])
+        self._rows.view(self._n_runs, self._capacity, -1)[:, : len(self)] = state["rows"]

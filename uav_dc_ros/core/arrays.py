@@ -3,12 +3,21 @@
 from functools import lru_cache
 from typing import Any, TypeAlias
 
-from array_api_compat import array_namespace, device
+import array_api_compat
+import array_api_compat.numpy
+import numpy as np
+from array_api_compat import device
 
 # numpy.ndarray or torch.Tensor. The array API standard has no type to name them both.
 Array: TypeAlias = Any
 
-__all__ = ["Array", "array_namespace", "constant"]
+
+def array_namespace(*arrays: Array) -> Any:
+    """The array-API namespace of some arrays of one library."""
+    # A node asks some thirty times a step: the likeliest answer is worth a short way.
+    if all(type(array) is np.ndarray for array in arrays):
+        return array_api_compat.numpy
+    return array_api_compat.array_namespace(*arrays)
 
 
 def constant(values: tuple[Any, ...] | range, like: Array, dtype: Any = None) -> Array:

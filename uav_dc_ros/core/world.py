@@ -129,9 +129,7 @@ def collect(scenario: Scenario, link: Link, data_bits: Array, collected: Array) 
     )
 
 
-def total_reward(
-    scenario: Scenario, cell: Array, data_bits: Array, rewards: Rewards | None = None
-) -> Array:
+def total_reward(scenario: Scenario, cell: Array, data_bits: Array, rewards: Rewards | None = None) -> Array:
     """r^t (eq. 7) of a UAV in `cell` `[..., 3]` that holds `data_bits` `[..., U]`; shape `[...]`."""
     values = rewards or scenario.reward
     distance = mission.dock_distance_cells(cell, scenario.dock_cell, like=data_bits)

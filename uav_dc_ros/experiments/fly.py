@@ -11,6 +11,7 @@ import numpy as np
 
 from uav_dc_ros.core import mission, world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.batch import select
 
@@ -44,7 +45,12 @@ class Missions:
 
 
 def flight(
-    scenario: Scenario, act: Act, seeds: Sequence[int], runs: tuple[int, ...] = ()
+    scenario: Scenario,
+    act: Act,
+    seeds: Sequence[int],
+    runs: tuple[int, ...] = (),
+    layouts: Sequence[Array | None] = (),
+    rewards: Rewards | None = None,
 ) -> Iterator[tuple[world.State, world.Outcome | None]]:
     """The missions step by step: first their start, without an outcome, then every step.
 
@@ -53,6 +59,9 @@ def flight(
         act: who steers.
         seeds: the S missions.
         runs: leading dimensions of what steers: each flies all S missions.
+        layouts: for each run the draws for where users start, `[U, 2]`, or None for the seed's own;
+            none at all means the seed's own for all.
+        rewards: how each run is paid, `[*runs, 1]`; as the scenario says unless told.
     """
     rngs = [np.random.default_rng(seed) for seed in seeds]
 
@@ -60,16 +69,27 @@ def flight(
         one = np.stack([rng.random((scenario.n_users, 2)) for rng in rngs])
         return np.broadcast_to(one, (*runs, *one.shape))
 
-    state = world.initial(scenario, draws())
+    start = draws().copy()
+    for run, own in enumerate(layouts):
+        if own is not None:
+            start[run] = own
+    state = world.initial(scenario, start)
     yield state, None
     for _ in range(scenario.mission.max_steps):
-        state, outcome = world.step(scenario, state, act(state), draws())
+        state, outcome = world.step(scenario, state, act(state), draws(), rewards)
         yield state, outcome
 
 
-def fly(scenario: Scenario, act: Act, seeds: Sequence[int], runs: tuple[int, ...] = ()) -> Missions:
+def fly(
+    scenario: Scenario,
+    act: Act,
+    seeds: Sequence[int],
+    runs: tuple[int, ...] = (),
+    layouts: Sequence[Array | None] = (),
+    rewards: Rewards | None = None,
+) -> Missions:
     """Flies every mission to its end; arguments as in `flight`, results `[*runs, S]`."""
-    steps = flight(scenario, act, seeds, runs)
+    steps = flight(scenario, act, seeds, runs, layouts, rewards)
     final, _ = next(steps)
     over = final.step < 0
     landed, arrival = over, np.full(over.shape, np.nan)

@@ -55,7 +55,9 @@ class Population(msgspec.Struct, frozen=True, kw_only=True):
         for name in ("episodes", "buffer_size", "target_every"):
             values = sorted({getattr(run.hyperparameters, name) for run in self.runs})
             if len(values) > 1:
-                raise TrainingError(f"{name} of the runs of a population is {values}; expected one value for all")
+                raise TrainingError(
+                    f"{name} of the runs of a population is {values}; expected one value for all"
+                )
 
     @property
     def n_episodes(self) -> int:

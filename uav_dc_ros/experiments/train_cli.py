@@ -1,10 +1,12 @@
 """The command line of `python -m uav_dc_ros.train`: options, checkpoints, the result."""
 
 import argparse
+import math
 import shlex
 import shutil
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -13,16 +15,20 @@ from rich.console import Console
 
 from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import network, policy
-from uav_dc_ros.agents.policy import Algorithm, Hyperparameters, PolicyConfig
+from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Algorithm, Hyperparameters, PolicyConfig
 from uav_dc_ros.core.reward import RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.card import card, checkpoint_card
-from uav_dc_ros.experiments.progress import Display
+from uav_dc_ros.experiments.evaluate import TEST_SEEDS, save_mission_picture, steer
+from uav_dc_ros.experiments.progress import Display, Report
+from uav_dc_ros.experiments.runs import Population, Run
 
 if TYPE_CHECKING:
     import torch
+
+    from uav_dc_ros.experiments.training import Training
 
 PROG = "python -m uav_dc_ros.train"
 # Every hyperparameter is an option.
@@ -63,7 +69,9 @@ def options_parser() -> cli.Parser:
     add("--hidden", default=[64, 64], nargs="+", help="units of each hidden layer", **count)
     add("--seed", default=0, type=int, metavar="N", help="of the first run; the next has N + 1")
     add("--runs", default=1, help="runs side by side, of which the best is kept", **count)
-    add("--checkpoint-every", default=100, help="episodes between validations", **count)
+    add("--checkpoint-every", default=100, help="episodes between validations and checkpoints", **count)
+    add("--resume", action="store_true", help="go on from the last checkpoint of the same command, if any")
+    add("--tensorboard", type=Path, metavar="DIR", help="write scalars of every run for TensorBoard")
     add("--threads", default=1, help="of torch: equal numbers give equal results", **count)
     add("--device", default="cpu", help="where torch computes, such as cpu or cuda")
     learning = parser.add_argument_group("learning")
@@ -82,63 +90,126 @@ def options_parser() -> cli.Parser:
 def _train(options: argparse.Namespace, command: str) -> int:
     shipped = scenarios.load(options.scenario)
     config = _config(options, shipped)
+    population = _population(config, shipped.name, options.runs)
     device = _device(options.device, options.threads)
-    from uav_dc_ros.experiments.train import train  # needs torch, which _device() has asked for
+    # These need torch, which _device() has asked for.
+    from uav_dc_ros.experiments import checkpoint
+    from uav_dc_ros.experiments.scalars import Scalars
+    from uav_dc_ros.experiments.training import Training
+    from uav_dc_ros.experiments.validation import validate
 
-    checkpoints = _reserve(options.out)
-    started = time.monotonic()
-    scenario = from_values(config.scenario, shipped.name)
-    latest = None
+    folder = options.out.with_name(f"{options.out.name}.checkpoints")
+    saved = folder / "training.safetensors"
+    resumed = options.resume and saved.is_file()
+    _reserve(options.out, folder, resumed)
+    training = Training(population, device)
+    progress: dict[str, Any] = {"score": None, "run": 0, "best": None, "seconds": 0.0}
+    if resumed:
+        progress = checkpoint.restore(saved, training)
+        _discard_later(folder, training.n_flown)
+    started = time.monotonic() - progress["seconds"]
     try:
-        with Display(config.hyperparameters.episodes, options.checkpoint_every) as display:
-            for report in train(config, scenario, options.runs, options.checkpoint_every, device):
-                display.show(report)
-                if report.best is not None:
-                    best, score = report.best, report.score
-                    config = msgspec.structs.replace(
-                        config, seed=options.seed + report.run, episode=report.episode
-                    )
-                    text = checkpoint_card(config, score, command)
-                    latest = _save_checkpoint(checkpoints, config, best, text)
+        with ExitStack() as stack:
+            display = stack.enter_context(Display(training, options.checkpoint_every))
+            scalars = stack.enter_context(Scalars(options.tensorboard, options.out.name, training))
+            while training.n_flown < population.n_episodes:
+                training.fly_episode()
+                last = training.n_flown == population.n_episodes
+                if training.n_flown % options.checkpoint_every == 0 or last:
+                    scores = validate(training)
+                    if progress["score"] is None or scores.max() > progress["score"]:
+                        progress |= {"score": float(scores.max()), "run": int(scores.argmax())}
+                        progress["best"] = _save_best(folder, config, training, progress, command)
+                    progress["seconds"] = time.monotonic() - started
+                    checkpoint.save(saved, training, progress)
+                    scalars.add_scores(scores)
+                score = math.nan if progress["score"] is None else progress["score"]
+                display.show(Report.of(training, score))
+                scalars.add_episode()
     except KeyboardInterrupt:
-        kept = f"the best policy until now is {latest}" if latest else "there is no checkpoint yet"
-        if latest is None:
-            checkpoints.rmdir()
+        if not saved.is_file():
+            shutil.rmtree(folder)
+            kept = "there is no checkpoint yet"
+        else:
+            kept = f"the best policy until now is {folder / progress['best']}; --resume goes on"
         print(f"{PROG}: stopped; {kept}", file=sys.stderr)
         return cli.INTERRUPTED
-    seconds = time.monotonic() - started
+    best = policy.load(folder / progress["best"])
     policy.save(
         options.out,
-        config,
-        best,
-        lambda loaded: card(loaded, shipped, command, options.runs, seconds, score),
+        best.config,
+        best.parameters,
+        lambda loaded: card(loaded, shipped, command, options.runs, progress["seconds"], progress["score"]),
+        lambda loaded, made: _draw(made, loaded, shipped, training),
     )
-    shutil.rmtree(checkpoints)
-    Console().print(f"{options.out}: {score:.1f} of {shipped.n_users} users brought home in validation")
+    shutil.rmtree(folder)
+    brought = f"{progress['score']:.1f} of {shipped.n_users} users brought home in validation"
+    Console().print(f"{options.out}: {brought}")
     return 0
 
 
-def _reserve(out: Path) -> Path:
+def _population(config: PolicyConfig, name: str, n_runs: int) -> Population:
+    """Runs that differ in their seeds only: `config.seed`, `config.seed + 1`, ..."""
+    scenario = from_values(config.scenario, name)
+    runs = tuple(
+        Run(
+            seed=config.seed + i,
+            algorithm=config.algorithm,
+            aggregation=config.aggregation,
+            reward=scenario.reward,
+            hyperparameters=config.hyperparameters,
+        )
+        for i in range(n_runs)
+    )
+    return Population(scenario=scenario, observation=config.observation, hidden=config.hidden, runs=runs)
+
+
+def _reserve(out: Path, checkpoints: Path, resumed: bool) -> None:
     """Makes the folder for checkpoints beside `out`: an hour later is too late to find out that one cannot.
 
     Raises:
-        PolicyError: it or `out` exists.
+        PolicyError: it, unless the training is resumed, or `out` exists.
         TrainingError: it cannot be made.
     """
-    checkpoints = out.with_name(f"{out.name}.checkpoints")
     policy.refuse_existing(out)
+    if resumed:
+        return
     policy.refuse_existing(checkpoints)
     try:
         checkpoints.mkdir(parents=True)
     except OSError as error:
         raise TrainingError(f"{checkpoints} cannot be made: {error.strerror}") from None
-    return checkpoints
 
 
-def _save_checkpoint(root: Path, config: PolicyConfig, best: network.Parameters, text: str) -> Path:
-    folder = root / f"episode_{config.episode:06d}"
-    policy.save(folder, config, best, lambda _: text)
-    return folder
+def _discard_later(folder: Path, n_flown: int) -> None:
+    """Removes best policies that a killed training had saved after the state that it is resumed from."""
+    for later in folder.glob("episode_*"):
+        if int(later.name.removeprefix("episode_")) > n_flown:
+            shutil.rmtree(later)
+
+
+def _save_best(
+    folder: Path, config: PolicyConfig, training: "Training", progress: dict[str, Any], command: str
+) -> str:
+    """Saves the best run's policy as it is now; gives back the name of its folder."""
+    run = progress["run"]
+    now = msgspec.structs.replace(config, seed=config.seed + run, episode=training.n_flown)
+    text = checkpoint_card(now, progress["score"], command)
+    name = f"episode_{training.n_flown:06d}"
+    policy.save(folder / name, now, training.learner.parameters(run), lambda _: text)
+    return name
+
+
+def _draw(folder: Path, made: policy.Policy, scenario: Scenario, training: "Training") -> None:
+    """The pictures in a policy's folder: how it learnt, and a mission as it flies it."""
+    try:
+        from uav_dc_ros.experiments.pictures import save_learning_curve  # needs matplotlib
+    except ModuleNotFoundError:
+        return  # the policy is worth more than its pictures
+    save_learning_curve(
+        training, made.config.seed - training.population.runs[0].seed, folder / LEARNING_CURVE
+    )
+    save_mission_picture(steer(made, scenario), scenario, TEST_SEEDS[0], folder / TRAJECTORY)
 
 
 def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:

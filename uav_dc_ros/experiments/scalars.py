@@ -1,0 +1,63 @@
+"""Scalars for TensorBoard. Needs torch; and tensorboard, when they are asked for."""
+
+import math
+from pathlib import Path
+from types import TracebackType
+
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments.training import Training
+
+
+class Scalars:
+    """Writes the curves of every run under `DIR/NAME/seed_S`; writes nothing without a folder."""
+
+    def __init__(self, folder: Path | None, name: str, training: Training) -> None:
+        """Scalars of a training, from its next episode on.
+
+        Raises:
+            TrainingError: tensorboard is not installed, or the folder cannot be written.
+        """
+        self._training = training
+        self._writers = []
+        if folder is None:
+            return
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ModuleNotFoundError:
+            raise TrainingError(
+                "--tensorboard: tensorboard is not installed; expected it from: "
+                'pip install "uav_dc_ros[train]"'
+            ) from None
+        try:
+            self._writers = [
+                # What was written after the checkpoint that a training goes on from is taken back.
+                SummaryWriter(str(folder / name / f"seed_{run.seed}"), purge_step=training.n_flown + 1)
+                for run in training.population.runs
+            ]
+        except OSError as error:
+            raise TrainingError(f"--tensorboard {folder} cannot be written: {error.strerror}") from None
+
+    def __enter__(self) -> "Scalars":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for writer in self._writers:
+            writer.close()
+
+    def add_episode(self) -> None:
+        """Writes the figures of the episode just flown."""
+        if self._writers:
+            for name, values in self._training.curves.items():
+                self._add(f"training/{name}", values[-1])
+
+    def add_scores(self, scores: Array) -> None:
+        """Writes what a validation found, `[N]`."""
+        self._add("validation/users_brought_home", scores)
+
+    def _add(self, name: str, values: Array) -> None:
+        for writer, value in zip(self._writers, values.tolist() if self._writers else [], strict=True):
+            if not math.isnan(value):
+                writer.add_scalar(name, value, self._training.n_flown)

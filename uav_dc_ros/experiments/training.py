@@ -1,0 +1,195 @@
+"""Training: N runs side by side, an episode at a time, read from top to bottom.
+
+Needs torch. Every random number of a run comes from the run's own numpy generator, drawn for a whole
+episode at once: a run learns the same alone and among others, starts the same on every device, and a GPU
+is not made to wait for the host at every step. Worlds live where it is fastest: in numpy beside a
+learner on the CPU, in torch on any other device. They are the same functions.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from uav_dc_ros.agents import network
+from uav_dc_ros.agents.dqn import Learner, Member
+from uav_dc_ros.agents.replay import ReplayBuffer, Transitions
+from uav_dc_ros.core import world
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.reward import Rewards
+from uav_dc_ros.env import observations
+from uav_dc_ros.env.batch import BatchWorld
+from uav_dc_ros.experiments.books import CURVES, Books
+from uav_dc_ros.experiments.runs import Population, Run
+
+# Makes a run's stream another one than that of the mission with the same seed.
+_TRAINING_STREAM = 1
+
+
+class Training:
+    """A population between two episodes.
+
+    Attributes:
+        population: what is trained.
+        device: where the learner computes.
+        learner: the networks.
+        n_flown: episodes flown by each run.
+    """
+
+    def __init__(
+        self,
+        population: Population,
+        device: torch.device,
+        worlds_in: Literal["numpy", "torch"] | None = None,
+    ) -> None:
+        """Runs before their first episode.
+
+        Args:
+            population: the runs.
+            device: where to compute.
+            worlds_in: which library the worlds use; numpy on the CPU, torch elsewhere, unless told.
+        """
+        self.population, self.device = population, device
+        self._on_host = (worlds_in or ("numpy" if device.type == "cpu" else "torch")) == "numpy"
+        self._rngs = [
+            np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(_TRAINING_STREAM,)))
+            for run in population.runs
+        ]
+        architectures = [architecture(population, run) for run in population.runs]
+        members = zip(architectures, population.runs, self._rngs, strict=True)
+        self.learner = Learner([Member(a, run.hyperparameters, rng) for a, run, rng in members], device)
+        capacity = population.runs[0].hyperparameters.buffer_size
+        self._buffer = ReplayBuffer(len(population.runs), capacity, architectures[0].n_inputs, device)
+        paid = rewards(population.runs, self._world_array)
+        self._worlds = BatchWorld(population.scenario, self._layouts(), paid)
+        self._books = Books(population.scenario, self._worlds.state.total_reward)
+        self._curves = np.full(
+            (population.n_episodes, len(CURVES), len(population.runs)), np.nan, dtype=np.float32
+        )
+        self.n_flown = 0
+
+    @property
+    def curves(self) -> dict[str, Array]:
+        """Figures of every episode flown, float32 `[n_flown, N]` each; see `books.CURVES`."""
+        return {name: self._curves[: self.n_flown, i] for i, name in enumerate(CURVES)}
+
+    def fly_episode(self) -> None:
+        """T_cons iterations of every run, each one step and one gradient step (algorithms 1 and 2).
+
+        Under `on_arrival` several missions may fit into them.
+        """
+        scenario, worlds, kind = self.population.scenario, self._worlds, self.population.observation
+        n_steps = scenario.mission.max_steps
+        walk, explore, choice, replay = self._draws(n_steps)
+        loss = torch.zeros(len(self.population.runs), device=self.device)
+        observation = self._tensor(worlds.observe(kind))
+        for t in range(n_steps):
+            action = self.learner.act(observation, explore[t], choice[t])
+            outcome = worlds.step(action.numpy() if self._on_host else action, walk[t])
+            next_observation = self._tensor(worlds.observe(kind))
+            reward, terminated = self._tensor(outcome.reward), self._tensor(outcome.terminated)
+            self._buffer.add(Transitions(observation, action, reward, next_observation, terminated))
+            loss += self.learner.update(self._buffer.sample(replay[t]))
+            self._books.add(worlds.state, outcome)
+            # The device is not asked whether a mission is over: under `at_time_limit` only the last step
+            # ends one, under `on_arrival` every step can.
+            if scenario.mission.episode_end == "on_arrival" or t == n_steps - 1:
+                over = outcome.terminated | outcome.truncated
+                self._books.close(over, worlds.state, outcome)
+                worlds.restart(over, self._layouts())
+                next_observation = self._tensor(worlds.observe(kind))
+            observation = next_observation
+        self._curves[self.n_flown] = [*self._books.take(), (loss / n_steps).cpu().numpy()]
+        self.n_flown += 1
+
+    def _draws(self, n_steps: int) -> tuple[Array, Tensor, Tensor, Tensor]:
+        """Uniform draws for walks `[T, N, U, 2]`, explore and choice `[T, N]`, and replay `[T, N, B]`."""
+        n_users, runs = self.population.scenario.n_users, self.population.runs
+        sizes = [run.hyperparameters.batch_size for run in runs]
+        walk = np.empty((n_steps, len(runs), 2 * n_users), np.float32)
+        pick = np.zeros((n_steps, len(runs), 2 + max(sizes)), np.float32)
+        for i, (rng, size) in enumerate(zip(self._rngs, sizes, strict=True)):
+            walk[:, i] = rng.random((n_steps, 2 * n_users), np.float32)
+            pick[:, i, : 2 + size] = rng.random((n_steps, 2 + size), np.float32)
+        walks = self._world_array(walk.reshape(n_steps, len(runs), n_users, 2))
+        picks = torch.from_numpy(pick).to(self.device)
+        return walks, picks[..., 0], picks[..., 1], picks[..., 2:]
+
+    def _layouts(self) -> Array:
+        """Draws for where users start, in each run's environment or a fresh layout, `[N, U, 2]`."""
+        shape = (self.population.scenario.n_users, 2)
+        own = [
+            rng.random(shape, np.float32) if run.environment is None else layout(run.environment, shape)
+            for rng, run in zip(self._rngs, self.population.runs, strict=True)
+        ]
+        return self._world_array(np.stack(own))
+
+    def _world_array(self, values: np.ndarray) -> Array:
+        return values if self._on_host else torch.from_numpy(values).to(self.device)
+
+    def _tensor(self, values: Array) -> Tensor:
+        """What a world says, for the learner; without a copy."""
+        return torch.from_numpy(values) if self._on_host else values
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything that later episodes depend on: arrays, and values that JSON can hold."""
+        parts = {
+            "learner": self.learner.state(),
+            "buffer": self._buffer.state(),
+            "world": {name: torch.as_tensor(v) for name, v in asdict(self._worlds.state).items()},
+            "books": {name: torch.as_tensor(v) for name, v in self._books.state().items()},
+        }
+        arrays = {f"{part}.{name}": v for part, values in parts.items() for name, v in values.items()}
+        arrays["curves"] = torch.from_numpy(self._curves[: self.n_flown])
+        return arrays, {"n_flown": self.n_flown, "rngs": [rng.bit_generator.state for rng in self._rngs]}
+
+    def restore(self, arrays: dict[str, Tensor], values: dict[str, Any]) -> None:
+        """Becomes what gave the state, which had the same population, device and library of worlds."""
+
+        def part(name: str) -> dict[str, Tensor]:
+            return {key.partition(".")[2]: v for key, v in arrays.items() if key.startswith(f"{name}.")}
+
+        def in_worlds(name: str) -> dict[str, Array]:
+            return {key: self._world_array(v.numpy()) for key, v in part(name).items()}
+
+        self.learner.restore(part("learner"))
+        self._buffer.restore(part("buffer"))
+        self._worlds.state = world.State(**in_worlds("world"))
+        self._books.restore(in_worlds("books"))
+        self.n_flown = values["n_flown"]
+        self._curves[: self.n_flown] = arrays["curves"].numpy()
+        for rng, state in zip(self._rngs, values["rngs"], strict=True):
+            rng.bit_generator.state = state
+
+
+def layout(environment: int, shape: tuple[int, int]) -> np.ndarray:
+    """Draws for where users start in an environment, float32 `[U, 2]`: as in the mission with that seed."""
+    return np.random.default_rng(environment).random(shape).astype(np.float32)
+
+
+def architecture(population: Population, run: Run) -> network.Architecture:
+    """Sizes of a run's network."""
+    return network.Architecture(
+        n_inputs=observations.size(population.observation, population.scenario),
+        hidden=population.hidden,
+        n_actions=len(ACTION_LABELS),
+        dueling=run.aggregation if run.algorithm == "dueling_dqn" else None,
+    )
+
+
+def rewards(runs: Sequence[Run], array: Callable[[np.ndarray], Array]) -> Rewards:
+    """How each run's world pays, `[N]`."""
+    terms = [run.reward for run in runs]
+    weights = {
+        name: array(np.array([getattr(one, name) for one in terms], np.float32))
+        for name in ("beta", "zeta", "data_scale_bits")
+    }
+    return Rewards(
+        **weights,
+        r_plus=array(np.array([one.r_plus == "exponential" for one in terms])),
+        form=array(np.array([one.form == "episode" for one in terms])),
+    )
