@@ -110,8 +110,8 @@ def _sum_of_others(received_w: Array) -> Array:
     """
     xp = array_namespace(received_w)
     strongest = xp.argmax(received_w, axis=-1, keepdims=True)
-    is_strongest = constant(range(received_w.shape[-1]), strongest) == strongest
-    weaker_w = xp.where(is_strongest, xp.zeros_like(received_w), received_w)
+    is_weaker = constant(range(received_w.shape[-1]), strongest) != strongest
+    weaker_w = received_w * xp.astype(is_weaker, received_w.dtype)
     return xp.sum(weaker_w, axis=-1, keepdims=True) + (
         xp.max(received_w, axis=-1, keepdims=True) - received_w
     )
