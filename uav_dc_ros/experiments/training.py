@@ -65,7 +65,7 @@ class Training:
         capacity = population.runs[0].hyperparameters.buffer_size
         self._buffer = ReplayBuffer(len(population.runs), capacity, architectures[0].n_inputs, device)
         paid = rewards(population.runs, self._world_array)
-        self._worlds = BatchWorld(population.scenario, self._layouts(), paid)
+        self._worlds = BatchWorld(population.scenario, self._layouts(1)[0], paid)
         self._books = Books(population.scenario, self._worlds.state.total_reward)
         self._curves = np.full(
             (population.n_episodes, len(CURVES), len(population.runs)), np.nan, dtype=np.float32
@@ -83,8 +83,9 @@ class Training:
         Under `on_arrival` several missions may fit into them.
         """
         scenario, worlds, kind = self.population.scenario, self._worlds, self.population.observation
-        n_steps = scenario.mission.max_steps
+        n_steps, on_arrival = scenario.mission.max_steps, scenario.mission.episode_end == "on_arrival"
         walk, explore, choice, replay = self._draws(n_steps)
+        starts = self._layouts(n_steps if on_arrival else 1)
         loss = torch.zeros(len(self.population.runs), device=self.device)
         observation = self._tensor(worlds.observe(kind))
         for t in range(n_steps):
@@ -97,10 +98,10 @@ class Training:
             self._books.add(worlds.state, outcome)
             # The device is not asked whether a mission is over: under `at_time_limit` only the last step
             # ends one, under `on_arrival` every step can.
-            if scenario.mission.episode_end == "on_arrival" or t == n_steps - 1:
+            if on_arrival or t == n_steps - 1:
                 over = outcome.terminated | outcome.truncated
                 self._books.close(over, worlds.state, outcome)
-                worlds.restart(over, self._layouts())
+                worlds.restart(over, starts[t - n_steps])
                 next_observation = self._tensor(worlds.observe(kind))
             observation = next_observation
         self._curves[self.n_flown] = [*self._books.take(), (loss / n_steps).cpu().numpy()]
@@ -119,14 +120,14 @@ class Training:
         picks = torch.from_numpy(pick).to(self.device)
         return walks, picks[..., 0], picks[..., 1], picks[..., 2:]
 
-    def _layouts(self) -> Array:
-        """Draws for where users start, in each run's environment or a fresh layout, `[N, U, 2]`."""
+    def _layouts(self, n: int) -> Array:
+        """Draws for where users start n times, in each run's environment or anew, `[n, N, U, 2]`."""
         shape = (self.population.scenario.n_users, 2)
-        own = [
-            rng.random(shape, np.float32) if run.environment is None else layout(run.environment, shape)
-            for rng, run in zip(self._rngs, self.population.runs, strict=True)
-        ]
-        return self._world_array(np.stack(own))
+        starts = np.empty((n, len(self.population.runs), *shape), np.float32)
+        for i, (rng, run) in enumerate(zip(self._rngs, self.population.runs, strict=True)):
+            own = None if run.environment is None else layout(run.environment, shape)
+            starts[:, i] = rng.random((n, *shape), np.float32) if own is None else own
+        return self._world_array(starts)
 
     def _world_array(self, values: np.ndarray) -> Array:
         return values if self._on_host else torch.from_numpy(values).to(self.device)
