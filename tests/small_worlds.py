@@ -9,7 +9,8 @@ import numpy as np
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import network, policy
 from uav_dc_ros.agents.policy import Hyperparameters, PolicyConfig
-from uav_dc_ros.core.scenario import Scenario, from_values
+from uav_dc_ros.core.scenario import Reward, Scenario, from_values
+from uav_dc_ros.experiments.runs import Population, Run
 
 
 def changed(shipped: str, **tables: Any) -> Scenario:
@@ -46,6 +47,24 @@ def config(scenario: Scenario, **values: Any) -> PolicyConfig:
         "scenario": msgspec.to_builtins(scenario),
     }
     return PolicyConfig(**defaults | values)
+
+
+def run(scenario: Scenario, seed: int = 0, **values: Any) -> Run:
+    """A small run: `run(tiny(), 3, algorithm="dqn", gamma=0.5, beta=2.0)`, whichever part a value is of."""
+    learning: dict[str, Any] = {"episodes": 4, "batch_size": 8, "buffer_size": 100, "target_every": 10}
+    paid = {key: values.pop(key) for key in Reward.__struct_fields__ if key in values}
+    learning |= {key: values.pop(key) for key in Hyperparameters.__struct_fields__ if key in values}
+    return Run(
+        seed=seed,
+        reward=msgspec.structs.replace(scenario.reward, **paid),
+        hyperparameters=Hyperparameters(**learning),
+        **{"algorithm": "dueling_dqn"} | values,
+    )
+
+
+def population(scenario: Scenario, *runs: Run, **values: Any) -> Population:
+    """Runs side by side in a scenario; small unless told."""
+    return Population(**{"observation": "mission", "hidden": (8, 8)} | values, scenario=scenario, runs=runs)
 
 
 def saved(folder: Path, scenario: Scenario, **values: Any) -> Path:

@@ -110,6 +110,32 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_picture_that_fails_leaves_nothing_behind(tmp_path):
+    def draw(made, partial):
+        (partial / policy.TRAJECTORY).touch()
+        raise RuntimeError("no ink")
+
+    made = config(tiny())
+    parameters = network.initial(made.architecture(tiny()), np.random.default_rng(0))
+    with pytest.raises(RuntimeError, match="no ink"):
+        policy.save(tmp_path / "new", made, parameters, lambda _: "", draw)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_are_drawn_of_what_was_read_back_beside_it(tmp_path):
+    made = config(tiny())
+    parameters = network.initial(made.architecture(tiny()), np.random.default_rng(0))
+    drawn = []
+
+    def draw(loaded, partial):
+        drawn.append((loaded.sha256, sorted(path.name for path in partial.iterdir())))
+        (partial / policy.TRAJECTORY).write_bytes(b"ink")
+
+    policy.save(tmp_path / "new", made, parameters, lambda _: "# test\n", draw)
+    assert drawn == [(policy.load(tmp_path / "new").sha256, [policy.CARD, policy.CONFIG, policy.MODEL])]
+    assert (tmp_path / "new" / policy.TRAJECTORY).read_bytes() == b"ink"
+
+
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(PolicyError, match="cannot be written"):
@@ -219,6 +245,7 @@ def test_names_are_folders_with_a_config(tmp_path, monkeypatch, folder):
     shutil.copytree(folder, tmp_path / "policies" / "b")
     shutil.copytree(folder, tmp_path / "policies" / "a")
     (tmp_path / "policies" / "a.checkpoints").mkdir()
+    shutil.copytree(folder, tmp_path / "policies" / ".c.123.partial")  # left by a killed training
     monkeypatch.setattr(policy.resources, "folder", lambda name: tmp_path / name)
     assert policy.names() == ["a", "b"]
     assert policy.load("b").folder == tmp_path / "policies" / "b"

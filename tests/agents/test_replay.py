@@ -56,3 +56,22 @@ def test_sampling_is_uniform_and_stays_inside():
     counts = torch.bincount(buffer.sample(draws).reward[0].to(torch.int64), minlength=8)
     # 10 000 expected in each of 8 slots; chi-squared with 7 degrees of freedom is below 24.3 in 999 of 1000.
     assert ((counts - 10_000.0) ** 2 / 10_000.0).sum() < 24.3
+
+
+@pytest.mark.parametrize("n", [0, 4, 10, 23])
+def test_a_restored_buffer_holds_the_same_in_the_same_places(n):
+    """Empty, not full, just full, and wrapped round: what is added next replaces what it would have."""
+    buffer, restored = filled(n), ReplayBuffer(2, 10, 3, torch.device("cpu"))
+    restored.restore({name: values.clone() for name, values in buffer.state().items()})
+    draws = torch.rand((2, 40), generator=torch.Generator().manual_seed(0))
+    for value in range(n, n + 12):
+        for one in (buffer, restored):
+            one.add(transitions(value))
+        assert len(buffer) == len(restored)
+        for expected, found in zip(buffer.sample(draws), restored.sample(draws), strict=True):
+            assert torch.equal(expected, found)
+
+
+def test_what_it_hands_out_is_only_what_it_holds():
+    assert filled(4).state()["rows"].shape == (2, 4, 9)
+    assert filled(23).state()["rows"].shape == (2, 10, 9)

@@ -180,7 +180,8 @@ class Policy:
 def names() -> list[str]:
     """Names of the shipped policies."""
     root = resources.folder("policies")
-    return sorted(path.parent.name for path in root.glob(f"*/{CONFIG}"))
+    # Hidden is what a killed `save` has left behind.
+    return sorted(path.parent.name for path in root.glob(f"[!.]*/{CONFIG}"))
 
 
 def load(name_or_path: str | Path) -> Policy:
