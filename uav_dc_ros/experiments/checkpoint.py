@@ -14,6 +14,8 @@ from uav_dc_ros.experiments.runs import Population
 from uav_dc_ros.experiments.training import Training
 
 _FORMAT = 1
+# What reading bytes that are no state can end in.
+_DAMAGED = (OSError, SafetensorError, msgspec.DecodeError, KeyError, TypeError, RuntimeError, ValueError)
 
 
 def save(path: Path, training: Training, progress: dict[str, Any]) -> None:
@@ -62,7 +64,7 @@ def restore(path: Path, training: Training) -> dict[str, Any]:
             raise TrainingError(f"{path}: format is {values['format']}; expected {_FORMAT}")
         _check(values["population"], _plain(training.population), path)
         training.restore(arrays, values)
-    except (OSError, SafetensorError, msgspec.DecodeError, KeyError, RuntimeError, ValueError) as error:
+    except _DAMAGED as error:
         raise TrainingError(f"{path}: cannot be read, or not the state of a training: {error}") from None
     return dict(values["progress"])
 
@@ -79,6 +81,8 @@ def _check(saved: Any, wanted: Any, path: Path, key: str = "") -> None:
     elif isinstance(saved, list) and isinstance(wanted, list) and len(saved) == len(wanted):
         for i, (one, other) in enumerate(zip(saved, wanted, strict=True)):
             _check(one, other, path, f"{key}[{i}]")
+    elif isinstance(saved, list) and isinstance(wanted, list):
+        _check(len(saved), len(wanted), path, f"the number of {key}")
     elif saved != wanted:
         raise TrainingError(
             f"{path} is the state of a training with {key} = {saved!r}; "

@@ -54,8 +54,10 @@ class Scalars:
                 self._add(f"training/{name}", values[-1])
 
     def add_scores(self, scores: Array) -> None:
-        """Writes what a validation found, `[N]`."""
+        """Writes what a validation found, `[N]`, and puts everything until now on the disk."""
         self._add("validation/users_brought_home", scores)
+        for writer in self._writers:
+            writer.flush()
 
     def _add(self, name: str, values: Array) -> None:
         for writer, value in zip(self._writers, values.tolist() if self._writers else [], strict=True):

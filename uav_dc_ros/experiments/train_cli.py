@@ -1,6 +1,7 @@
 """The command line of `python -m uav_dc_ros.train`: options, checkpoints, the result."""
 
 import argparse
+import contextlib
 import math
 import shlex
 import shutil
@@ -11,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import msgspec
-from rich.console import Console
 
 from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import network, policy
@@ -100,20 +100,25 @@ def _train(options: argparse.Namespace, command: str) -> int:
 
     folder = options.out.with_name(f"{options.out.name}.checkpoints")
     saved = folder / "training.safetensors"
-    resumed = options.resume and saved.is_file()
-    _reserve(options.out, folder, resumed)
-    training = Training(population, device)
+    policy.refuse_existing(options.out)
+    try:
+        training = Training(population, device)
+    except (MemoryError, RuntimeError) as error:  # torch says with the latter that memory is short
+        raise TrainingError(f"the training cannot be set up: {str(error).splitlines()[0]}") from None
     progress: dict[str, Any] = {"score": None, "run": 0, "best": None, "seconds": 0.0}
-    if resumed:
+    if options.resume and saved.is_file():
         progress = checkpoint.restore(saved, training)
-        _discard_later(folder, training.n_flown)
+        policy.load(folder / progress["best"])  # the result of what follows, unless there is a better one
+    _reserve(folder, options.resume, training.n_flown)
     started = time.monotonic() - progress["seconds"]
     try:
         with ExitStack() as stack:
+            stack.callback(_discard_empty, folder)
             display = stack.enter_context(Display(training, options.checkpoint_every))
             scalars = stack.enter_context(Scalars(options.tensorboard, options.out.name, training))
             while training.n_flown < population.n_episodes:
                 training.fly_episode()
+                scalars.add_episode()
                 last = training.n_flown == population.n_episodes
                 if training.n_flown % options.checkpoint_every == 0 or last:
                     scores = validate(training)
@@ -121,14 +126,13 @@ def _train(options: argparse.Namespace, command: str) -> int:
                         progress |= {"score": float(scores.max()), "run": int(scores.argmax())}
                         progress["best"] = _save_best(folder, config, training, progress, command)
                     progress["seconds"] = time.monotonic() - started
-                    checkpoint.save(saved, training, progress)
                     scalars.add_scores(scores)
+                    checkpoint.save(saved, training, progress)
                 score = math.nan if progress["score"] is None else progress["score"]
                 display.show(Report.of(training, score))
-                scalars.add_episode()
     except KeyboardInterrupt:
         if not saved.is_file():
-            shutil.rmtree(folder)
+            shutil.rmtree(folder, ignore_errors=True)
             kept = "there is no checkpoint yet"
         else:
             kept = f"the best policy until now is {folder / progress['best']}; --resume goes on"
@@ -144,7 +148,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     )
     shutil.rmtree(folder)
     brought = f"{progress['score']:.1f} of {shipped.n_users} users brought home in validation"
-    Console().print(f"{options.out}: {brought}")
+    print(f"{options.out}: {brought}")
     return 0
 
 
@@ -164,28 +168,31 @@ def _population(config: PolicyConfig, name: str, n_runs: int) -> Population:
     return Population(scenario=scenario, observation=config.observation, hidden=config.hidden, runs=runs)
 
 
-def _reserve(out: Path, checkpoints: Path, resumed: bool) -> None:
-    """Makes the folder for checkpoints beside `out`: an hour later is too late to find out that one cannot.
+def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
+    """Makes the folder for checkpoints: an hour later is too late to find out that one cannot.
+
+    One that is there already is taken only to resume. What a killed training had saved in it after the
+    state that it is resumed from, if any, is removed.
 
     Raises:
-        PolicyError: it, unless the training is resumed, or `out` exists.
+        PolicyError: it exists, and is not to be resumed.
         TrainingError: it cannot be made.
     """
-    policy.refuse_existing(out)
-    if resumed:
-        return
-    policy.refuse_existing(checkpoints)
+    if not resume:
+        policy.refuse_existing(folder)
     try:
-        checkpoints.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=resume)
     except OSError as error:
-        raise TrainingError(f"{checkpoints} cannot be made: {error.strerror}") from None
+        raise TrainingError(f"{folder} cannot be made: {error.strerror}") from None
+    for best in folder.glob("episode_*"):
+        if int(best.name.removeprefix("episode_")) > n_flown:
+            shutil.rmtree(best)
 
 
-def _discard_later(folder: Path, n_flown: int) -> None:
-    """Removes best policies that a killed training had saved after the state that it is resumed from."""
-    for later in folder.glob("episode_*"):
-        if int(later.name.removeprefix("episode_")) > n_flown:
-            shutil.rmtree(later)
+def _discard_empty(folder: Path) -> None:
+    """Removes a folder for checkpoints in which there is none: it would be in the next command's way."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 def _save_best(
