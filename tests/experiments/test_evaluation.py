@@ -3,7 +3,10 @@
 import json
 import subprocess
 import sys
+from importlib.resources import files
+from typing import get_type_hints
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,7 +14,18 @@ from tests.small_worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.env.gym_env import DataCollectionEnv
-from uav_dc_ros.experiments.evaluate import evaluate, rows, steer
+from uav_dc_ros.experiments import evaluate_cli
+from uav_dc_ros.experiments.bootstrap import interval
+from uav_dc_ros.experiments.evaluate import (
+    Evaluation,
+    Figure,
+    Report,
+    compare,
+    evaluate,
+    judge,
+    rows,
+    steer,
+)
 from uav_dc_ros.experiments.evaluate_cli import main
 from uav_dc_ros.experiments.fly import flight, fly
 
@@ -80,6 +94,106 @@ def test_on_arrival_a_mission_ends_there():
     assert missions.landed.tolist() == [True, False]
 
 
+def plan(*actions):
+    """Whoever flies the same course in every mission."""
+    return lambda state: np.full(state.step.shape, actions[state.step[0]])
+
+
+def test_a_figure_is_over_the_missions_that_have_it():
+    scenario = tiny()
+    flown = judge("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, range(20))
+    figures, missions = flown.evaluation, fly(scenario, plan(1, 1, 2, 2, 6, 6, 6, 6), range(20))
+    assert figures.landing_rate == Figure(n=20, mean=1.0, low=1.0, high=1.0, min=1.0, max=1.0)
+    assert figures.arrival_step.mean == 4.0
+    mean, low, high = interval(missions.data_bits)
+    data = figures.data_bits
+    assert (data.n, data.mean, data.low, data.high) == (20, mean, low, high)
+    assert (data.min, data.max) == (missions.data_bits.min(), missions.data_bits.max())
+    assert data.min < data.low < data.mean < data.high < data.max
+
+    lost = judge("hover", None, plan(*[6] * 8), scenario, range(20)).evaluation
+    assert lost.landing_rate.mean == 0.0
+    assert lost.arrival_step == Figure(n=0)
+    once = judge("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, [7]).evaluation
+    assert (once.data_bits.low, once.data_bits.high) == (None, None), "one mission has no interval"
+    assert ("arrival step", "4.0", "-", "4.0", "4.0") in rows(once)
+
+
+def test_policies_are_compared_mission_by_mission():
+    scenario = tiny()
+    late = judge("late", None, plan(6, 6, 1, 1, 2, 2, 6, 6), scenario, range(20))
+    soon = judge("soon", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, range(20))
+    comparison = compare(late, soon)
+    assert (comparison.policy, comparison.baseline) == ("late", "soon")
+    differences = comparison.differences
+    assert differences["arrival_step"] == Figure(n=20, mean=2.0, low=2.0, high=2.0, min=2.0, max=2.0)
+    by_hand = late.values["data_bits"] - soon.values["data_bits"]
+    assert tuple(interval(by_hand)) == tuple(
+        getattr(differences["data_bits"], key) for key in ("mean", "low", "high")
+    )
+    figures = {name for name, kind in get_type_hints(Evaluation).items() if kind is Figure}
+    assert set(differences) == figures, "no figure is left out"
+
+    lost = judge("hover", None, plan(*[6] * 8), scenario, range(20))
+    assert compare(lost, soon).differences["arrival_step"].n == 0, "only one of the two landed"
+    assert compare(lost, soon).differences["landing_rate"].mean == -1.0
+
+
+def test_every_policy_flies_in_every_scenario_and_is_compared_with_the_first(tmp_path, capsys):
+    made = saved(tmp_path / "made", scenarios.load("five_clusters"), observation="position")
+    arguments = ["--policy", "tour", made, "--scenario", "five_clusters", "three_clusters", "--seeds", 3]
+    with pytest.raises(SystemExit) as exit:
+        main([*map(str, arguments), "--json", str(tmp_path / "x.json")])
+    assert exit.value.code == 0
+    report = msgspec.json.decode((tmp_path / "x.json").read_bytes(), type=Report)
+    flown = [(one.policy, one.scenario) for one in report.evaluations]
+    fields = ("five_clusters", "three_clusters")
+    assert flown == [(who, where) for where in fields for who in ("tour", "test")]
+    compared = [(one.policy, one.baseline, one.scenario) for one in report.comparisons]
+    assert compared == [("test", "tour", where) for where in fields]
+    out = capsys.readouterr().out
+    assert "Means and their 95% bootstrap intervals, 3 missions, seeds 0 to 2" in out
+    assert out.count("less tour") == 2
+    for evaluation in report.evaluations:
+        mean = evaluation.users_collected.mean
+        assert f"{mean:.1f}" in out
+
+
+def test_policies_of_one_name_are_told_apart_by_their_folders(tmp_path, capsys):
+    three = scenarios.load("three_clusters")
+    folders = [str(saved(tmp_path / name, three, name="same")) for name in ("a", "b")]
+    with pytest.raises(SystemExit):
+        main(["--policy", *folders, "--seeds", "2"])
+    out = capsys.readouterr().out
+    assert all(f"{folder} in three_clusters, 30 users" in out for folder in folders)
+
+
+def test_scenarios_of_one_name_are_refused(tmp_path, capsys):
+    copy = tmp_path / "copy.toml"
+    copy.write_bytes((files(scenarios) / "three_clusters.toml").read_bytes())
+    with pytest.raises(SystemExit) as exit:
+        main(["--policy", "tour", "--scenario", "three_clusters", str(copy)])
+    assert exit.value.code == 2
+    assert "expected a different `name` in each file" in capsys.readouterr().err
+
+
+def test_nothing_is_flown_before_all_is_known_to_fit(tmp_path, capsys, monkeypatch):
+    made = str(saved(tmp_path / "made", scenarios.load("three_clusters")))
+    monkeypatch.setattr(evaluate_cli, "judge", None)
+    monkeypatch.setattr(evaluate_cli, "save_mission_picture", None)
+    scenario = ["--scenario", "three_clusters", "five_clusters"]
+    for arguments, complaint in (
+        (["tour", made, *scenario], "'test' does not fit scenario 'five_clusters'"),
+        ([made, "--json", str(tmp_path)], f"{tmp_path} cannot be written: Is a directory"),
+        ([made, "--json", "/nowhere/x", "--picture", "x.png"], "/nowhere/x cannot be written"),
+        ([made, "--picture", "/nowhere/x.png"], "/nowhere/x.png cannot be written"),
+    ):
+        with pytest.raises(SystemExit) as exit:
+            main(["--policy", *arguments])
+        assert exit.value.code == 2
+        assert complaint in capsys.readouterr().err
+
+
 def test_the_command_prints_and_writes_figures(tmp_path):
     made = saved(tmp_path / "made", scenarios.load("three_clusters"))
     picture = tmp_path / "mission.png"
@@ -87,12 +201,15 @@ def test_the_command_prints_and_writes_figures(tmp_path):
         "--policy", made, "--seeds", 4, "--json", tmp_path / "x.json", "--picture", picture
     )
     assert (status, err) == (0, "")
-    (written,) = json.loads((tmp_path / "x.json").read_text())
+    report = json.loads((tmp_path / "x.json").read_text())
+    (written,) = report["evaluations"]
+    assert report["comparisons"] == []
     expected = evaluate(policy.load(made), scenarios.load("three_clusters"), range(4))
-    assert written["users_collected"]["mean"] == expected.users_collected.mean
+    assert written["users_collected"] == msgspec.to_builtins(expected.users_collected)
     assert written["sha256"] == policy.load(made).sha256
     assert written["scenario"] == "three_clusters"
     assert all(title in out for title, *_ in rows(expected))
+    assert "Means and their" not in out, "nothing to compare"
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
@@ -110,7 +227,15 @@ def test_the_command_prints_and_writes_figures(tmp_path):
             "/nowhere/x.png cannot be written",
         ),
         (["--policy", "MADE", "--seeds", "2", "--picture", "x.mission"], "x.mission cannot be written"),
-        (["--policy", "MADE", "MADE", "--picture", "x.png"], "expected one policy"),
+        (
+            ["--policy", "MADE", "tour", "--scenario", "three_clusters", "--picture", "x.png"],
+            "expected one policy",
+        ),
+        (["--policy", "MADE", "MADE"], "given 2 times; expected once"),
+        (
+            ["--policy", "tour", "--scenario", "three_clusters", "three_clusters"],
+            "given 2 times; expected once",
+        ),
         (["--policy", "MADE", "--seed", "3"], "--seed 3"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -74,7 +74,7 @@ def test_evaluate_compares_policies_with_planners(tmp_path, capsys):
         main([*arguments, "--json", str(figures)])
     assert ended.value.code == 0
     assert "tour in five_clusters" in capsys.readouterr().out
-    learnt, planned = json.loads(figures.read_text())
+    learnt, planned = json.loads(figures.read_text())["evaluations"]
     assert (learnt["policy"], planned["policy"]) == ("five_clusters_dueling", "tour")
     assert len(learnt["sha256"]) == 64
     assert planned["sha256"] is None

@@ -3,7 +3,7 @@
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.experiments.evaluate import TEST_SEEDS, evaluate, rows
+from uav_dc_ros.experiments.evaluate import COLUMNS, TEST_SEEDS, evaluate, rows
 
 _ALGORITHMS = {"dqn": "DQN", "dueling_dqn": "Dueling DQN"}
 _LIMITS = {
@@ -30,7 +30,8 @@ def card(policy: Policy, scenario: Scenario, command: str, n_runs: int, seconds:
     hidden = " and ".join(map(str, config.hidden))
     first, last = TEST_SEEDS[0], TEST_SEEDS[-1]
     algorithm, n_users = _ALGORITHMS[config.algorithm], scenario.n_users
-    table = "\n".join(f"| {' | '.join(row)} |" for row in rows(evaluate(policy, scenario)))
+    lines = (COLUMNS, ["---"] * len(COLUMNS), *rows(evaluate(policy, scenario)))
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"""# {config.name}
 
 {algorithm} for the scenario `{scenario.name}`, with the `{config.observation}` observation,
@@ -54,10 +55,8 @@ hidden layers of {hidden} units and {len(config.actions)} actions.
 
 {len(TEST_SEEDS)} missions, seeds {first} to {last}, flown greedily, each with a fresh layout of its users.
 Rewards are those of the scenario as it is shipped: {_reward(scenario)}.
-The arrival step is over missions that landed.
+The arrival step is over missions that landed. Intervals of the mean are by the bootstrap.
 
-| | mean | least | greatest |
-| --- | --- | --- | --- |
 {table}
 
 ## Limits

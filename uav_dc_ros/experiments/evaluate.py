@@ -1,9 +1,9 @@
 """Evaluation of policies over many missions. Needs numpy only, but for the picture."""
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -11,9 +11,11 @@ import numpy as np
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
+from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.batch import observe
 from uav_dc_ros.errors import UavDcError
+from uav_dc_ros.experiments.bootstrap import interval
 from uav_dc_ros.experiments.fly import Act, Missions, flight, fly
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
@@ -21,11 +23,23 @@ TEST_SEEDS = range(100)
 
 
 class Figure(msgspec.Struct, frozen=True, kw_only=True):
-    """One quantity over missions: mean, least and greatest; null where no mission has it."""
+    """One quantity over missions; null where it cannot be known.
 
-    mean: float | None
-    min: float | None
-    max: float | None
+    Attributes:
+        n: missions that have it.
+        mean: over these missions.
+        low, high: ends of the 95% bootstrap interval of the mean; of two missions or more. Where all
+            missions are alike it has no width: after 100 landings of 100 it says nothing of the odds of
+            a rare failure.
+        min, max: least and greatest.
+    """
+
+    n: int
+    mean: float | None = None
+    low: float | None = None
+    high: float | None = None
+    min: float | None = None
+    max: float | None = None
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
@@ -37,7 +51,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
         version: of the package that flew.
         seeds: first seed and number of seeds.
         users_total: users in the field.
-        landing_rate: share of missions that landed.
+        landing_rate: 1 for a mission that landed, else 0.
         users_collected, steps: counts per mission.
         arrival_step: step after which the UAV stayed over the dock; missions that landed only.
         sum_rate_bps: mean over the steps of a mission, bit/s.
@@ -53,7 +67,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     version: str
     seeds: tuple[int, int]
     users_total: int
-    landing_rate: float
+    landing_rate: Figure
     users_collected: Figure
     steps: Figure
     arrival_step: Figure
@@ -61,6 +75,44 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     data_bits: Figure
     reward: Figure
     episode_return: Figure
+
+
+class Comparison(msgspec.Struct, frozen=True, kw_only=True):
+    """Two policies in the same missions, mission by mission.
+
+    Attributes:
+        policy, baseline: who is compared with whom.
+        scenario, fingerprint, seeds: as in `Evaluation`.
+        differences: `policy` less `baseline`, by the name of the figure in `Evaluation`, over the
+            missions in which both have it.
+    """
+
+    policy: str
+    baseline: str
+    scenario: str
+    fingerprint: str
+    seeds: tuple[int, int]
+    differences: dict[str, Figure]
+
+
+class Report(msgspec.Struct, frozen=True, kw_only=True):
+    """What `python -m uav_dc_ros.evaluate --json` writes.
+
+    Attributes:
+        evaluations: one for each policy in each scenario.
+        comparisons: in each scenario, every further policy against the first.
+    """
+
+    evaluations: list[Evaluation]
+    comparisons: list[Comparison]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flown:
+    """An evaluation, and each of its figures mission by mission: `[S]`, NaN where a mission has none."""
+
+    evaluation: Evaluation
+    values: dict[str, Array]
 
 
 def steer(policy: Policy, scenario: Scenario) -> Act:
@@ -75,14 +127,15 @@ def steer(policy: Policy, scenario: Scenario) -> Act:
 
 def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Evaluation:
     """Flies one mission per seed, greedily; raises PolicyError when the policy does not fit."""
-    return judge(policy.name, policy.sha256, steer(policy, scenario), scenario, seeds)
+    return judge(policy.name, policy.sha256, steer(policy, scenario), scenario, seeds).evaluation
 
 
-def judge(name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Sequence[int]) -> Evaluation:
+def judge(name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Sequence[int]) -> Flown:
     """Flies one mission per seed with whoever steers by `act`."""
     missions = fly(scenario, act, seeds)
-    figures = {f.name: _figure(getattr(missions, f.name)) for f in fields(Missions) if f.name != "landed"}
-    return Evaluation(
+    values = {f.name: np.asarray(getattr(missions, f.name), np.float64) for f in fields(Missions)}
+    values["landing_rate"] = values.pop("landed")
+    evaluation = Evaluation(
         policy=name,
         sha256=sha256,
         scenario=scenario.name,
@@ -90,41 +143,67 @@ def judge(name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Se
         version=__version__,
         seeds=(seeds[0], len(seeds)),
         users_total=scenario.n_users,
-        landing_rate=float(np.mean(missions.landed)),
-        **figures,
+        **{figure: _figure(of_missions) for figure, of_missions in values.items()},
+    )
+    return Flown(evaluation=evaluation, values=values)
+
+
+def compare(flown: Flown, baseline: Flown) -> Comparison:
+    """`flown` less `baseline`, which has flown the same seeds in the same scenario."""
+    mine, other = flown.evaluation, baseline.evaluation
+    return Comparison(
+        policy=mine.policy,
+        baseline=other.policy,
+        scenario=mine.scenario,
+        fingerprint=mine.fingerprint,
+        seeds=mine.seeds,
+        differences={name: _figure(flown.values[name] - baseline.values[name]) for name in TITLES},
     )
 
 
-def _figure(values: np.ndarray) -> Figure:
+def _figure(values: Array) -> Figure:
     known = values[np.isfinite(values)]
     if not known.size:
-        return Figure(mean=None, min=None, max=None)
-    return Figure(mean=float(known.mean()), min=float(known.min()), max=float(known.max()))
+        return Figure(n=0)
+    mean, low, high = interval(known) if known.size > 1 else (float(known[0]), None, None)
+    return Figure(n=known.size, mean=mean, low=low, high=high, min=float(known.min()), max=float(known.max()))
 
 
-# Title, attribute, what to divide by, decimals: the rows of every table of an evaluation.
-_ROWS = (
-    ("users collected", "users_collected", 1.0, 1),
-    ("steps", "steps", 1.0, 1),
-    ("arrival step", "arrival_step", 1.0, 1),
-    ("sum-rate, Mbit/s", "sum_rate_bps", 1e6, 3),
-    ("data, Mbit", "data_bits", 1e6, 1),
-    ("reward r^t at the end", "reward", 1.0, 3),
-    ("return", "episode_return", 1.0, 3),
-)
+# Of each figure: title, what to divide by, decimals.
+_SHOWN = {
+    "landing_rate": ("landing rate", 1.0, 2),
+    "users_collected": ("users collected", 1.0, 1),
+    "steps": ("steps", 1.0, 1),
+    "arrival_step": ("arrival step", 1.0, 1),
+    "sum_rate_bps": ("sum-rate, Mbit/s", 1e6, 3),
+    "data_bits": ("data, Mbit", 1e6, 1),
+    "reward": ("reward r^t at the end", 1.0, 3),
+    "episode_return": ("return", 1.0, 3),
+}
+TITLES = {name: title for name, (title, _, _) in _SHOWN.items()}
+COLUMNS = ("", "mean", "95% interval", "least", "greatest")
 
 
-def rows(evaluation: Evaluation) -> list[tuple[str, str, str, str]]:
-    """Title, mean, least and greatest of every figure, as text."""
-    table = [("landing rate", f"{evaluation.landing_rate:.2f}", "", "")]
-    for title, attribute, unit, decimals in _ROWS:
-        figure = getattr(evaluation, attribute)
-        cells = [
-            "-" if value is None else f"{value / unit:.{decimals}f}"
-            for value in (figure.mean, figure.min, figure.max)
-        ]
-        table.append((title, cells[0], cells[1], cells[2]))
+def rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    """What stands in the `COLUMNS` of every figure, as text."""
+    table: list[tuple[str, ...]] = []
+    for name, title in TITLES.items():
+        figure: Figure = getattr(evaluation, name)
+        # Of landings, which are 0 or 1, the least and the greatest say nothing.
+        extremes = ("", "") if name == "landing_rate" else (_text(name, figure.min), _text(name, figure.max))
+        table.append((title, *mean_and_interval(name, figure), *extremes))
     return table
+
+
+def mean_and_interval(name: str, figure: Figure, sign: Literal["", "+"] = "") -> tuple[str, str]:
+    """A figure's mean, and the ends of its interval, as text; with `+` also positive numbers have a sign."""
+    low, high = _text(name, figure.low, sign), _text(name, figure.high, sign)
+    return _text(name, figure.mean, sign), "-" if figure.low is None else f"{low} to {high}"
+
+
+def _text(name: str, value: float | None, sign: str = "") -> str:
+    _, unit, decimals = _SHOWN[name]
+    return "-" if value is None else f"{value / unit:{sign}z.{decimals}f}"
 
 
 def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) -> None:
