@@ -174,7 +174,7 @@ def test_scenarios_of_one_name_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit) as exit:
         main(["--policy", "tour", "--scenario", "three_clusters", str(copy)])
     assert exit.value.code == 2
-    assert "expected a different `name` in each file" in capsys.readouterr().err
+    assert "their names are three_clusters, three_clusters; expected different" in capsys.readouterr().err
 
 
 def test_nothing_is_flown_before_all_is_known_to_fit(tmp_path, capsys, monkeypatch):

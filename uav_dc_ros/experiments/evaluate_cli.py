@@ -116,23 +116,32 @@ def main(argv: list[str] | None = None) -> None:
 
 def _flights(wanted: Sequence[str], where: Sequence[str]) -> list[tuple[Pilot, Scenario]]:
     """Who flies where, in the order of the results: every policy in each scenario, or in its own."""
-    pilots = [_pilot(given) for given in wanted]
-    named = _unique([pilot.name for pilot in pilots], wanted, "--policy")
-    pilots = [pilot._replace(name=name) for pilot, name in zip(pilots, named, strict=True)]
-    worlds = [scenarios.load(given) for given in where]
-    if _unique([world.name for world in worlds], where, "--scenario") != [world.name for world in worlds]:
-        raise UavDcError(
-            f"--scenario {' '.join(where)}: names are {', '.join(world.name for world in worlds)}; "
-            "expected a different `name` in each file"
-        )
-    if worlds:
+    for option, given in (("--policy", wanted), ("--scenario", where)):
+        for one in given:
+            if given.count(one) > 1:
+                raise UavDcError(f"{option} {one} is given {given.count(one)} times; expected once")
+    pilots = [_pilot(one) for one in wanted]
+    names = [pilot.name for pilot in pilots]
+    pilots = [  # a table must tell them apart
+        pilot._replace(name=one) if names.count(pilot.name) > 1 else pilot
+        for pilot, one in zip(pilots, wanted, strict=True)
+    ]
+    if where:
+        worlds = [scenarios.load(one) for one in where]
+        names = [world.name for world in worlds]
+        if len(set(names)) < len(names):
+            raise UavDcError(
+                f"--scenario {' '.join(where)}: their names are {', '.join(names)}; expected different ones"
+            )
         return [(pilot, world) for world in worlds for pilot in pilots]
+    flights = []
     for pilot in pilots:
         if pilot.home is None:
             raise UavDcError(
                 f"--policy {pilot.name}: a planner has no scenario of its own; expected --scenario"
             )
-    return [(pilot, scenarios.load(pilot.home)) for pilot in pilots if pilot.home is not None]
+        flights.append((pilot, scenarios.load(pilot.home)))
+    return flights
 
 
 def _pilot(given: str) -> Pilot:
@@ -140,14 +149,6 @@ def _pilot(given: str) -> Pilot:
         return Pilot(given, None, None, PLANNERS[given])
     policy = policies.load(given)
     return Pilot(policy.name, policy.sha256, policy.scenario.name, partial(steer, policy))
-
-
-def _unique(names: list[str], given: Sequence[str], option: str) -> list[str]:
-    """The names, or what was given for those that share one: a table must tell them apart."""
-    for one in given:
-        if given.count(one) > 1:
-            raise UavDcError(f"{option} {one} is given {given.count(one)} times; expected once")
-    return [g if names.count(name) > 1 else name for name, g in zip(names, given, strict=True)]
 
 
 def _refuse_unwritable(path: Path) -> None:
