@@ -5,8 +5,9 @@
 An agent step is one environment step and one gradient step. Scenario, network and hyperparameters are
 those of `benchmarks/learner.py`; the environment is the one that Gymnasium users get. Prints one line of
 JSON, with the rate as stable-baselines3 comes, and the best that was found with its settings: eight
-environments side by side (with as many gradient steps) and torch's fused Adam. One thread was faster than
-two. Needs `pip install stable-baselines3`, best in a virtual environment of its own.
+environments side by side (with as many gradient steps) and torch's fused Adam. One thread of torch is the
+default: two were slower as it comes, and no faster at its best. Needs `pip install stable-baselines3`, best
+in a virtual environment of its own.
 """
 
 import json
