@@ -35,7 +35,7 @@ def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float |
     Returns:
         y, `[...]`.
     """
-    return reward + gamma * torch.where(terminated, 0.0, next_q.amax(dim=-1))
+    return reward + gamma * next_q.amax(dim=-1).masked_fill_(terminated, 0.0)
 
 
 class Member(NamedTuple):
@@ -62,29 +62,37 @@ class Learner:
         self._target_every = settings[0].target_every
         self._iterations = 0
 
-        def column(values: list[float]) -> Tensor:
+        def column(values: Sequence[float]) -> Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)[:, None]
 
         self._gamma = column([values.gamma for values in settings])
         self._epsilon = column([values.epsilon for values in settings])[:, 0]
-        self._dueling = column([float(one.dueling is not None) for one in self._architectures])
-        self._subtracts_max = column([float(one.dueling == "max") for one in self._architectures]) > 0
-        self._any_max = bool(self._subtracts_max.any())
+        kinds = [one.dueling for one in self._architectures]
+        self._dueling = column([float(kind is not None) for kind in kinds])
+        self._subtracts_max = column([float(kind == "max") for kind in kinds]) > 0
+        self._any_dueling, self._any_max = any(kinds), "max" in kinds
         sizes = [values.batch_size for values in settings]
-        # Weight of each row in its run's mean; rows beyond a run's batch size count for nothing.
+        # Twice the weight of each row in its run's mean, as the gradient of a square has it; rows beyond
+        # a run's batch size count for nothing.
         rows = torch.arange(max(sizes), device=device)
-        self._weight = (rows < column([float(size) for size in sizes])) / column([float(s) for s in sizes])
+        self._weight = 2.0 * (rows < column(sizes)) / column(sizes)
 
         made = [_stacked(network.initial(member.architecture, member.rng)) for member in members]
-        self._theta = {
-            name: torch.from_numpy(np.stack([one[name] for one in made])).to(device) for name in made[0]
-        }
-        self._theta_target = {name: values.clone() for name, values in self._theta.items()}
-        self._gradient = {name: torch.zeros_like(values) for name, values in self._theta.items()}
+        stacks = {name: torch.from_numpy(np.stack([one[name] for one in made])) for name in made[0]}
+        # One piece of memory each, which the optimiser walks through in one go; the layers are views of it.
+        self._flat = torch.cat([values.reshape(-1) for values in stacks.values()]).to(device)
+        self._flat_target, self._flat_gradient = self._flat.clone(), torch.zeros_like(self._flat)
+        shapes = {name: values.shape for name, values in stacks.items()}
+        self._theta, self._theta_target, self._gradient = (
+            _layers(flat, shapes) for flat in (self._flat, self._flat_target, self._flat_gradient)
+        )
         self._optimiser = self._adam([values.learning_rate for values in settings])
 
     def _adam(self, rates: list[float]) -> torch.optim.Adam:
-        """Adam, with a parameter group for each stretch of neighbouring runs that share a learning rate."""
+        """Adam; with a parameter group for each stretch of neighbouring runs that share a learning rate."""
+        if len(set(rates)) == 1:
+            self._flat.grad = self._flat_gradient
+            return torch.optim.Adam([self._flat], lr=rates[0], fused=True)
         groups = []
         for rate, stretch in groupby(range(len(rates)), lambda run: rates[run]):
             runs = list(stretch)
@@ -126,14 +134,13 @@ class Learner:
         *features, head = self._forward(self._theta, batch.observation)
         action = batch.action[:, None]  # [N, 1, B], as the head is [N, 1 + A, B]
         error = self._q(head).gather(1, action)[:, 0] - y
-        loss = torch.sum(self._weight * error * error, dim=-1)
-        self._backward(features, head, action, 2.0 * self._weight * error)
+        d_q = self._weight * error
+        self._backward(features, head, action, d_q)
         self._optimiser.step()
         self._iterations += 1
         if self._iterations % self._target_every == 0:
-            for name, values in self._theta.items():
-                self._theta_target[name].copy_(values)
-        return loss
+            self._flat_target.copy_(self._flat)
+        return 0.5 * torch.sum(d_q * error, dim=-1)
 
     def _forward(self, theta: dict[str, Tensor], observation: Tensor) -> list[Tensor]:
         """Input of every layer, `[N, B, *]`, then the output of the head, `[N, 1 + A, B]`."""
@@ -148,31 +155,35 @@ class Learner:
     def _q(self, head: Tensor) -> Tensor:
         """Q-values from the output of the head, `[N, 1 + A, B]` to `[N, A, B]` (eqs. 28 to 30)."""
         value, advantage = head[:, :1], head[:, 1:]
+        if not self._any_dueling:
+            return advantage
         subtracted = advantage.mean(1, keepdim=True)
         if self._any_max:
             greatest = advantage.amax(1, keepdim=True)
             subtracted = torch.where(self._subtracts_max[..., None], greatest, subtracted)
-        return advantage + self._dueling[..., None] * (value - subtracted)
+        return torch.addcmul(advantage, self._dueling[..., None], value - subtracted)
 
     def _backward(self, features: list[Tensor], head: Tensor, action: Tensor, d_q: Tensor) -> None:
         """Writes the gradient, from that of the Q-values of the actions taken, `[N, B]`."""
         gradient, n_actions = self._gradient, head.shape[1] - 1
-        d_value = self._dueling * d_q
         d_head = torch.zeros_like(head)
-        d_head[:, 0] = d_value
         d_advantage = d_head[:, 1:]
-        d_mean = torch.where(self._subtracts_max, 0.0, d_value) if self._any_max else d_value
-        d_advantage.sub_(d_mean[:, None] / n_actions)
-        if self._any_max:
-            greatest = head[:, 1:].argmax(1, keepdim=True)
-            d_advantage.scatter_add_(1, greatest, torch.where(self._subtracts_max, -d_value, 0.0)[:, None])
+        if self._any_dueling:
+            d_value = d_head[:, :1]
+            torch.mul(self._dueling, d_q, out=d_head[:, 0])
+            to_max = self._subtracts_max[..., None]
+            d_mean = d_value.masked_fill(to_max, 0.0) if self._any_max else d_value
+            d_advantage.copy_(d_mean / -n_actions)
+            if self._any_max:
+                greatest = head[:, 1:].argmax(1, keepdim=True)
+                d_advantage.scatter_add_(1, greatest, d_value.masked_fill(~to_max, 0.0).neg_())
         d_advantage.scatter_add_(1, action, d_q[:, None])
 
         torch.bmm(d_head, features[-1], out=gradient["head.weight"])
         torch.sum(d_head, 2, keepdim=True, out=gradient["head.bias"])
         d_features = torch.bmm(d_head.mT, self._theta["head.weight"])
         for i in reversed(range(self._n_hidden)):
-            d_before = d_features.mul_(features[i + 1].sign())  # ReLU: what passed is positive, the rest 0
+            d_before = d_features.mul_(features[i + 1].sign_())  # ReLU: what passed is positive, the rest 0
             torch.bmm(features[i].mT, d_before, out=gradient[f"hidden_{i}.weight"])
             torch.sum(d_before, 1, keepdim=True, out=gradient[f"hidden_{i}.bias"])
             if i > 0:
@@ -185,17 +196,15 @@ class Learner:
 
     def state(self) -> dict[str, Tensor]:
         """Everything that a later `update` depends on."""
-        state = {f"theta.{name}": values for name, values in self._theta.items()}
-        state |= {f"theta_target.{name}": values for name, values in self._theta_target.items()}
+        state = {"theta": self._flat, "theta_target": self._flat_target}
         for i, moments in self._optimiser.state_dict()["state"].items():
             state |= {f"adam.{i}.{key}": values for key, values in moments.items()}
         return state | {"iterations": torch.tensor(self._iterations)}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Becomes what gave `state`, which had the same members."""
-        for name in self._theta:
-            self._theta[name].copy_(state[f"theta.{name}"])
-            self._theta_target[name].copy_(state[f"theta_target.{name}"])
+        self._flat.copy_(state["theta"])
+        self._flat_target.copy_(state["theta_target"])
         adam = self._optimiser.state_dict()
         moments: dict[int, dict[str, Tensor]] = {}
         for name, values in state.items():
@@ -204,6 +213,12 @@ class Learner:
                 moments.setdefault(int(i), {})[key] = values
         self._optimiser.load_state_dict(adam | {"state": moments})
         self._iterations = int(state["iterations"])
+
+
+def _layers(flat: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
+    """Views of one piece of memory as layers, one behind the other."""
+    pieces = torch.split(flat, [shape.numel() for shape in shapes.values()])
+    return {name: piece.view(shape) for piece, (name, shape) in zip(pieces, shapes.items(), strict=True)}
 
 
 def _stacked(parameters: network.Parameters) -> network.Parameters:

@@ -1,6 +1,6 @@
 """The mission's books: who is served, what is collected, has the UAV landed."""
 
-from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.arrays import Array, array_namespace
 
 
 def served(distance_m: Array, collected: Array, d_cons_m: float) -> Array:
@@ -40,14 +40,14 @@ def collect(
         stays collected for this mission.
     """
     xp = array_namespace(data_bits)
-    data_bits = data_bits + xp.where(served, rate_bps * step_s, xp.zeros_like(rate_bps))
+    data_bits = data_bits + rate_bps * step_s * xp.astype(served, rate_bps.dtype)
     return data_bits, collected | (data_bits >= r_min_bits)
 
 
 def sum_rate(served: Array, rate_bps: Array) -> Array:
     """Sum of the rates of the served users, bit/s, `[...]`."""
     xp = array_namespace(rate_bps)
-    return xp.sum(xp.where(served, rate_bps, xp.zeros_like(rate_bps)), axis=-1)
+    return xp.sum(rate_bps * xp.astype(served, rate_bps.dtype), axis=-1)
 
 
 def at_dock(cell: Array, dock_cell: tuple[int, int]) -> Array:
@@ -55,12 +55,13 @@ def at_dock(cell: Array, dock_cell: tuple[int, int]) -> Array:
 
     The paper measures the way to the destination horizontally, and calls X_target a set.
     """
-    xp = array_namespace(cell)
-    return xp.all(cell[..., :2] == constant(dock_cell, cell), axis=-1)
+    east, north = dock_cell
+    return (cell[..., 0] == east) & (cell[..., 1] == north)
 
 
 def dock_distance_cells(cell: Array, dock_cell: tuple[int, int], like: Array) -> Array:
     """Horizontal distance to the dock, in cells, `[...]`, with the dtype of `like`."""
     xp = array_namespace(cell)
-    offset = xp.astype(cell[..., :2] - constant(dock_cell, cell), like.dtype)
-    return xp.sqrt(xp.sum(offset * offset, axis=-1))
+    east, north = dock_cell
+    dx, dy = xp.astype(cell[..., 0] - east, like.dtype), xp.astype(cell[..., 1] - north, like.dtype)
+    return xp.sqrt(dx * dx + dy * dy)

@@ -7,6 +7,7 @@ import numpy as np
 from uav_dc_ros.core.arrays import Array
 
 _RESAMPLES = 10_000
+_BLOCK = 1_000_000  # values resampled at a time
 
 
 class Interval(NamedTuple):
@@ -28,6 +29,12 @@ def interval(values: Array, level: float = 0.95) -> Interval:
         level: probability that the interval is meant to cover.
     """
     values = np.asarray(values, np.float64)
-    rows = np.random.default_rng(0).integers(0, len(values), (_RESAMPLES, len(values)))
-    low, high = np.quantile(values[rows].mean(axis=-1), [(1 - level) / 2, (1 + level) / 2])
+    rng, n = np.random.default_rng(0), len(values)
+    # In blocks, so that a large sample needs no memory for all of its resamples at once.
+    block = max(1, min(_RESAMPLES, _BLOCK // n))
+    means = [
+        values[rng.integers(0, n, (min(block, _RESAMPLES - done), n))].mean(axis=-1)
+        for done in range(0, _RESAMPLES, block)
+    ]
+    low, high = np.quantile(np.concatenate(means), [(1 - level) / 2, (1 + level) / 2])
     return Interval(float(values.mean()), float(low), float(high))

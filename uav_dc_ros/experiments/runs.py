@@ -3,11 +3,14 @@
 from typing import Annotated
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from uav_dc_ros.agents import network
 from uav_dc_ros.agents.policy import Algorithm, Hyperparameters
+from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.scenario import Reward, Scenario
+from uav_dc_ros.env import observations
 from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import TrainingError
 
@@ -63,3 +66,18 @@ class Population(msgspec.Struct, frozen=True, kw_only=True):
     def n_episodes(self) -> int:
         """Episodes of each run."""
         return self.runs[0].hyperparameters.episodes
+
+
+def layout(environment: int, shape: tuple[int, int]) -> np.ndarray:
+    """Draws for where users start in an environment, float32 `[U, 2]`: as in the mission with that seed."""
+    return np.random.default_rng(environment).random(shape).astype(np.float32)
+
+
+def architecture(population: Population, run: Run) -> network.Architecture:
+    """Sizes of a run's network."""
+    return network.Architecture(
+        n_inputs=observations.size(population.observation, population.scenario),
+        hidden=population.hidden,
+        n_actions=len(ACTION_LABELS),
+        dueling=run.aggregation if run.algorithm == "dueling_dqn" else None,
+    )

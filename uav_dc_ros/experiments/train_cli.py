@@ -267,7 +267,9 @@ def _device(name: str, n_threads: int) -> "torch.device":
         raise TrainingError(
             'torch is not installed; expected it from: pip install "uav_dc_ros[train]"'
         ) from None
-    torch.set_num_threads(n_threads)
+    from uav_dc_ros.experiments.training import prepare_torch
+
+    prepare_torch(n_threads)
     try:
         torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:

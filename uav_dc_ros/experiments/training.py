@@ -14,20 +14,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uav_dc_ros.agents import network
 from uav_dc_ros.agents.dqn import Learner, Member
 from uav_dc_ros.agents.replay import ReplayBuffer, Transitions
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.reward import Rewards
-from uav_dc_ros.env import observations
 from uav_dc_ros.env.batch import BatchWorld
 from uav_dc_ros.experiments.books import CURVES, Books
-from uav_dc_ros.experiments.runs import Population, Run
+from uav_dc_ros.experiments.runs import Population, Run, architecture, layout
 
 # Makes a run's stream another one than that of the mission with the same seed.
 _TRAINING_STREAM = 1
+
+
+def prepare_torch(n_threads: int) -> None:
+    """What every process that trains does first: equal settings give equal results."""
+    torch.set_num_threads(n_threads)
+    # Adam's moments of a unit that died fade for ever; as denormal numbers they would slow every step.
+    torch.set_flush_denormal(True)
 
 
 class Training:
@@ -165,21 +169,6 @@ class Training:
         self._curves[: self.n_flown] = arrays["curves"].numpy()
         for rng, state in zip(self._rngs, values["rngs"], strict=True):
             rng.bit_generator.state = state
-
-
-def layout(environment: int, shape: tuple[int, int]) -> np.ndarray:
-    """Draws for where users start in an environment, float32 `[U, 2]`: as in the mission with that seed."""
-    return np.random.default_rng(environment).random(shape).astype(np.float32)
-
-
-def architecture(population: Population, run: Run) -> network.Architecture:
-    """Sizes of a run's network."""
-    return network.Architecture(
-        n_inputs=observations.size(population.observation, population.scenario),
-        hidden=population.hidden,
-        n_actions=len(ACTION_LABELS),
-        dueling=run.aggregation if run.algorithm == "dueling_dqn" else None,
-    )
 
 
 def rewards(runs: Sequence[Run], array: Callable[[np.ndarray], Array]) -> Rewards:

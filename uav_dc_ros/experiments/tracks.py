@@ -1,0 +1,25 @@
+"""A single mission, kept step by step for its picture. Needs matplotlib."""
+
+from dataclasses import fields
+from typing import Any
+
+from uav_dc_ros.core import world
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.env.render import Track
+from uav_dc_ros.experiments.fly import Act, flight
+
+
+def fly_track(scenario: Scenario, act: Act, seed: int, layout: Array | None = None) -> Track:
+    """Flies the mission with a seed; its users start as the seed says, or by the draws `layout` `[U, 2]`."""
+
+    def alone(batch: Any) -> Any:
+        return type(batch)(**{f.name: getattr(batch, f.name)[0, 0] for f in fields(batch)})
+
+    track = Track(scenario)
+    for state, outcome in flight(scenario, act, [seed], runs=(1,), layouts=[layout]):
+        link: world.Link | None = alone(outcome.link) if outcome else None
+        track.add(alone(state), link)
+        if outcome and (outcome.terminated | outcome.truncated).all():
+            break
+    return track
