@@ -3,8 +3,6 @@
 import json
 import os
 import re
-import subprocess
-import sys
 
 import msgspec
 import numpy as np
@@ -202,35 +200,3 @@ def test_a_failure_leaves_the_older_one_and_nothing_else(path, monkeypatch):
     assert list(path.parent.iterdir()) == [path]
     with pytest.raises(TrainingError, match="cannot be written"):
         checkpoint.save(path / "below", training, {})
-
-
-KILLED = """
-import os, pathlib, signal, sys, torch
-from tests.experiments.test_checkpoint import made, fly, CPU
-from uav_dc_ros.experiments import checkpoint
-from uav_dc_ros.experiments.training import Training
-torch.set_num_threads(1)
-training = fly(Training(made(), CPU), 1)
-here = pathlib.Path(sys.argv[1])
-checkpoint.save(here / "replace.safetensors", training, {"n": 1})
-checkpoint.save(here / "fsync.safetensors", training, {"n": 1})
-fly(training, 1)
-kill = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-for owner, name in ((pathlib.Path, "replace"), (os, "fsync")):
-    if os.fork() == 0:
-        setattr(owner, name, kill)
-        checkpoint.save(here / f"{name}.safetensors", training, {"n": 2})
-        os._exit(3)  # not reached
-    assert os.waitstatus_to_exitcode(os.wait()[1]) == -signal.SIGKILL
-"""
-
-
-def test_a_kill_in_the_midst_of_writing_leaves_the_older_one(tmp_path):
-    subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=True)
-    left = sorted(path.name for path in tmp_path.iterdir())
-    assert len(left) == 4, "two states, and beside each what the kill interrupted"
-    assert all(re.fullmatch(r"\.\w+\.safetensors\.\d+\.partial", name) for name in left[:2])
-    for name in ("replace", "fsync"):
-        training = Training(made(), CPU)
-        assert checkpoint.restore(tmp_path / f"{name}.safetensors", training) == {"n": 1}
-        assert training.n_flown == 1

@@ -1,9 +1,14 @@
 """`python -m uav_dc_ros.train`, as a user runs it."""
 
+import itertools
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -50,11 +55,24 @@ data_scale_bits = 6e6
 """
 
 
+PICTURES = [policy.LEARNING_CURVE, policy.TRAJECTORY]
+
+
 @pytest.fixture
 def field(tmp_path):
     path = tmp_path / "tiny.toml"
     path.write_text(TINY)
     return path
+
+
+def refused(capsys, *arguments):
+    """The one line with which a command is refused, with status 2."""
+    with pytest.raises(SystemExit) as exit:
+        main([str(argument) for argument in arguments])
+    err = capsys.readouterr().err
+    assert exit.value.code == 2, err
+    assert len(err.splitlines()) == 1, err
+    return err
 
 
 def start(*arguments):
@@ -78,11 +96,17 @@ def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
     arguments = ["--scenario", field, "--algo", "dueling_dqn", "--out", out, "--observation", "map"]
     arguments += ["--episodes", 6, "--runs", 2, "--seed", 5, "--checkpoint-every", 3, "--hidden", 12, 10]
     arguments += ["--batch-size", 16, "--gamma", 0.8, "--beta", 3, "--reward-form", "immediate"]
+    arguments += ["--tensorboard", tmp_path / "scalars"]
     status, printed, progress = command(*arguments)
     assert status == 0, progress
     assert "brought home in validation" in printed
     assert [line.split()[1] for line in progress.splitlines()] == ["3", "6"], "plain lines off a terminal"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["made", "tiny.toml"], "no checkpoint is left"
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["made", "scalars", "tiny.toml"], "no checkpoint is left"
+    assert sorted(path.name for path in (tmp_path / "scalars" / "made").iterdir()) == ["seed_5", "seed_6"]
+    files = sorted(path.name for path in out.iterdir())
+    assert files == sorted([policy.CONFIG, policy.MODEL, policy.CARD, *PICTURES])
+    assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in PICTURES)
 
     made = policy.load(out)
     assert made.config.hidden == (12, 10)
@@ -119,39 +143,33 @@ def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
         (["--out", "a policy"], "--out is 'a policy'; expected str matching"),
         (["--out", "/proc/made"], "/proc/made.checkpoints cannot be made"),
         (["--overwrite"], "--overwrite"),
+        (["--tensorboard", "/proc/made"], "--tensorboard /proc/made cannot be written"),
+        (["--buffer-size", str(2**50)], "the training cannot be set up"),
+        (["--episodes", str(2**50)], "the training cannot be set up"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_mistake_is_one_line_and_status_2(tmp_path, field, capsys, arguments, complaint):
     options = {"--scenario": field, "--algo": "dqn", "--out": tmp_path / "made", "--episodes": 1}
-    with pytest.raises(SystemExit) as exit:
-        main([str(part) for pair in options.items() for part in pair] + arguments)
-    assert exit.value.code == 2
-    err = capsys.readouterr().err
-    assert complaint in err
-    assert len(err.splitlines()) == 1, err
-    assert not (tmp_path / "made").exists()
+    assert complaint in refused(capsys, *itertools.chain(*options.items()), *arguments)
+    assert list(tmp_path.iterdir()) == [field], "nothing is in the way of the next command"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [(["--scenario", "nowhere"], "'nowhere'"), (["--batch-size", "0"], "--batch-size is 0")],
-    ids=["scenario", "value"],
-)
-def test_so_it_is_for_a_whole_process(tmp_path, field, arguments, complaint):
-    status, out, err = command("--scenario", field, "--algo", "dqn", "--out", tmp_path / "made", *arguments)
+def test_so_it_is_for_a_whole_process(tmp_path, field):
+    status, out, err = command(
+        "--scenario", field, "--algo", "dqn", "--out", tmp_path / "made", "--batch-size", 0
+    )
     assert (status, out) == (2, "")
-    assert complaint in err
+    assert "--batch-size is 0" in err
     assert len(err.splitlines()) == 1, err
 
 
 @pytest.mark.parametrize("existing", ["made", "made.checkpoints"])
-def test_an_existing_folder_is_refused_before_training(tmp_path, field, existing):
+def test_an_existing_folder_is_refused_before_training(tmp_path, field, existing, capsys):
     (tmp_path / existing).mkdir()
-    status, _, err = command("--scenario", field, "--algo", "dqn", "--out", tmp_path / "made")
-    assert status == 2
+    err = refused(capsys, "--scenario", field, "--algo", "dqn", "--out", tmp_path / "made")
     assert f"{existing}' exists; expected a new folder" in err
-    assert len(err.splitlines()) == 1
+    assert (tmp_path / existing).is_dir()
 
 
 def test_without_torch_there_is_one_line_that_helps(tmp_path, field):
@@ -178,6 +196,267 @@ def test_ctrl_c_keeps_the_best_checkpoint(tmp_path, field):
     assert process.returncode == 130
     last = err.splitlines()[-1]
     assert "stopped; the best policy until now is" in last
-    folder = last.rsplit(maxsplit=1)[-1]
+    folder, _, hint = last.rpartition(" is ")[-1].partition("; ")
+    assert hint == "--resume goes on"
     assert policy.load(folder).config.episode >= 2
     assert not (tmp_path / "made").exists()
+
+
+def test_ctrl_c_before_the_first_checkpoint_leaves_nothing(tmp_path, field, capsys, monkeypatch):
+    def interrupted(training):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("uav_dc_ros.experiments.training.Training.fly_episode", interrupted)
+    with pytest.raises(SystemExit) as exit:
+        main(["--scenario", str(field), "--algo", "dqn", "--out", str(tmp_path / "made")])
+    assert exit.value.code == 130
+    assert capsys.readouterr().err.endswith("stopped; there is no checkpoint yet\n")
+    assert list(tmp_path.iterdir()) == [field]
+
+
+# A command that learns: its best policy is not that of its first checkpoint.
+LEARNS = {
+    "--algo": "dueling_dqn", "--seed": 4, "--runs": 2, "--episodes": 30, "--checkpoint-every": 10,
+    "--hidden": 16, "--beta": 4, "--zeta": 4, "--reward-form": "immediate", "--target-every": 50,
+    "--epsilon": 0.7, "--learning-rate": 0.003, "--buffer-size": 200,
+}  # fmt: skip
+# What is called, which of its calls a kill comes to, whether before or after it, and the checkpoints that
+# are still to come when the training goes on.
+MOMENTS = {
+    "never": (None, [10, 20, 30]),
+    "before the first state": (("os.fsync", 1, "before"), [10, 20, 30]),
+    "before a state takes its name": (("pathlib.Path.replace", 2, "before"), [20, 30]),
+    "in the midst of writing a best policy": (("uav_dc_ros.agents.policy.load", 2, "before"), [20, 30]),
+    "between a best policy and its state": (
+        ("uav_dc_ros.experiments.train_cli._save_best", 2, "after"),
+        [20, 30],
+    ),
+    "between two checkpoints": (
+        ("uav_dc_ros.experiments.training.Training.fly_episode", 23, "after"),
+        [30],
+    ),
+    "in the midst of writing the result": (("uav_dc_ros.experiments.train_cli._draw", 1, "before"), []),
+}
+# Runs commands in children of one process, to import torch once; prints the status after each.
+FORKS = """
+import json, os, pkgutil, signal, sys
+import matplotlib.figure, torch.utils.tensorboard, torch._dynamo
+from uav_dc_ros.experiments import pictures, train_cli, training
+
+
+def kill_at(path, call, when):
+    owner, name = path.rsplit(".", 1)
+    owner, calls = pkgutil.resolve_name(owner), []
+    function = getattr(owner, name)
+
+    def killing(*arguments, **values):
+        calls.append(None)
+        if len(calls) == call and when == "before":
+            os.kill(os.getpid(), signal.SIGKILL)
+        result = function(*arguments, **values)
+        if len(calls) == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    setattr(owner, name, killing)
+
+
+for moment, arguments in json.loads(sys.argv[1]):
+    child = os.fork()
+    if child == 0:
+        if moment:
+            kill_at(*moment)
+        try:
+            train_cli.main(arguments)
+        except SystemExit as exit:
+            sys.stderr.flush()
+            os._exit(exit.code)
+    print("status", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+def learns(folder, **others):
+    """Arguments of the command, with its result in a folder."""
+    values = {"--scenario": folder.parent / "tiny.toml", "--out": folder / "made"} | LEARNS | others
+    return [str(part) for pair in values.items() for part in pair]
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    """A folder for each moment: `killed` as a kill left it, `made` as `--resume` then ended."""
+    root = tmp_path_factory.mktemp("killed")
+    (root / "tiny.toml").write_text(TINY)
+    jobs, expected = [], []
+    for moment, (kill, checkpoints) in MOMENTS.items():
+        (root / moment).mkdir()
+        arguments = learns(root / moment, **{"--tensorboard": root / moment / "scalars"})
+        if kill:
+            jobs.append((kill, arguments))
+            expected.append((-signal.SIGKILL, None))
+        jobs.append((None, [*arguments, "--resume"]))
+        expected.append((0, checkpoints))
+    (root / "left").mkdir()
+    jobs.append((MOMENTS["between two checkpoints"][0], learns(root / "left")))
+    expected.append((-signal.SIGKILL, None))
+    done = subprocess.run(
+        [sys.executable, "-c", FORKS, json.dumps(jobs)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        env=os.environ | {"COLUMNS": "200"},
+    )
+    found, checkpoints = [], []
+    for word, number, *_ in (line.split() for line in done.stdout.splitlines() if " " in line):
+        if word == "episode":
+            checkpoints.append(int(number))
+        elif word == "status":
+            found.append((int(number), checkpoints))
+            checkpoints = []
+    assert [status for status, _ in found] == [status for status, _ in expected], done.stdout
+    for (_, seen), (_, wanted) in zip(found, expected, strict=True):
+        assert wanted is None or seen == wanted, done.stdout
+    return root
+
+
+def result(folder):
+    """Every file of a policy but its card, which tells the time and the command."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != policy.CARD}
+
+
+@pytest.mark.parametrize("moment", list(MOMENTS)[1:])
+def test_a_killed_training_goes_on_to_the_same_result(killed, moment):
+    expected = result(killed / "never" / "made")
+    assert sorted(expected) == sorted([policy.CONFIG, policy.MODEL, *PICTURES])
+    found = result(killed / moment / "made")
+    for name, content in expected.items():
+        assert found[name] == content, name
+    assert not (killed / moment / "made.checkpoints").exists()
+    assert policy.load(killed / moment / "made").config.episode > 10, "the best came late enough to matter"
+
+
+@pytest.mark.parametrize("moment", list(MOMENTS)[1:])
+def test_its_scalars_are_those_of_a_training_never_interrupted(killed, moment):
+    for seed in (4, 5):
+        expected = scalars(killed / "never" / "scalars" / "made" / f"seed_{seed}")
+        assert [step for step, _ in expected["training/reward"]] == list(range(1, 31))
+        assert [step for step, _ in expected["validation/users_brought_home"]] == [10, 20, 30]
+        assert scalars(killed / moment / "scalars" / "made" / f"seed_{seed}") == expected
+
+
+def scalars(folder):
+    """Step and value of every scalar, by TensorBoard's own reader."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    read = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    read.Reload()
+    return {tag: [(event.step, event.value) for event in read.Scalars(tag)] for tag in read.Tags()["scalars"]}
+
+
+def test_a_process_killed_from_outside_goes_on_to_the_same_result(killed, tmp_path, capsys):
+    (tmp_path / "tiny.toml").write_text(TINY)
+    arguments = learns(tmp_path / "run")
+    state = tmp_path / "run" / "made.checkpoints" / "training.safetensors"
+    process = start(*arguments)
+    deadline_s = time.monotonic() + 60.0
+    while not state.exists() and time.monotonic() < deadline_s:
+        time.sleep(0.001)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert state.exists()
+    with pytest.raises(SystemExit) as exit:
+        main([*arguments, "--resume"])
+    err = capsys.readouterr().err
+    assert exit.value.code == 0, err
+    assert "episode 10 " not in err, "the first ten episodes are not flown again"
+    assert "episode 30 " in err
+    assert result(tmp_path / "run" / "made") == result(killed / "never" / "made")
+
+
+@pytest.fixture
+def left(killed, tmp_path):
+    """What a kill between two checkpoints left, and the field beside it."""
+    (tmp_path / "tiny.toml").write_text(TINY)
+    return Path(shutil.copytree(killed / "left", tmp_path / "left"))
+
+
+def test_what_a_kill_leaves_is_whole(left):
+    folder = left / "made.checkpoints"
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["episode_000010", "episode_000020", "training.safetensors"]
+    best = policy.load(folder / names[1])
+    assert best.config.episode == 20
+    assert "checkpoint" in (folder / names[1] / policy.CARD).read_text()
+    assert not (left / "made").exists()
+
+
+@pytest.mark.parametrize(
+    ("others", "complaint"),
+    [
+        ({"--gamma": 0.5}, "runs[0].hyperparameters.gamma = 0.9; expected 0.5, as in this command"),
+        ({"--seed": 5}, "runs[0].seed = 4; expected 5, as in this command"),
+        ({"--runs": 3}, "the number of runs = 2; expected 3, as in this command"),
+        ({"--beta": 3}, "reward.beta = 4.0; expected 3.0, as in this command"),
+        ({"--hidden": 17}, "hidden[0] = 16; expected 17, as in this command"),
+        ({"--algo": "dqn"}, "runs[0].algorithm = 'dueling_dqn'; expected 'dqn', as in this command"),
+        ({"--episodes": 50}, "hyperparameters.episodes = 30; expected 50, as in this command"),
+        ({"--scenario": "three_clusters"}, "scenario"),
+    ],
+    ids=str,
+)
+def test_the_state_of_another_command_is_refused(left, capsys, others, complaint):
+    before = sorted(left.rglob("*"))
+    err = refused(capsys, *learns(left, **others), "--resume")
+    assert "training.safetensors is the state of a training with" in err
+    assert complaint in err
+    assert sorted(left.rglob("*")) == before, "nothing is lost by a mistake"
+
+
+@pytest.mark.parametrize("size", [0, 7, 1000, -1])
+def test_a_damaged_state_is_refused(left, capsys, size):
+    state = left / "made.checkpoints" / "training.safetensors"
+    state.write_bytes(state.read_bytes()[:size])
+    err = refused(capsys, *learns(left), "--resume")
+    assert "training.safetensors: cannot be read, or not the state of a training" in err
+
+
+def test_a_foreign_file_is_refused(left, capsys):
+    folder = left / "made.checkpoints"
+    shutil.copy(folder / "episode_000010" / policy.MODEL, folder / "training.safetensors")
+    assert "not the state of a training" in refused(capsys, *learns(left), "--resume")
+
+
+def test_a_best_policy_that_is_gone_is_missed_at_once(left, capsys):
+    shutil.rmtree(left / "made.checkpoints" / "episode_000020")
+    assert "episode_000020" in refused(capsys, *learns(left), "--resume")
+
+
+def test_without_resume_what_is_there_is_refused(left, capsys):
+    assert "made.checkpoints' exists" in refused(capsys, *learns(left))
+
+
+def test_a_result_that_is_there_is_refused_also_to_resume(left, capsys):
+    (left / "made").mkdir()
+    assert "made' exists; expected a new folder" in refused(capsys, *learns(left), "--resume")
+
+
+@pytest.mark.parametrize("there", [False, True], ids=["no folder", "an empty folder"])
+def test_resume_without_a_checkpoint_starts(tmp_path, field, there):
+    if there:
+        (tmp_path / "made.checkpoints").mkdir()
+    arguments = [
+        "--scenario",
+        field,
+        "--algo",
+        "dqn",
+        "--out",
+        tmp_path / "made",
+        "--episodes",
+        2,
+        "--resume",
+    ]
+    with pytest.raises(SystemExit) as exit:
+        main([str(argument) for argument in arguments])
+    assert exit.value.code == 0
+    assert policy.load(tmp_path / "made").config.hyperparameters.episodes == 2
