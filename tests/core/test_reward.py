@@ -37,6 +37,21 @@ def test_forms(array):
     np.testing.assert_array_equal(reward.earned(total, before, "episode"), [2.0, 1.0])
 
 
+def test_each_world_may_have_its_own_shape_and_form(array):
+    """As the word says it, world by world, and with the dtype of the numbers."""
+    for dtype in (np.float32, np.float64):
+        cells = array([0.0, 0.0, 2.0, 2.0, 0.5], dtype)
+        exponential = array([True, False, True, False, False])
+        found = reward.r_plus(cells, exponential)
+        assert found.dtype == cells.dtype
+        for i, shape in enumerate(["exponential", "binary", "exponential", "binary", "binary"]):
+            assert found[i] == reward.r_plus(cells, shape)[i]
+        total, before = array([2.0, 1.0, 3.0], dtype), array([0.5, 1.5, 3.0], dtype)
+        earned = reward.earned(total, before, array([True, False, True]))
+        assert earned.dtype == total.dtype
+        np.testing.assert_array_equal(earned, [2.0, -0.5, 3.0])
+
+
 @pytest.mark.parametrize("r_plus", ["binary", "exponential"])
 def test_immediate_rewards_sum_to_the_episode_reward(three, changed, array, r_plus):
     """Over a mission, at every step: the sum of r1 so far, r2, and r^t are one number."""

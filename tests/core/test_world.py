@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from uav_dc_ros.core import grid, world
+from uav_dc_ros.core.reward import Rewards
 
 BATCHES = [(), (3,), (2, 3)]
 
@@ -301,6 +302,55 @@ def test_shapes_and_types(three, array, batch, dtype):
         check(outcome, of_outcome)
 
 
+# Numbers that float32 holds exactly.
+PAID = [
+    {"beta": 1.0, "zeta": 4.0, "r_plus": "binary", "form": "immediate", "data_scale_bits": 6e6},
+    {"beta": 2.5, "zeta": 0.0, "r_plus": "exponential", "form": "episode", "data_scale_bits": 1e6},
+    {"beta": 0.0, "zeta": 0.5, "r_plus": "exponential", "form": "immediate", "data_scale_bits": 2e6},
+    {"beta": 0.5, "zeta": 2.0, "r_plus": "binary", "form": "episode", "data_scale_bits": 6e6},
+]
+
+
+def paid(array, dtype, shape=(-1,)):
+    """`PAID` as the core takes it."""
+
+    def column(name, kind):
+        return array(np.array([one[name] for one in PAID]).reshape(shape), kind)
+
+    return Rewards(
+        beta=column("beta", dtype),
+        zeta=column("zeta", dtype),
+        data_scale_bits=column("data_scale_bits", dtype),
+        r_plus=array(np.array([one["r_plus"] == "exponential" for one in PAID]).reshape(shape)),
+        form=array(np.array([one["form"] == "episode" for one in PAID]).reshape(shape)),
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("batch", [(4,), (4, 3)], ids=str)
+def test_worlds_that_are_paid_in_different_ways_are_each_paid_as_alone(three, changed, array, batch, dtype):
+    """Nothing but the pay differs; each is what a scenario with that reward gives, to the last bit."""
+    draws, actions = flight(three, batch, seed=6)
+    rewards = paid(array, dtype, (4,) + (1,) * (len(batch) - 1))
+    together = world.initial(three, array(draws[0], dtype))
+    alone = [world.initial(three, array(draws[0, i], dtype)) for i in range(4)]
+    scenarios = [changed(three, reward=own) for own in PAID]
+    arrived = False
+    for now, action in zip(draws[1:], actions, strict=True):
+        together, outcome = world.step(three, together, array(action), array(now, dtype), rewards)
+        assert outcome.reward.dtype == together.data_bits.dtype
+        for i in range(4):
+            alone[i], one = world.step(scenarios[i], alone[i], array(action[i]), array(now[i], dtype))
+            for (name, many), (_, single) in zip(
+                [*fields(together), *fields(outcome)], [*fields(alone[i]), *fields(one)], strict=True
+            ):
+                # Torch may add up a batch in another order than a world of its own.
+                close = 0.0 if isinstance(single, np.ndarray) else 10.0 * np.finfo(dtype).eps
+                np.testing.assert_allclose(many[i], single, rtol=close, atol=close, err_msg=name)
+        arrived |= bool((together.cell[..., :2] == 10).any())
+    assert arrived, "R_plus should have come in"
+
+
 @pytest.mark.parametrize(
     "device",
     ["meta", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))],
@@ -311,9 +361,13 @@ def test_everything_follows_the_device_of_the_draws(three, changed, device):
     draws = torch.rand((4, scenario.n_users, 2), device=device)
     actions = torch.zeros(4, dtype=torch.int64, device=device)
     state = world.initial(scenario, draws)
-    state, outcome = world.step(scenario, state, actions, draws)
-    for name, value in [*fields(state), *fields(outcome)]:
-        assert value.device.type == device, name
+    rewards = paid(
+        lambda values, dtype=None: torch.from_numpy(np.array(values, dtype)).to(device), np.float32
+    )
+    for how in (None, rewards):
+        state, outcome = world.step(scenario, state, actions, draws, how)
+        for name, value in [*fields(state), *fields(outcome)]:
+            assert value.device.type == device, name
 
 
 def test_a_mission_begins_at_its_start_with_nothing(three, array):

@@ -15,6 +15,7 @@ from uav_dc_ros.env import observations
 from uav_dc_ros.env.batch import BatchWorld, observe
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments.books import CURVES, Books
 from uav_dc_ros.experiments.evaluate import TEST_SEEDS
 from uav_dc_ros.experiments.fly import fly
 from uav_dc_ros.experiments.progress import Report
@@ -248,14 +249,19 @@ def test_a_fixed_environment_is_the_layout_of_the_mission_with_its_seed(end, wor
 
 
 def flown_by_hand(scenario, one, actions):
-    """The figures of every episode, from a run's actions `[T]`, in the Gymnasium environment."""
+    """The transitions, and the figures of every episode's missions, of a run's actions `[T]`.
+
+    As the Gymnasium environment tells them.
+    """
     values = msgspec.structs.replace(scenario, reward=one.reward)
     env, limit = DataCollectionEnv(values), scenario.mission.max_steps
-    episodes, missions = [], []
-    env.reset(seed=one.environment)
+    transitions, episodes, missions = [], [], []
+    before, _ = env.reset(seed=one.environment)
     paid, rates, arrival, step = 0.0, [], None, 0
     for t, action in enumerate(actions, start=1):
-        _, reward, terminated, truncated, told = env.step(np.int64(action))
+        after, reward, terminated, truncated, told = env.step(np.int64(action))
+        transitions.append(np.concatenate([before, after, [action, reward, terminated]]))
+        before = after
         step += 1
         paid += reward
         rates.append(float(told["sum_rate_bps"]))
@@ -275,17 +281,17 @@ def flown_by_hand(scenario, one, actions):
                     "arrival_step": arrival if landed else limit,
                 }
             )
-            env.reset(seed=one.environment)
+            before, _ = env.reset(seed=one.environment)
             paid, rates, arrival, step = 0.0, [], None, 0
         if t % limit == 0:
             episodes.append(missions)
             missions = []
-    return episodes
+    return np.array(transitions), episodes
 
 
 @pytest.mark.parametrize("worlds_in", ["numpy", "torch"])
 @pytest.mark.parametrize("end", ENDS)
-def test_the_curves_are_what_the_environment_says_of_the_same_actions(end, worlds_in):
+def test_what_is_learnt_from_and_booked_is_what_the_environment_says_of_the_same_actions(end, worlds_in):
     # Nobody walks, so that a run's environment and its actions decide everything.
     scenario = tiny(mission={"episode_end": end, "start_m": [100.0, 200.0, 100.0]}, users={"v_max_mps": 0.0})
     paid = [
@@ -303,7 +309,8 @@ def test_the_curves_are_what_the_environment_says_of_the_same_actions(end, world
     actions = rows[..., 2 * observations.size("mission", scenario)].to(torch.int64).numpy()
     most = 0
     for i, one in enumerate(runs):
-        episodes = flown_by_hand(scenario, one, actions[i])
+        transitions, episodes = flown_by_hand(scenario, one, actions[i])
+        np.testing.assert_allclose(rows[i], transitions, rtol=1e-4, atol=1e-5)
         assert len(episodes) == 8
         most = max(most, *map(len, episodes))
         for name, values in training.curves.items():
@@ -312,8 +319,41 @@ def test_the_curves_are_what_the_environment_says_of_the_same_actions(end, world
                 continue
             expected = [np.mean([mission[name] for mission in missions]) for missions in episodes]
             np.testing.assert_allclose(values[:, i], expected, rtol=2e-4, atol=1e-4, err_msg=f"{i} {name}")
+    assert rows[..., -1].any(), "a mission has terminated"
     assert most == 1 if end == "at_time_limit" else most > 1, "several missions in an episode"
     assert len(set(training.curves["landing_rate"].ravel())) > 1, "some landed, some did not"
+
+
+def test_the_loss_is_the_mean_over_the_iterations(monkeypatch):
+    scenario = tiny()
+    training = Training(population(scenario, *mixed(scenario)), CPU)
+    update, losses = training.learner.update, []
+
+    def noted(batch):
+        losses.append(update(batch))
+        return losses[-1].clone()
+
+    monkeypatch.setattr(training.learner, "update", noted)
+    for n in (1, 2):
+        training.fly_episode()
+        assert len(losses) == 8 * n, "one for each step"
+        expected = torch.stack(losses[-8:]).mean(0)
+        np.testing.assert_allclose(training.curves["loss"][-1], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("library", [np, torch], ids=["numpy", "torch"])
+def test_an_episode_in_which_no_mission_ended_has_no_figures(library):
+    scenario = tiny()
+    worlds = BatchWorld(scenario, library.zeros((2, scenario.n_users, 2)))
+    books = Books(scenario, worlds.state.total_reward)
+    outcome = worlds.step(library.zeros((2,), dtype=library.int64), library.zeros((2, scenario.n_users, 2)))
+    books.add(worlds.state, outcome)
+    second = library.asarray([False, True])
+    books.close(second, worlds.state, outcome)
+    for name, values in zip(CURVES, books.take(), strict=False):
+        assert np.isnan(values[0]), name
+        assert np.isfinite(values[1]), name
+    assert np.isnan(books.take()).all(), "what was taken is gone"
 
 
 @pytest.mark.parametrize("algorithm", ["dqn", "dueling_dqn"])
