@@ -1,0 +1,111 @@
+"""How fast a population learns, as a multiple of stable-baselines3's DQN on the same machine in the same run.
+
+    python benchmarks/learner.py [--peer PYTHON] [--seconds S]
+
+An agent-step is one environment step and one gradient step of batch 32. World, observation (position),
+network (two hidden layers of 64), batch and buffer are those of `benchmarks/sb3_dqn.py`, which runs before
+and after in PYTHON, an interpreter that has stable-baselines3. Each line but the last two is one batch in
+one process on one core; those are as the sweep does it, shards of 64 runs in two processes at a time.
+Imports are not counted on either side.
+"""
+
+import argparse
+import json
+import multiprocessing
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from queue import Queue
+
+import torch
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.agents.policy import Hyperparameters
+from uav_dc_ros.experiments.runs import Population, Run
+from uav_dc_ros.experiments.training import Training, prepare_torch
+
+SHARD = 64
+PEER = Path(__file__).with_name("sb3_dqn.py")
+
+
+def population(n_runs: int) -> Population:
+    """Runs of both algorithms and both forms of the reward, as a sweep has them."""
+    scenario = scenarios.load("five_clusters")
+    runs = [
+        Run(
+            seed=i,
+            environment=i % 5,
+            algorithm=("dqn", "dueling_dqn")[i % 2],
+            reward=scenario.reward,
+            hyperparameters=Hyperparameters(episodes=100_000, buffer_size=50_000),
+        )
+        for i in range(n_runs)
+    ]
+    return Population(scenario=scenario, observation="position", hidden=(64, 64), runs=tuple(runs))
+
+
+def work(n_runs: int, seconds: float, together: Barrier, results: "Queue[tuple[float, float]]") -> None:
+    """Trains one population for a while; reports agent-steps per second and the memory it took, MB."""
+    prepare_torch(n_threads=1)
+    bare_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    training = Training(population(n_runs), torch.device("cpu"))
+    training.fly_episode()
+    together.wait()
+    started, steps = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        training.fly_episode()
+        steps += n_runs * training.population.scenario.mission.max_steps
+    rate = steps / (time.perf_counter() - started)
+    together.wait()  # both were at work until both were done
+    results.put((rate, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - bare_mb))
+
+
+def measure(n_runs: int, processes: int, seconds: float) -> tuple[float, float]:
+    """Agent-steps per second and memory in MB of `processes` batches of `n_runs` side by side."""
+    context = multiprocessing.get_context("spawn")
+    together, results = context.Barrier(processes), context.Queue()
+    workers = [
+        context.Process(target=work, args=(n_runs, seconds, together, results)) for _ in range(processes)
+    ]
+    for worker in workers:
+        worker.start()
+    found = [results.get() for _ in workers]
+    for worker in workers:
+        worker.join()
+    return sum(rate for rate, _ in found), sum(mb for _, mb in found)
+
+
+def peer(python: str) -> tuple[float, float]:
+    """Agent-steps per second of stable-baselines3: with the same settings, and at its best."""
+    done = subprocess.run([python, PEER], check=True, capture_output=True, text=True)
+    figures = json.loads(done.stdout.splitlines()[-1])
+    return figures["agent_steps_per_s"], figures["best_agent_steps_per_s"]
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--peer", default=sys.executable, metavar="PYTHON")
+    parser.add_argument("--seconds", default=8.0, type=float, metavar="S")
+    options = parser.parse_args()
+    peers = [peer(options.peer) for _ in range(2)]
+    lines = [(f"{n} in one batch", *measure(n, 1, options.seconds)) for n in (1, 16, 64, 256, 1024)]
+    # Every further pair of shards takes its turn at the same rate and in the same memory.
+    rate, memory_mb = measure(SHARD, 2, 3 * options.seconds)
+    lines += [(f"{n} as {n // SHARD} shards, 2 at a time", rate, memory_mb) for n in (256, 1024)]
+    peers += [peer(options.peer) for _ in range(2)]
+    same, best = (statistics.median(column) for column in zip(*peers, strict=True))
+    print(f"stable-baselines3: {same:,.0f} agent-steps/s with these settings, {best:,.0f} at its best")
+    print(f"(each of {len(peers)} runs: {', '.join(f'{one:,.0f}' for one, _ in peers)})")
+    print("| runs | agent-steps/s | times stable-baselines3 | times its best | memory, MB |")
+    print("|---|---|---|---|---|")
+    for title, rate, memory_mb in lines:
+        print(f"| {title} | {rate:,.0f} | {rate / same:.1f} | {rate / best:.1f} | {memory_mb:,.0f} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""The sweep: planned runs become shards, shards become results."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError
+
+from uav_dc_ros import cli, scenarios
+from uav_dc_ros.agents import network
+from uav_dc_ros.core import world
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.env.batch import observe
+from uav_dc_ros.env.render import Track
+from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments import shards
+from uav_dc_ros.experiments.paper.plan import FIGURES
+from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results
+from uav_dc_ros.experiments.paper.setting import HIDDEN, OBSERVATION, Planned, Scale, Setting
+from uav_dc_ros.experiments.runs import Population, architecture, layout
+from uav_dc_ros.experiments.shards import Shard, Trained
+from uav_dc_ros.experiments.tracks import fly_track
+
+# Runs of a shard: enough to hide the overhead of an operation, few enough for a core's cache, and enough
+# shards to keep the workers busy to the end.
+_SHARD_RUNS = 64
+# Greedy missions of each run: seeds that no run was trained with and no policy is judged by.
+GREEDY_SEEDS = (2_000_000, 20)
+
+# Trains shards and keeps their results in a folder.
+TrainAll = Callable[[Sequence[Shard], Path], None]
+# Where each run is: what its shard brought, and its place in there.
+Found: TypeAlias = dict[Planned, tuple[Trained, int]]
+# Networks by the environments that they learnt in.
+Trajectories: TypeAlias = dict[int, network.Parameters]
+
+
+def cut(planned: Sequence[Planned], scale: Scale) -> list[tuple[Shard, list[Planned]]]:
+    """The runs as shards, longest first, each with the runs it holds in order."""
+    alike: dict[tuple[str, int], list[Planned]] = defaultdict(list)
+    for one in planned:
+        # A batch up to the paper's 32 costs what 32 costs; only larger ones are kept apart.
+        alike[one.setting.scenario, max(one.setting.batch_size, 32)].append(one)
+    made = []
+    for (scenario, _), runs in alike.items():
+        # Neighbours with one learning rate share a step of the optimiser.
+        runs = sorted(runs, key=lambda one: one.setting.learning_rate)
+        for part in np.array_split(np.arange(len(runs)), -(-len(runs) // _SHARD_RUNS)):
+            own = [runs[i] for i in part]
+            population = _population(scenario, own, scale)
+            made.append((Shard(population=population, greedy_seeds=GREEDY_SEEDS), own))
+    # Longest first, so that no worker begins a long one when the others are done.
+    return sorted(made, key=lambda one: (-one[0].n_steps, one[0].name))
+
+
+def train(planned: Sequence[Planned], scale: Scale, folder: Path, train_all: TrainAll) -> Found:
+    """Trains what is planned, but for shards whose results are in `folder` already."""
+    made = cut(planned, scale)
+    missing = [shard for shard, _ in made if not shards.result_file(folder, shard).is_file()]
+    if missing:
+        train_all(missing, folder)
+    found: Found = {}
+    for shard, own in made:
+        trained = shards.load(folder, shard)
+        found |= {one: (trained, run) for run, one in enumerate(own)}
+    return found
+
+
+def collect(planned: Sequence[Planned], metadata: Metadata, found: Found) -> Results:
+    """What the runs measured, as means over the episodes of a point and over the greedy missions."""
+    n_points, per_point = metadata.scale.n_points, metadata.scale.episodes_per_point
+
+    def curve(one: Planned, name: str) -> Array:
+        trained, run = found[one]
+        return trained.curves[name][: n_points * per_point, run].reshape(n_points, per_point).mean(axis=1)
+
+    def greedy(one: Planned, name: str) -> float:
+        trained, run = found[one]
+        missions, max_steps = trained.greedy, metadata.worlds[one.setting.scenario].max_steps
+        values = {
+            "greedy_reward": missions.reward,
+            "greedy_return": missions.episode_return,
+            "greedy_throughput_bps": missions.sum_rate_bps,
+            "greedy_users_collected": missions.users_collected,
+            "greedy_landing_rate": missions.landed,
+            "greedy_arrival_step": np.where(missions.landed, missions.arrival_step, max_steps),
+        }
+        return float(np.mean(values[name][run]))
+
+    return Results(
+        metadata=metadata,
+        planned=tuple(planned),
+        episode=per_point * (1 + np.arange(n_points)),
+        curves={name: np.stack([curve(one, name) for one in planned]) for name in METRICS},
+        greedy={name: np.array([greedy(one, name) for one in planned], np.float32) for name in GREEDY},
+    )
+
+
+def trajectories(planned: Sequence[Planned], scale: Scale, found: Found) -> Trajectories:
+    """The networks of the figure `Traj`; none when its runs are not planned."""
+    setting = _trajectory_setting(scale)
+    own = {one.environment: found[one] for one in planned if one.setting == setting and one.repeat == 0}
+    return {environment: trained.parameters[run] for environment, (trained, run) in own.items()}
+
+
+def fly_tracks(networks: Trajectories, scale: Scale) -> list[Track]:
+    """A greedy mission of each network in its environment."""
+    setting = _trajectory_setting(scale)
+    population = _population(setting.scenario, [Planned(setting, 0, 0)], scale)
+    scenario, sizes = population.scenario, architecture(population, population.runs[0])
+
+    def track(environment: int) -> Track:
+        def act(state: world.State) -> Array:
+            seen = observe(OBSERVATION, scenario, state)
+            return network.q_values(sizes, networks[environment], seen).argmax(-1)
+
+        return fly_track(scenario, act, GREEDY_SEEDS[0], layout(environment, (scenario.n_users, 2)))
+
+    return [track(environment) for environment in sorted(networks)]
+
+
+def save_trajectories(networks: Trajectories, path: Path) -> None:
+    """Writes the networks, each parameter as `ENVIRONMENT.NAME`."""
+    arrays = {f"{e}.{name}": values for e, own in networks.items() for name, values in own.items()}
+    cli.write_whole(path, safetensors.numpy.save(arrays))
+
+
+def load_trajectories(path: Path) -> Trajectories:
+    """Reads what `save_trajectories` wrote; raises TrainingError for anything else."""
+    networks: Trajectories = defaultdict(dict)
+    try:
+        for key, values in safetensors.numpy.load(path.read_bytes()).items():
+            environment, _, name = key.partition(".")
+            networks[int(environment)][name] = values
+    except (OSError, SafetensorError, ValueError) as error:
+        raise TrainingError(f"{path}: cannot be read: {error}") from None
+    return networks
+
+
+def _trajectory_setting(scale: Scale) -> Setting:
+    (setting,) = FIGURES["Traj"].panels[0].settings(scale)
+    return setting
+
+
+def _population(scenario: str, runs: Sequence[Planned], scale: Scale) -> Population:
+    return Population(
+        scenario=scenarios.load(scenario),
+        observation=OBSERVATION,
+        hidden=HIDDEN,
+        runs=tuple(one.run(scale) for one in runs),
+    )

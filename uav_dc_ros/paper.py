@@ -1,0 +1,6 @@
+"""`python -m uav_dc_ros.paper`: the sweep behind every figure of the paper, and what it says of its claims."""
+
+from uav_dc_ros.experiments.paper.cli import main
+
+if __name__ == "__main__":
+    main()
