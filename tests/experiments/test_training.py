@@ -15,9 +15,10 @@ from uav_dc_ros.env import observations
 from uav_dc_ros.env.batch import BatchWorld, observe
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments import validation
 from uav_dc_ros.experiments.books import CURVES, Books
 from uav_dc_ros.experiments.evaluate import TEST_SEEDS
-from uav_dc_ros.experiments.fly import fly
+from uav_dc_ros.experiments.fly import Missions, fly
 from uav_dc_ros.experiments.progress import Report
 from uav_dc_ros.experiments.runs import architecture
 from uav_dc_ros.experiments.training import Training
@@ -368,7 +369,7 @@ def test_it_learns_to_collect_and_land(algorithm):
     assert curves["landing_rate"][-20:].mean() > curves["landing_rate"][:20].mean() + 0.2
     assert curves["episode_return"][-20:].mean() > curves["episode_return"][:20].mean()
     assert curves["loss"][-20:].mean() < curves["loss"][:20].mean()
-    assert validate(training).max() >= 2.0, "of four users, brought home by a greedy mission"
+    assert validate(training).brought_home.max() >= 2.0, "of four users, brought home by a greedy mission"
 
 
 def test_validation_flies_what_is_exported():
@@ -406,7 +407,33 @@ def test_the_score_counts_users_brought_home():
         np.mean([n if landed else 0 for n, landed in zip(*both, strict=True)])
         for both in zip(missions.users_collected, missions.landed, strict=True)
     ]
-    np.testing.assert_allclose(validate(training), brought)
+    np.testing.assert_allclose(validate(training).brought_home, brought)
+
+
+def test_policies_are_chosen_for_users_first_and_then_for_time(monkeypatch):
+    """Of four users a hundredth is 0.04: one more user in one of a hundred missions does not count."""
+    scenario = tiny()
+    collected = np.full((4, 100), 3)
+    collected[1, 0] = 4
+    collected[2, :10] = 4
+    landed = np.ones((4, 100), bool)
+    landed[3] = False
+    arrival = np.where(landed, np.array([[5.0], [7.0], [8.0], [4.0]]), np.nan)
+    nothing = np.zeros((4, 100))
+    missions = Missions(
+        users_collected=collected,
+        landed=landed,
+        steps=nothing,
+        arrival_step=arrival,
+        sum_rate_bps=nothing,
+        data_bits=nothing,
+        reward=nothing,
+        episode_return=nothing,
+    )
+    monkeypatch.setattr(validation, "fly_greedily", lambda training, seeds: missions)
+    found = validate(Training(population(scenario, *[run(scenario, i) for i in range(4)]), CPU))
+    np.testing.assert_allclose(found.brought_home, [3.0, 3.01, 3.1, 0.0])
+    assert np.argsort(-found.merit).tolist() == [2, 0, 1, 3]
 
 
 def test_nothing_is_chosen_on_the_missions_that_judge():

@@ -105,7 +105,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
         training = Training(population, device)
     except (MemoryError, RuntimeError) as error:  # torch says with the latter that memory is short
         raise TrainingError(f"the training cannot be set up: {str(error).splitlines()[0]}") from None
-    progress: dict[str, Any] = {"score": None, "run": 0, "best": None, "seconds": 0.0}
+    progress: dict[str, Any] = {"merit": None, "score": None, "run": 0, "best": None, "seconds": 0.0}
     if options.resume and saved.is_file():
         progress = checkpoint.restore(saved, training)
         policy.load(folder / progress["best"])  # the result of what follows, unless there is a better one
@@ -121,12 +121,14 @@ def _train(options: argparse.Namespace, command: str) -> int:
                 scalars.add_episode()
                 last = training.n_flown == population.n_episodes
                 if training.n_flown % options.checkpoint_every == 0 or last:
-                    scores = validate(training)
-                    if progress["score"] is None or scores.max() > progress["score"]:
-                        progress |= {"score": float(scores.max()), "run": int(scores.argmax())}
+                    found = validate(training)
+                    if progress["merit"] is None or found.merit.max() > progress["merit"]:
+                        run = int(found.merit.argmax())
+                        progress |= {"run": run, "merit": float(found.merit[run])}
+                        progress["score"] = float(found.brought_home[run])
                         progress["best"] = _save_best(folder, config, training, progress, command)
                     progress["seconds"] = time.monotonic() - started
-                    scalars.add_scores(scores)
+                    scalars.add_scores(found.brought_home)
                     checkpoint.save(saved, training, progress)
                 score = math.nan if progress["score"] is None else progress["score"]
                 display.show(Report.of(training, score))
