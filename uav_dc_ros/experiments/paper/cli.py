@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def _paper(options: argparse.Namespace, command: str) -> int:
     try:
-        from uav_dc_ros.experiments.paper import plan, sweep
+        from uav_dc_ros.experiments.paper import plan, report, sweep
         from uav_dc_ros.experiments.paper.results import RUNS_FILE, Results
     except ModuleNotFoundError as error:
         raise TrainingError(
@@ -73,8 +73,6 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         networks = sweep.load_trajectories(out / TRAJECTORIES_FILE)
     else:
         results, networks = _train(options, command)
-    from uav_dc_ros.experiments.paper import report
-
     report.write(results, sweep.fly_tracks(networks, scale), out, options.only)
     shutil.rmtree(out / "shards", ignore_errors=True)
     Console().print(f"{out}: {len(results.planned)} runs; read {out / report.CLAIMS_FILE}", soft_wrap=True)

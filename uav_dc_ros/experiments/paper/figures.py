@@ -1,0 +1,253 @@
+"""The paper's figures, drawn from the results."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.env.render import PATH_COLOURS, Track, picture
+from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments.bootstrap import interval
+from uav_dc_ros.experiments.paper import style
+from uav_dc_ros.experiments.paper.evidence import SMOOTHING, Evidence, name, smooth
+from uav_dc_ros.experiments.paper.plan import FIGURES, FigurePlan, Panel
+from uav_dc_ros.experiments.paper.results import Results
+from uav_dc_ros.experiments.paper.setting import Scale, Setting
+
+_DPI = 150
+# Sizes in inches: a panel, and what surrounds it.
+_WIDE, _HIGH, _LEFT, _RIGHT, _BELOW, _ABOVE, _HEADER = 5.3, 3.3, 0.75, 0.25, 0.6, 0.85, 0.75
+_ONE_LINE_LEGEND = 0.2
+# Metric: title of the axis, what to divide by.
+_AXES = {
+    "reward": ("reward $r^t$ at the end of a mission", 1.0),
+    "reward_share": (r"reward $r^t\,/\,(\beta + \zeta)$", 1.0),
+    "throughput_bps": ("throughput, Mbit/s", 1e6),
+    "arrival_step": ("arrival step ($T_{cons}$ if not landed)", 1.0),
+}
+
+
+def drawable(results: Results) -> list[str]:
+    """Names of the figures for which the results have every run."""
+    there = {run.setting for run in results.planned}
+    return [
+        figure
+        for figure, plan in FIGURES.items()
+        if all(
+            setting in there for panel in plan.panels for setting in panel.settings(results.metadata.scale)
+        )
+    ]
+
+
+def draw(figure: str, results: Results, tracks: Sequence[Track], path: Path) -> None:
+    """Writes one figure as a PNG file.
+
+    Args:
+        figure: a name in `FIGURES`.
+        results: what was measured.
+        tracks: a greedy mission in each environment; for the figure `Traj` only.
+        path: where to.
+
+    Raises:
+        TrainingError: no such figure, runs or missions that it lacks, or a file that cannot be written.
+    """
+    if figure not in FIGURES:
+        raise TrainingError(f"no figure {figure!r}; expected one of {', '.join(FIGURES)}")
+    plan = FIGURES[figure]
+    if plan.panels[0].kind == "tracks":
+        drawn = _montage(plan, results.metadata.scale, tracks)
+    elif figure not in drawable(results):
+        raise TrainingError(f"figure {figure}: the results lack some of its runs")
+    else:
+        drawn = _panels(plan, results)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        FigureCanvasAgg(drawn).figure.savefig(partial, dpi=_DPI, format="png")
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise TrainingError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def _panels(plan: FigurePlan, results: Results) -> Figure:
+    """Panels side by side, two in a row, each with its title and legend above it."""
+    evidence = Evidence(results)
+    n_columns = min(len(plan.panels), 2)
+    n_rows = -(-len(plan.panels) // n_columns)
+    wide = n_columns * (_LEFT + _WIDE + _RIGHT)
+    high = _HEADER + n_rows * (_ABOVE + _HIGH + _BELOW)
+    drawn = Figure(figsize=(wide, high), facecolor=style.PAPER)
+    _header(drawn, plan.caption, _facts(plan, results.metadata.scale), results.metadata.scale)
+    for i, panel in enumerate(plan.panels):
+        row, column = divmod(i, n_columns)
+        x = column * (_LEFT + _WIDE + _RIGHT) + _LEFT
+        y = high - _HEADER - (row + 1) * (_ABOVE + _HIGH) - row * _BELOW
+        axes = drawn.add_axes((x / wide, y / high, _WIDE / wide, _HIGH / high))
+        _DRAW[panel.kind](axes, panel, evidence)
+        letter = f"({'abcd'[i]}) " if len(plan.panels) > 1 else ""
+        drawn.text(
+            x / wide,
+            (y + _HIGH + _ABOVE - 0.25) / high,
+            f"{letter}{panel.title}",
+            color=style.INK,
+            size=10.5,
+            weight="bold",
+            va="center",
+        )
+    return drawn
+
+
+def _curves(axes: Axes, panel: Panel, evidence: Evidence) -> None:
+    """Mean over environments of smoothed curves, with its interval as a band."""
+    results = evidence.results
+    title, unit = _AXES[panel.metric]
+    lines = panel.lines(evidence.scale)
+    values = [tuple(getattr(line, key) for key in panel.vary) for line in lines]
+    for line in lines:
+        curves = smooth(evidence.curves(panel.metric, line)) / unit  # [E, P]
+        mean, low, high = _bands(curves)
+        properties = style.look(line, panel.vary, values) | {"marker": ""}
+        axes.plot(results.episode, mean, label=style.label(line, panel.vary), **properties)
+        axes.fill_between(results.episode, low, high, color=properties["color"], alpha=0.13, lw=0)
+    axes.set_xlim(0, results.episode[-1])
+    axes.margins(y=0.06)
+    axes.set_xlabel("episode", color=style.INK, size=9)
+    axes.set_ylabel(title, color=style.INK, size=9)
+    _legend(axes, len(lines), panel.vary)
+
+
+def _ratios(axes: Axes, panel: Panel, evidence: Evidence) -> None:
+    """Performance over the ratios, mean over environments with its interval as a bar."""
+    metric = "reward_share" if panel.metric == "reward" else panel.metric
+    title, unit = _AXES[metric]
+    ratios, lines = evidence.scale.ratios, panel.lines(evidence.scale)
+    values = [tuple(getattr(line, key) for key in panel.vary) for line in lines]
+    for i, line in enumerate(lines):
+        measured = evidence.of(metric, line, ratio=ratios) / unit
+        mean, low, high = _bands(measured)
+        # Side by side, so that no bar hides another.
+        x = np.arange(len(ratios)) + 0.09 * (i - (len(lines) - 1) / 2)
+        axes.errorbar(
+            x,
+            mean,
+            yerr=np.stack([mean - low, high - mean]),
+            label=style.label(line, panel.vary),
+            ms=4.5,
+            elinewidth=1.0,
+            **style.look(line, panel.vary, values) | {"lw": 1.3},
+        )
+    axes.set_xticks(range(len(ratios)), [name(ratio) for ratio in ratios])
+    axes.margins(y=0.06)
+    axes.set_xlabel(r"$\beta : \zeta$", color=style.INK, size=9)
+    axes.set_ylabel(title, color=style.INK, size=9)
+    _legend(axes, len(lines), panel.vary)
+
+
+def _grid(axes: Axes, panel: Panel, evidence: Evidence) -> None:
+    """Performance over two parameters, as a map; the paper's choice has a frame."""
+    title, unit = _AXES[panel.metric]
+    scale = evidence.scale
+    measured = evidence.of(panel.metric, panel.setting, gamma=scale.gammas, epsilon=scale.epsilons) / unit
+    means = measured.mean(axis=0)
+    image = axes.imshow(means, cmap=PATH_COLOURS, aspect="auto", origin="lower")
+    for i, gamma in enumerate(scale.gammas):
+        for j, epsilon in enumerate(scale.epsilons):
+            mean, low, high = interval(measured[:, i, j])
+            colour = style.shade(image.to_rgba(np.array([mean]))[0])
+            axes.text(j, i + 0.1, f"{mean:.3f}", color=colour, size=11, ha="center", va="center")
+            axes.text(j, i - 0.2, f"{low:.3f} to {high:.3f}", color=colour, size=7, ha="center", va="center")
+            if (gamma, epsilon) == (Setting().gamma, Setting().epsilon):
+                x, y = np.array([-1, 1, 1, -1, -1]) * 0.46 + j, np.array([-1, -1, 1, 1, -1]) * 0.46 + i
+                axes.plot(x, y, color=style.PAPER, lw=2.2)
+    axes.set_xticks(range(len(scale.epsilons)), [f"{value:g}" for value in scale.epsilons])
+    axes.set_yticks(range(len(scale.gammas)), [f"{value:g}" for value in scale.gammas])
+    axes.set_xlabel(r"$\epsilon$, probability of the greedy action", color=style.INK, size=9)
+    axes.set_ylabel(r"$\gamma$, discount", color=style.INK, size=9)
+    style.dress(axes)
+    axes.grid(False)
+    text = f"{title}; the paper's choice is framed"
+    axes.text(0, 1.03, text, transform=axes.transAxes, color=style.MUTED, size=8.5)
+
+
+_DRAW = {"curves": _curves, "ratios": _ratios, "grid": _grid}
+
+
+def _legend(axes: Axes, n_lines: int, vary: tuple[str, ...]) -> None:
+    """Above the axes, where it covers nothing."""
+    n_columns = 2 if len(vary) == 2 else n_lines
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(-0.01, 1.0),
+        borderaxespad=0.1,
+        ncols=n_columns,
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=style.INK,
+        handlelength=2.6 if len(vary) == 2 else 1.2,
+        columnspacing=1.2,
+        handletextpad=0.5,
+        labelspacing=0.3,
+    )
+    style.dress(axes)
+
+
+def _montage(plan: FigurePlan, scale: Scale, tracks: Sequence[Track]) -> Figure:
+    """The pictures of missions, three in a row."""
+    if not tracks:
+        raise TrainingError("0 missions to draw; expected at least 1")
+    pictures = [picture(track) for track in tracks]
+    n_columns = min(len(pictures), 3)
+    n_rows = -(-len(pictures) // n_columns)
+    one_high, one_wide = (size / 100 for size in pictures[0].shape[:2])  # a picture has 100 dots per inch
+    wide, high = n_columns * one_wide, n_rows * (one_high + 0.3) + _HEADER
+    drawn = Figure(figsize=(wide, high), facecolor=style.PAPER)
+    facts = f"{plan.panels[0].title}; greedy missions after training, one in each environment"
+    _header(drawn, plan.caption, facts, scale)
+    for i, image in enumerate(pictures):
+        row, column = divmod(i, n_columns)
+        y = high - _HEADER - (row + 1) * (one_high + 0.3)
+        axes = drawn.add_axes((column / n_columns, y / high, 1 / n_columns, one_high / high))
+        axes.imshow(image, interpolation="lanczos")
+        axes.axis("off")
+        where = ((column + 0.1) / n_columns, (y + one_high + 0.05) / high)
+        drawn.text(*where, f"environment {scale.environments[i]}", color=style.MUTED, size=11)
+    return drawn
+
+
+def _header(drawn: Figure, title: str, facts: str, scale: Scale) -> None:
+    wide, high = drawn.get_size_inches()
+    drawn.text(0.25 / wide, 1 - 0.3 / high, title, color=style.INK, size=12, weight="bold", va="center")
+    drawn.text(0.25 / wide, 1 - 0.56 / high, facts, color=style.MUTED, size=8.5, va="center")
+    if scale.name == "smoke":
+        text = "smoke: these numbers mean nothing"
+        drawn.text(
+            1 - 0.25 / wide,
+            1 - 0.56 / high,
+            text,
+            color=style.WARNING,
+            size=9,
+            weight="bold",
+            ha="right",
+            va="center",
+        )
+
+
+def _facts(plan: FigurePlan, scale: Scale) -> str:
+    """What the marks are."""
+    marks = f"mean of {len(scale.environments)} environments and its 95% bootstrap interval"
+    if any(panel.kind == "curves" for panel in plan.panels):
+        marks += f"; curves: moving average over {SMOOTHING * scale.episodes_per_point} episodes"
+    if any(panel.kind != "curves" for panel in plan.panels):
+        marks += "; levels: last fifth of the training"
+    return marks
+
+
+def _bands(values: Array) -> tuple[Array, Array, Array]:
+    """Mean of each column of `[E, P]`, and its interval, each `[P]`."""
+    mean, low, high = np.array([interval(column) for column in values.T]).T
+    return mean, low, high
