@@ -1,4 +1,4 @@
-"""`python -m uav_dc_ros.paper`: the sweep behind every figure of the paper, and what it says of its claims."""
+"""`python -m uav_dc_ros.paper`: the sweep behind every figure of the paper, and its claims."""
 
 from uav_dc_ros.experiments.paper.cli import main
 

@@ -32,8 +32,8 @@ def sweep(
     """Results whose curves rise exponentially to made-up levels.
 
     Args:
-        levels: what differs from `LEVELS` for a setting; beside the metrics `tau`, the episodes in which 63% of the
-            way is done, and `jitter`, the relative size of the ups and downs at the end.
+        levels: what differs from `LEVELS` for a setting; beside the metrics `tau`, the episodes in which 63%
+            of the way is done, and `jitter`, the relative size of the ups and downs at the end.
         scale: whose plan.
         noise: relative standard deviation of points and greedy figures.
         between: relative change of all levels of a setting in an environment.

@@ -80,8 +80,8 @@ def _provenance(results: Results) -> str:
 ```
 
 - uav_dc_ros {metadata.version}; {metadata.device}; {minutes}
-- {len(results.planned)} runs of {scale.episodes} episodes; environments {environments}, {scale.repeats} run(s)
-  of a setting in each; seeds {", ".join(map(str, seeds))}
+- {len(results.planned)} runs of {scale.episodes} episodes; environments {environments}, in each {scale.repeats}
+  run(s) of a setting; seeds {", ".join(map(str, seeds))}
 - worlds and their fingerprints: {worlds}
 - data: `runs.parquet`, `curves.parquet` (means over {scale.episodes_per_point} episodes);
   verdicts also in `{VERDICTS_FILE}`"""
