@@ -1,6 +1,7 @@
 """The paper's figures, drawn from the results."""
 
 import os
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,10 +20,10 @@ from uav_dc_ros.experiments.paper.plan import FIGURES, FigurePlan, Panel
 from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import Scale, Setting
 
-_DPI = 150
+# Dots per inch: of a figure, and of the pictures of missions as they come.
+_DPI, _PICTURE_DPI = 150, 100
 # Sizes in inches: a panel, and what surrounds it.
-_WIDE, _HIGH, _LEFT, _RIGHT, _BELOW, _ABOVE, _HEADER = 5.3, 3.3, 0.75, 0.25, 0.6, 0.85, 0.75
-_ONE_LINE_LEGEND = 0.2
+_WIDE, _HIGH, _LEFT, _RIGHT, _BELOW, _ABOVE = 5.3, 3.3, 0.75, 0.25, 0.6, 0.8
 # Metric: title of the axis, what to divide by.
 _AXES = {
     "reward": ("reward $r^t$ at the end of a mission", 1.0),
@@ -59,7 +60,9 @@ def draw(figure: str, results: Results, tracks: Sequence[Track], path: Path) -> 
     if figure not in FIGURES:
         raise TrainingError(f"no figure {figure!r}; expected one of {', '.join(FIGURES)}")
     plan = FIGURES[figure]
+    dpi = _DPI
     if plan.panels[0].kind == "tracks":
+        dpi = _PICTURE_DPI  # its dots as they are
         drawn = _montage(plan, results.metadata.scale, tracks)
     elif figure not in drawable(results):
         raise TrainingError(f"figure {figure}: the results lack some of its runs")
@@ -67,7 +70,7 @@ def draw(figure: str, results: Results, tracks: Sequence[Track], path: Path) -> 
         drawn = _panels(plan, results)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        FigureCanvasAgg(drawn).figure.savefig(partial, dpi=_DPI, format="png")
+        FigureCanvasAgg(drawn).figure.savefig(partial, dpi=dpi, format="png")
         partial.replace(path)
     except OSError as error:
         partial.unlink(missing_ok=True)
@@ -75,30 +78,32 @@ def draw(figure: str, results: Results, tracks: Sequence[Track], path: Path) -> 
 
 
 def _panels(plan: FigurePlan, results: Results) -> Figure:
-    """Panels side by side, two in a row, each with its title and legend above it."""
-    evidence = Evidence(results)
-    n_columns = min(len(plan.panels), 2)
-    n_rows = -(-len(plan.panels) // n_columns)
-    wide = n_columns * (_LEFT + _WIDE + _RIGHT)
-    high = _HEADER + n_rows * (_ABOVE + _HIGH + _BELOW)
+    """Panels two in a row, each with its title and legend above it; the first of an odd number is wide."""
+    evidence, scale = Evidence(results), results.metadata.scale
+    n_panels = len(plan.panels)
+    n_columns = min(n_panels, 2)
+    n_rows = -(-n_panels // n_columns)
+    column_wide, row_high = _LEFT + _WIDE + _RIGHT, _ABOVE + _HIGH + _BELOW
+    wide, header = n_columns * column_wide, _header_high(plan.caption, n_columns * column_wide)
+    high = header + n_rows * row_high
     drawn = Figure(figsize=(wide, high), facecolor=style.PAPER)
-    _header(drawn, plan.caption, _facts(plan, results.metadata.scale), results.metadata.scale)
+    _header(drawn, plan.caption, _facts(plan, scale), scale)
+    shared: dict[tuple[str, str], Axes] = {}
     for i, panel in enumerate(plan.panels):
-        row, column = divmod(i, n_columns)
-        x = column * (_LEFT + _WIDE + _RIGHT) + _LEFT
-        y = high - _HEADER - (row + 1) * (_ABOVE + _HIGH) - row * _BELOW
-        axes = drawn.add_axes((x / wide, y / high, _WIDE / wide, _HIGH / high))
+        spans = n_columns if i == 0 and n_panels % n_columns else 1
+        row, column = divmod(i + n_panels % n_columns if i else 0, n_columns)
+        x, y = column * column_wide + _LEFT, high - header - (row + 1) * row_high + _BELOW
+        size = (_WIDE + (spans - 1) * column_wide, _HIGH)
+        # What has one measure has one axis, so that two panels can be compared.
+        twin = shared.get((panel.kind, panel.metric))
+        axes = drawn.add_axes((x / wide, y / high, size[0] / wide, size[1] / high), sharey=twin)
+        shared.setdefault((panel.kind, panel.metric), axes)
         _DRAW[panel.kind](axes, panel, evidence)
-        letter = f"({'abcd'[i]}) " if len(plan.panels) > 1 else ""
-        drawn.text(
-            x / wide,
-            (y + _HIGH + _ABOVE - 0.25) / high,
-            f"{letter}{panel.title}",
-            color=style.INK,
-            size=10.5,
-            weight="bold",
-            va="center",
-        )
+        letter = f"({'abcd'[i]}) " if n_panels > 1 else ""
+        above = _HIGH + (0.6 if len(panel.vary) == 2 and panel.kind != "grid" else 0.42)
+        where = (x / wide, (y + above) / high)
+        title = f"{letter}{panel.title}"
+        drawn.text(*where, title, color=style.INK, size=10.5, weight="bold", va="center")
     return drawn
 
 
@@ -203,14 +208,16 @@ def _montage(plan: FigurePlan, scale: Scale, tracks: Sequence[Track]) -> Figure:
     pictures = [picture(track) for track in tracks]
     n_columns = min(len(pictures), 3)
     n_rows = -(-len(pictures) // n_columns)
-    one_high, one_wide = (size / 100 for size in pictures[0].shape[:2])  # a picture has 100 dots per inch
-    wide, high = n_columns * one_wide, n_rows * (one_high + 0.3) + _HEADER
+    one_high, one_wide = (size / _PICTURE_DPI for size in pictures[0].shape[:2])
+    wide = n_columns * one_wide
+    header = _header_high(plan.caption, wide)
+    high = header + n_rows * (one_high + 0.3)
     drawn = Figure(figsize=(wide, high), facecolor=style.PAPER)
     facts = f"{plan.panels[0].title}; greedy missions after training, one in each environment"
     _header(drawn, plan.caption, facts, scale)
     for i, image in enumerate(pictures):
         row, column = divmod(i, n_columns)
-        y = high - _HEADER - (row + 1) * (one_high + 0.3)
+        y = high - header - (row + 1) * (one_high + 0.3)
         axes = drawn.add_axes((column / n_columns, y / high, 1 / n_columns, one_high / high))
         axes.imshow(image, interpolation="lanczos")
         axes.axis("off")
@@ -220,21 +227,26 @@ def _montage(plan: FigurePlan, scale: Scale, tracks: Sequence[Track]) -> Figure:
 
 
 def _header(drawn: Figure, title: str, facts: str, scale: Scale) -> None:
+    """Title, facts, and the warning that a smoke test needs."""
     wide, high = drawn.get_size_inches()
-    drawn.text(0.25 / wide, 1 - 0.3 / high, title, color=style.INK, size=12, weight="bold", va="center")
-    drawn.text(0.25 / wide, 1 - 0.56 / high, facts, color=style.MUTED, size=8.5, va="center")
-    if scale.name == "smoke":
-        text = "smoke: these numbers mean nothing"
-        drawn.text(
-            1 - 0.25 / wide,
-            1 - 0.56 / high,
-            text,
-            color=style.WARNING,
-            size=9,
-            weight="bold",
-            ha="right",
-            va="center",
-        )
+    x, y = 0.25 / wide, 1 - 0.18 / high
+    text = "\n".join(_lines(title, wide))
+    drawn.text(x, y, text, color=style.INK, size=12, weight="bold", va="top", linespacing=1.15)
+    y = 1 - (_header_high(title, wide) - 0.15) / high
+    smoke = scale.name == "smoke"
+    facts = "smoke test: these numbers mean nothing" if smoke else facts
+    colour = style.WARNING if smoke else style.MUTED
+    drawn.text(x, y, facts, color=colour, size=8.5, weight="bold" if smoke else "normal", va="center")
+
+
+def _header_high(title: str, wide: float) -> float:
+    """Inches that the title, in a figure of some width in inches, and the line below it take."""
+    return 0.45 + 0.22 * len(_lines(title, wide))
+
+
+def _lines(title: str, wide: float) -> list[str]:
+    # A bold letter of this size is about a tenth of an inch wide.
+    return textwrap.wrap(title.replace("beta/zeta", "β/ζ"), int((wide - 0.5) / 0.105))
 
 
 def _facts(plan: FigurePlan, scale: Scale) -> str:

@@ -20,7 +20,7 @@ _SECOND: tuple[dict[str, Any], ...] = (
     {"ls": "-", "marker": "s"},
 )
 # From more weight on the trajectory, by the balance in ink, to more weight on the data.
-_RATIOS = LinearSegmentedColormap.from_list("ratios", ["#5aa7d6", "#1f4e8c", INK, "#b8501c", "#eda13f"])
+_RATIOS = LinearSegmentedColormap.from_list("ratios", ["#79bce6", "#2b78bd", INK, "#cc5a1b", "#f0ad45"])
 _VALUES = matplotlib.colormaps["viridis"]
 _SYMBOLS = {"batch_size": "K", "learning_rate": "lr", "gamma": r"$\gamma$", "epsilon": r"$\epsilon$"}
 
@@ -40,7 +40,7 @@ def look(setting: Setting, vary: tuple[str, ...], values: list[tuple[object, ...
         colour = _FIRST[list(dict.fromkeys(first)).index(mine[0])]
         return emphasised | {"color": colour} | _SECOND[list(dict.fromkeys(second)).index(mine[1])]
     where = values.index(mine) / max(len(values) - 1, 1)
-    shade_of = _RATIOS(where) if vary == ("ratio",) else _VALUES(0.9 * where)
+    shade_of = _RATIOS(where) if vary == ("ratio",) else _VALUES(0.82 * where)
     # The value that the paper settles on, or finds best.
     if mine == _values(Setting(), vary):
         return emphasised | {"color": shade_of, "lw": 2.6, "zorder": 5}
