@@ -283,15 +283,16 @@ CLAIMS = (
 def check(results: Results) -> list[Finding]:
     """Every claim against the results, in the order of `CLAIMS`."""
     evidence = Evidence(results)
-    return [_finding(claim, evidence) for claim in CLAIMS]
+    return [finding(claim, evidence) for claim in CLAIMS]
 
 
 def count(findings: Sequence[Finding], verdict: Verdict) -> int:
     """How many came out so."""
-    return sum(finding.verdict == verdict for finding in findings)
+    return sum(one.verdict == verdict for one in findings)
 
 
-def _finding(claim: Claim, evidence: Evidence) -> Finding:
+def finding(claim: Claim, evidence: Evidence) -> Finding:
+    """One claim, weighed."""
     try:
         weighed = claim.weigh(evidence)
     except NotMeasured:

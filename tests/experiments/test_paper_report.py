@@ -1,0 +1,85 @@
+"""The document of a sweep, made from made-up results."""
+
+import dataclasses
+import re
+
+import msgspec
+import pytest
+
+from tests.experiments.paper_sweeps import realistic, sweep
+from uav_dc_ros.experiments.paper.claims import CLAIMS, check
+from uav_dc_ros.experiments.paper.plan import FIGURES
+from uav_dc_ros.experiments.paper.report import CLAIMS_FILE, VERDICTS_FILE, claims_md, write
+from uav_dc_ros.experiments.paper.setting import FULL, SMOKE
+
+
+@pytest.fixture(scope="module")
+def text():
+    results = realistic(FULL)
+    return claims_md(results, check(results), list(FIGURES))
+
+
+def test_it_says_where_it_comes_from(text):
+    for fact in (
+        "a test",
+        f"{FULL.repeats} run(s)",
+        "0, 1, 2, 3, 4",
+        f"{FULL.episodes} episodes",
+        "fcb46aa8fbbf",
+    ):
+        assert fact in text
+
+
+def test_every_claim_has_its_row_and_its_section(text):
+    for claim in CLAIMS:
+        assert re.search(
+            rf"^\| \[{claim.id}\]\(#{claim.id.lower()}\) \| .* \| \*\*[a-z ]+\*\* \| .+ \|$", text, re.M
+        )
+        assert f"\n### {claim.id}\n" in text
+        assert all(note in text for note in claim.notes)
+
+
+def test_tables_have_as_many_cells_in_every_row(text):
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.M)
+    assert len(tables) > 60
+    for table in tables:
+        assert len({row.count("|") for row in table.splitlines()}) == 1, table
+
+
+def test_links_lead_somewhere(text):
+    headings = {line.lstrip("# ").lower() for line in text.splitlines() if line.startswith("#")}
+    links = re.findall(r"\]\(#([^)]+)\)", text)
+    assert len(links) >= 40
+    assert set(links) <= headings
+    assert set(re.findall(r"\]\(([^#)]+\.png)\)", text)) == {f"{name}.png" for name in FIGURES}
+
+
+def test_a_smoke_test_says_that_it_means_nothing(text):
+    results = realistic(SMOKE)
+    assert "mean nothing" in claims_md(results, check(results), []).split("##")[0].replace("\n", " ")
+    assert "mean nothing" not in text
+
+
+def test_the_verdicts_are_there_for_programs(tmp_path):
+    results = sweep(scale=SMOKE)
+    write(results, [], tmp_path, only=["lr"])
+    assert {path.name for path in tmp_path.iterdir()} == {CLAIMS_FILE, VERDICTS_FILE, "lr.png"}
+    found = msgspec.json.decode((tmp_path / VERDICTS_FILE).read_bytes())
+    assert [one["id"] for one in found] == [claim.id for claim in CLAIMS]
+    assert [one["verdict"] for one in found] == [one.verdict for one in check(results)]
+    assert set(found[0]["parts"][0]["effect"]) == {"mean", "low", "high"}
+    assert "lr.png" in (tmp_path / CLAIMS_FILE).read_text("utf-8")
+
+
+def test_what_was_not_measured_is_not_judged():
+    results = sweep(scale=SMOKE)
+    kept = [i for i, run in enumerate(results.planned) if run.setting.scenario == "three_clusters"]
+    some = dataclasses.replace(
+        results,
+        planned=tuple(results.planned[i] for i in kept),
+        curves={name: values[kept] for name, values in results.curves.items()},
+        greedy={name: values[kept] for name, values in results.greedy.items()},
+    )
+    written = claims_md(some, check(some), [])
+    assert "16 not tested." in written
+    assert re.search(r"^\| \[C1\]\(#c1\) .* \| \*\*not tested\*\* \| \|$", written, re.M)
