@@ -55,7 +55,7 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
         "## The figures",
         *(_figure(name) for name in drawn),
         "## The claims",
-        *(section for finding in findings for section in _section(finding)),
+        *(section for finding in findings for section in _section(finding, drawn)),
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -80,8 +80,8 @@ def _provenance(results: Results) -> str:
 ```
 
 - uav_dc_ros {metadata.version}; {metadata.device}; {minutes}
-- {len(results.planned)} runs of {scale.episodes} episodes; environments {environments}, in each {scale.repeats}
-  run(s) of a setting; seeds {", ".join(map(str, seeds))}
+- {len(results.planned)} runs of {scale.episodes} episodes; environments {environments}, in each
+  {scale.repeats} run(s) of a setting; seeds {", ".join(map(str, seeds))}
 - worlds and their fingerprints: {worlds}
 - data: `runs.parquet`, `curves.parquet` (means over {scale.episodes_per_point} episodes);
   verdicts also in `{VERDICTS_FILE}`"""
@@ -102,9 +102,9 @@ def _figure(name: str) -> str:
     return f"### {name}\n\n![{plan.caption}]({name}.png)\n\n{plan.caption}. Claims: {', '.join(plan.claims)}."
 
 
-def _section(finding: Finding) -> list[str]:
+def _section(finding: Finding, drawn: Sequence[str]) -> list[str]:
     claim, verdict, weighed = finding
-    figures = ", ".join(f"[{name}](#{name.lower()})" for name in claim.figures)
+    figures = ", ".join(f"[{name}](#{name.lower()})" if name in drawn else name for name in claim.figures)
     sections = [
         f"### {claim.id}",
         f"*{claim.setting}:* {claim.text}. Figure {figures}. **{verdict[0].upper()}{verdict[1:]}.**",

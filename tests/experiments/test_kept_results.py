@@ -1,0 +1,44 @@
+"""The sweep that is kept in docs/paper is of this package's worlds and plan, and its document of its data."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.experiments.paper import report
+from uav_dc_ros.experiments.paper.claims import check
+from uav_dc_ros.experiments.paper.plan import FIGURES, runs
+from uav_dc_ros.experiments.paper.results import Results
+from uav_dc_ros.experiments.paper.setting import FULL
+
+ROOT = Path(__file__).parents[2]
+KEPT = ROOT / "docs" / "paper"
+
+
+@pytest.fixture(scope="module")
+def results():
+    return Results.load(KEPT)
+
+
+def test_it_is_the_whole_plan_in_the_worlds_as_they_are(results):
+    assert results.metadata.scale == FULL
+    assert results.planned == tuple(runs(FULL))
+    for name, world in results.metadata.worlds.items():
+        assert world.fingerprint == scenarios.load(name).fingerprint
+
+
+def test_the_document_is_what_the_data_gives(results):
+    findings = check(results)
+    drawn = [name for name in FIGURES if (KEPT / f"{name}.png").is_file()]
+    assert drawn == list(FIGURES)
+    assert (KEPT / report.CLAIMS_FILE).read_text("utf-8") == report.claims_md(results, findings, drawn)
+    kept = msgspec.json.decode((KEPT / report.VERDICTS_FILE).read_bytes())
+    assert {one["id"]: one["verdict"] for one in kept} == {one.claim.id: one.verdict for one in findings}
+
+
+def test_the_readme_counts_the_verdicts_as_they_are(results):
+    """`Of 20 claims ...` stands in both."""
+    lines = (KEPT / report.CLAIMS_FILE).read_text("utf-8").splitlines()
+    (counts,) = [line for line in lines if line.startswith("Of ")]
+    assert counts.rstrip(".") in (ROOT / "README.md").read_text("utf-8").replace("\n", " ")
