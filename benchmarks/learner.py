@@ -21,6 +21,7 @@ from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from queue import Queue
 
+import msgspec
 import torch
 
 from uav_dc_ros import scenarios
@@ -40,7 +41,7 @@ def population(n_runs: int) -> Population:
             seed=i,
             environment=i % 5,
             algorithm=("dqn", "dueling_dqn")[i % 2],
-            reward=scenario.reward,
+            reward=msgspec.structs.replace(scenario.reward, form=("immediate", "episode")[i // 2 % 2]),
             hyperparameters=Hyperparameters(episodes=100_000, buffer_size=50_000),
         )
         for i in range(n_runs)

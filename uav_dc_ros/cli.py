@@ -1,6 +1,7 @@
 """What the command lines share: mistakes become one line and exit status 2."""
 
 import argparse
+import contextlib
 import os
 import sys
 from collections.abc import Callable
@@ -57,10 +58,14 @@ def run(command: Callable[[], int], prog: str) -> NoReturn:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file in one move, so that it is there in full or not at all."""
+    """Writes a file in one move, so that it is there in full or not at all, even after a power cut."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        partial.write_bytes(content)
+        with partial.open("wb") as file:
+            file.write(content)
+            os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
         raise UavDcError(f"{path} cannot be written: {error.strerror}") from None

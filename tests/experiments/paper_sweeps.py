@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from typing import Any
+from zlib import crc32
 
 import msgspec
 import numpy as np
@@ -88,5 +89,8 @@ def realistic(scale: Scale = FULL) -> Results:
         }
 
     return sweep(
-        levels, scale, 0.08, lambda setting, environment: 0.03 * np.sin(environment * hash(str(setting)) % 7)
+        levels,
+        scale,
+        0.08,
+        lambda setting, environment: 0.03 * np.sin(environment * (crc32(str(setting).encode()) % 7)),
     )

@@ -19,7 +19,7 @@ from uav_dc_ros.experiments.paper.evidence import (
     settling,
     within,
 )
-from uav_dc_ros.experiments.paper.plan import runs
+from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.setting import FULL, RATIOS, SMOKE, Setting
 
 ONE = RATIOS.index((1, 1))
@@ -201,7 +201,7 @@ def test_runs_that_were_not_made_leave_claims_untested():
     assert tested == {"C1", "C20"}, "C1 needs the setting that all learning rates are compared with"
 
 
-@pytest.mark.parametrize("scale", [FULL, SMOKE], ids=str)
+@pytest.mark.parametrize("scale", [FULL, SMOKE], ids=["full", "smoke"])
 def test_every_claim_can_be_weighed(scale):
     for one in check(realistic(scale)):
         assert one.verdict != "not tested"
@@ -265,6 +265,30 @@ def test_the_rules_of_everywhere():
     assert verdicts(up, down, down) == ["does not hold", "does not hold"]
     part = everywhere("", np.stack([up, 2 * up, down], axis=1), ratios, "")
     assert (part.effect.mean, part.detail) == (-1.0, "as claimed at 2 of 3 ratios, not at 1:2")
+
+
+def test_what_is_shown_of_everywhere_says_what_the_verdict_says():
+    """The worst mean may belong to a ratio that is undecided: it is not what decided."""
+    effects = np.array([[-2, -0.3, 1], [1, -0.2, 1], [-1.5, -0.25, 1], [1, -0.3, 1], [-1, -0.3, 1]])
+    part = everywhere("", effects, RATIOS[:3], "")
+    assert part.verdict == "does not hold"
+    assert part.effect.mean == pytest.approx(effects[:, 1].mean())
+    assert part.effect.high < 0
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_a_figure_s_own_runs_decide_its_claims(figure):
+    whole = realistic(SMOKE)
+    wanted = set(runs(SMOKE, [figure]))
+    kept = [i for i, run in enumerate(whole.planned) if run in wanted]
+    some = dataclasses.replace(
+        whole,
+        planned=tuple(whole.planned[i] for i in kept),
+        curves={name: values[kept] for name, values in whole.curves.items()},
+        greedy={name: values[kept] for name, values in whole.greedy.items()},
+    )
+    tested = {one.claim.id for one in check(some) if one.verdict != "not tested"}
+    assert set(FIGURES[figure].claims) <= tested
 
 
 def test_the_worst_ratio_is_shown_of_an_equality():

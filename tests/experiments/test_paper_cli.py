@@ -114,6 +114,7 @@ def _alive(group):
         (["--scale", "large"], "invalid choice: 'large'"),
         (["--ray", "127.0.0.1:1"], "--ray 127.0.0.1:1: no cluster answers: Connection refused"),
         (["--ray", "nonsense:port"], "expected HOST:PORT, ray://HOST:PORT or auto"),
+        (["--ray", ""], "expected HOST:PORT, ray://HOST:PORT or auto"),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path, monkeypatch, capsys, options, complaint):
@@ -125,9 +126,31 @@ def test_a_mistake_is_one_line(tmp_path, monkeypatch, capsys, options, complaint
     assert complaint in said
     assert said.startswith("python -m uav_dc_ros.paper: ")
     assert len(said.splitlines()) == 1
+    assert not (tmp_path / "paper_results").exists(), "nothing that would be in the way of the next command"
+
+
+def test_half_a_sweep_is_gone_on_with_as_it_was_begun(tmp_path, monkeypatch, capsys):
+    """Another --only would train other shards, and take these for done with."""
+    monkeypatch.chdir(tmp_path)
+    kept = tmp_path / "paper_results" / "shards" / "shard_0.safetensors"
+
+    def interrupt(shards, folder, n_workers, tell):
+        kept.write_bytes(b"")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "train_here", interrupt)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--scale", "smoke", "--only", "lr", "batch"])
+    assert ended.value.code == 130
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--scale", "smoke", "--only", "lr", "--resume"])
+    assert ended.value.code == 2
+    assert 'is half of a sweep with {"scale":"smoke","only":["batch","lr"]}' in capsys.readouterr().err
+    assert kept.is_file()
 
 
 def test_results_of_other_runs_are_not_drawn_as_these(smoke, capsys):
     with pytest.raises(SystemExit):
         cli.main(["--scale", "full", "--only", "lr", "--out", str(smoke), "--resume"])
-    assert "is finished, without" in capsys.readouterr().err
+    assert "has the scale 'smoke' and is finished; expected 'full'" in capsys.readouterr().err

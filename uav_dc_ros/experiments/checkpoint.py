@@ -65,7 +65,9 @@ def restore(path: Path, training: Training) -> dict[str, Any]:
         _check(values["population"], _plain(training.population), path)
         training.restore(arrays, values)
     except _DAMAGED as error:
-        raise TrainingError(f"{path}: cannot be read, or not the state of a training: {error}") from None
+        raise TrainingError(
+            f"{path}: cannot be read, or not the state of a training: {error}; delete it to start anew"
+        ) from None
     return dict(values["progress"])
 
 

@@ -3,20 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
 
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
-from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.batch import observe
 from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.bootstrap import interval
-from uav_dc_ros.experiments.fly import Act, Missions, flight, fly
+from uav_dc_ros.experiments.fly import Act, Missions, fly
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
 TEST_SEEDS = range(100)
@@ -213,22 +212,14 @@ def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) ->
         UavDcError: matplotlib is not installed, or the picture cannot be written.
     """
     try:
-        from uav_dc_ros.env.render import Track, save_picture  # slow to import, and not always there
+        # Slow to import, and not always there.
+        from uav_dc_ros.env.render import save_picture
+        from uav_dc_ros.experiments.tracks import fly_track
     except ModuleNotFoundError:
         raise UavDcError(
             'matplotlib is not installed; expected it from: pip install "uav_dc_ros[train]"'
         ) from None
-
-    def first(batch: Any) -> Any:
-        return type(batch)(**{f.name: getattr(batch, f.name)[0] for f in fields(batch)})
-
-    track = Track(scenario)
-    for state, outcome in flight(scenario, act, [seed]):
-        link: world.Link | None = first(outcome.link) if outcome else None
-        track.add(first(state), link)
-        if outcome and (outcome.terminated | outcome.truncated)[0]:
-            break
     try:
-        save_picture(track, path)
+        save_picture(fly_track(scenario, act, seed), path)
     except (OSError, ValueError) as error:
         raise UavDcError(f"{path} cannot be written: {error}") from None

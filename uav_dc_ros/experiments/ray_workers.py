@@ -62,9 +62,9 @@ def train_on_ray(shards: Sequence[Shard], folder: Path, address: str, tell: Tell
 
 def _knock(address: str) -> None:
     """Raises TrainingError when nobody listens there: Ray would try for minutes, then end the process."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not colon:
-        return  # such as `auto`, which Ray looks up itself
+    if address == "auto":
+        return  # Ray looks for it
+    host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
         socket.create_connection((host, int(port)), timeout=5.0).close()
     except ValueError:

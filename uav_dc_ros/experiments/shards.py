@@ -1,12 +1,12 @@
 """Shards: populations that are trained apart, each by one process on one core, here or on a Ray cluster.
 
 How runs are divided into shards is the caller's, and does not depend on how many workers there are or
-where: so neither do the results. What a shard brought is one file in a folder; a shard whose file is there
-is not trained again, and one that was interrupted goes on from its checkpoint. Needs torch in the workers.
+where: so neither do the results, as long as the cores are alike (another kind of core rounds otherwise).
+What a shard brought is one file in a folder; a shard whose file is there is not trained again, and one
+that was interrupted goes on from its checkpoint. Needs torch in the workers.
 """
 
 import hashlib
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -17,7 +17,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError
 
-from uav_dc_ros import __version__
+from uav_dc_ros import __version__, cli
 from uav_dc_ros.agents import network
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import TrainingError
@@ -142,16 +142,8 @@ def checkpoint_file(folder: Path, shard: Shard) -> Path:
 
 def keep(folder: Path, shard: Shard, content: bytes) -> None:
     """Writes the result of a shard, in one move, and drops its checkpoint."""
-    path = result_file(folder, shard)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            os.fsync(file.fileno())
-        partial.replace(path)
-        checkpoint_file(folder, shard).unlink(missing_ok=True)
-    except OSError as error:
-        raise TrainingError(f"{path} cannot be written: {error.strerror}") from None
+    cli.write_whole(result_file(folder, shard), content)
+    checkpoint_file(folder, shard).unlink(missing_ok=True)
 
 
 def load(folder: Path, shard: Shard) -> Trained:
@@ -161,8 +153,13 @@ def load(folder: Path, shard: Shard) -> Trained:
         TrainingError: it is missing or damaged.
     """
     path = result_file(folder, shard)
+    population = shard.population
+    shape = (population.n_episodes, len(population.runs))
     try:
-        return Trained.from_bytes(path.read_bytes())
+        trained = Trained.from_bytes(path.read_bytes())
+        if len(trained.parameters) != shape[1] or any(v.shape != shape for v in trained.curves.values()):
+            raise ValueError(f"expected {shape[0]} episodes of {shape[1]} runs")
+        return trained
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise TrainingError(
             f"{path}: cannot be read: {error}; delete it, and --resume trains it again"

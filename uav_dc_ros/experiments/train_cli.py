@@ -186,7 +186,7 @@ def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
         folder.mkdir(parents=True, exist_ok=resume)
     except OSError as error:
         raise TrainingError(f"{folder} cannot be made: {error.strerror}") from None
-    for best in folder.glob("episode_*"):
+    for best in folder.glob("episode_" + 6 * "[0-9]"):
         if int(best.name.removeprefix("episode_")) > n_flown:
             shutil.rmtree(best)
 
@@ -214,7 +214,11 @@ def _draw(folder: Path, made: policy.Policy, scenario: Scenario, training: "Trai
     try:
         from uav_dc_ros.experiments.pictures import save_learning_curve  # needs matplotlib
     except ModuleNotFoundError:
-        return  # the policy is worth more than its pictures
+        # The policy is worth more than its pictures.
+        print(
+            'no pictures without matplotlib; it comes with: pip install "uav_dc_ros[train]"', file=sys.stderr
+        )
+        return
     save_learning_curve(
         training, made.config.seed - training.population.runs[0].seed, folder / LEARNING_CURVE
     )
@@ -272,6 +276,8 @@ def _device(name: str, n_threads: int) -> "torch.device":
     from uav_dc_ros.experiments.training import prepare_torch
 
     prepare_torch(n_threads)
+    if name.partition(":")[0] not in ("cpu", "cuda"):
+        raise TrainingError(f"--device is {name!r}; expected cpu, cuda or cuda:N")
     try:
         torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:

@@ -1,7 +1,7 @@
 """The paper's claims, C1 to C20: what each says, how it is weighed, and what is to be said against it.
 
-The rules are `evidence.RULES`. They and the settings below were fixed before the sweep was run. A note is
-there before any result: it says where a claim contradicts arithmetic, the paper's text or another claim.
+The rules are `evidence.RULES`. They were fixed before any result of the sweep was seen. A note owes
+nothing to the results: it says where a claim contradicts arithmetic, the paper's text or another claim.
 """
 
 from collections.abc import Callable, Sequence
@@ -56,11 +56,12 @@ class Finding(NamedTuple):
 
 
 _FORMS_ARE_ONE = (
-    "Both forms set the same goal to Q-learning: the episode form pays the sum of all immediate rewards so "
-    "far, so its discounted sum is 1/(1 - gamma) = 10 times that of the immediate form, whatever the agent "
-    "does, as long as missions are not terminated. A difference between them comes from how they are learnt"
-    " (targets ten times as large, rewards that depend on a past which the position does not show), not "
-    "from what they ask for."
+    "Far from the end of a mission both forms set the same goal to Q-learning. The episode form pays the "
+    "sum of all immediate rewards so far, so what is earned with n steps still to fly counts "
+    "(1 - gamma^n)/(1 - gamma) times as much as in the immediate form: 10 times early on, and less in the "
+    "last twenty steps, so that it values a late landing less. Else a difference between them comes from "
+    "how they are learnt (targets ten times as large, rewards that depend on a past which the position "
+    "does not show), not from what they ask for."
 )
 _EXPONENTIAL_IS_MORE = (
     "For one and the same flight the exponential R_plus is never below the binary one, so its reward has a "

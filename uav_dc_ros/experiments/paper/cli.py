@@ -1,6 +1,7 @@
 """The command line of `python -m uav_dc_ros.paper`."""
 
 import argparse
+import contextlib
 import os
 import platform
 import shlex
@@ -9,9 +10,11 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -28,6 +31,9 @@ if TYPE_CHECKING:
 
 PROG = "python -m uav_dc_ros.paper"
 TRAJECTORIES_FILE = "trajectories.safetensors"
+# Says of what the shards in a folder are.
+_PLAN_FILE = "plan.json"
+_FROM_TRAIN = 'is not installed; expected it from: pip install "uav_dc_ros[train]"'
 # Seconds between two lines of progress away from a terminal.
 _LINE_EVERY_S = 30.0
 
@@ -45,8 +51,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--only", nargs="+", metavar="FIGURE", help="these figures, and the claims that they can decide")
     add("--out", type=Path, metavar="DIR", default=Path("paper_results"), help="folder to make")
     add("--resume", action="store_true", help="go on with what is in --out; draw again what is finished")
-    cores = os.cpu_count() or 1
-    add("--workers", default=cores, type=cli.count, metavar="N", help="processes, each on one core")
+    add("--workers", default=_cores(), type=cli.count, metavar="N", help="processes, each on one core")
     add("--ray", metavar="ADDRESS", help="train on this Ray cluster instead, such as HOST:6379")
     options = parser.parse_args(argv)
     cli.run(lambda: _paper(options, f"{PROG} {shlex.join(argv)}".strip()), PROG)
@@ -57,22 +62,32 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         from uav_dc_ros.experiments.paper import plan, report, sweep
         from uav_dc_ros.experiments.paper.results import RUNS_FILE, Results
     except ModuleNotFoundError as error:
-        raise TrainingError(
-            f'{error.name} is not installed; expected it from: pip install "uav_dc_ros[train]"'
-        ) from None
+        raise TrainingError(f"{error.name} {_FROM_TRAIN}") from None
+    if find_spec("torch") is None:  # the workers need it
+        raise TrainingError(f"torch {_FROM_TRAIN}")
     scale, out = SCALES[options.scale], options.out
     planned = plan.runs(scale, options.only)
-    _make(out, options.resume)
+    if out.exists() and not options.resume:
+        raise TrainingError(f"{out} exists; expected a new folder, or --resume")
     if (out / RUNS_FILE).is_file():
         results = Results.load(out)
-        if missing := set(planned) - set(results.planned) or results.metadata.scale != scale:
-            n_missing = len(missing) if isinstance(missing, set) else len(planned)
+        if results.metadata.scale != scale:
             raise TrainingError(
-                f"{out} is finished, without {n_missing} runs of this command; expected another --out"
+                f"{out} has the scale {results.metadata.scale.name!r} and is finished; "
+                f"expected {scale.name!r}, or another --out"
             )
-        networks = sweep.load_trajectories(out / TRAJECTORIES_FILE)
+        if missing := set(planned) - set(results.planned):
+            raise TrainingError(
+                f"{out} is finished, without {len(missing)} runs of this command; expected another --out"
+            )
+        networks = sweep.load_trajectories(out / TRAJECTORIES_FILE, scale)
     else:
-        results, networks = _train(options, command)
+        try:
+            results, networks = _train(options, command)
+        except KeyboardInterrupt:
+            goes_on = "; --resume goes on" if out.exists() else ""
+            print(f"{PROG}: stopped{goes_on}", file=sys.stderr)
+            return cli.INTERRUPTED
     report.write(results, sweep.fly_tracks(networks, scale), out, options.only)
     shutil.rmtree(out / "shards", ignore_errors=True)
     Console().print(f"{out}: {len(results.planned)} runs; read {out / report.CLAIMS_FILE}", soft_wrap=True)
@@ -87,13 +102,16 @@ def _train(options: argparse.Namespace, command: str) -> "tuple[Results, Traject
     scale, out = SCALES[options.scale], options.out
     planned = plan.runs(scale, options.only)
     folder = out / "shards"
-    resumed = any(folder.iterdir())
+    resumed = _make(folder, options)
     started = time.monotonic()
     with _Progress(sum(shard.n_steps for shard, _ in sweep.cut(planned, scale))) as progress:
         where = partial(_train_all, options=options, progress=progress)
-        found = sweep.train(planned, scale, folder, where)
+        try:
+            found = sweep.train(planned, scale, folder, where)
+        finally:
+            _unmake(folder)
     names = {one.setting.scenario for one in planned}
-    here = f"{options.workers} cores of {platform.machine()}"
+    here = f"{options.workers} processes on {_cores()} cores of {platform.machine()}"
     metadata = Metadata(
         command=command,
         scale=scale,
@@ -101,7 +119,7 @@ def _train(options: argparse.Namespace, command: str) -> "tuple[Results, Traject
         greedy_missions=sweep.GREEDY_SEEDS[1],
         # Of an interrupted sweep nobody knows.
         wall_time_s=None if resumed else time.monotonic() - started,
-        device=f"Ray cluster {options.ray}" if options.ray else here,
+        device=f"Ray cluster {options.ray}" if options.ray is not None else here,
     )
     results, networks = sweep.collect(planned, metadata, found), sweep.trajectories(planned, scale, found)
     sweep.save_trajectories(networks, out / TRAJECTORIES_FILE)
@@ -113,20 +131,45 @@ def _train_all(
     shards: Sequence[Shard], folder: Path, options: argparse.Namespace, progress: "_Progress"
 ) -> None:
     progress.expect(shards)
-    if options.ray:
+    if options.ray is not None:
         train_on_ray(shards, folder, options.ray, progress.tell)
     else:
         train_here(shards, folder, options.workers, progress.tell)
 
 
-def _make(out: Path, resume: bool) -> None:
-    """Makes the folder of the results; refuses one that exists, unless it is to be gone on with."""
-    if out.exists() and not resume:
-        raise TrainingError(f"{out} exists; expected a new folder, or --resume")
+def _make(folder: Path, options: argparse.Namespace) -> bool:
+    """Makes the folder of the shards; tells whether there are some in it to go on from.
+
+    Raises:
+        TrainingError: it cannot be made, or belongs to a sweep with other options.
+    """
+    only = None if options.only is None else sorted(set(options.only))
+    plan = msgspec.json.encode({"scale": options.scale, "only": only})
     try:
-        (out / "shards").mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        kept = (folder / _PLAN_FILE).read_bytes() if (folder / _PLAN_FILE).is_file() else plan
     except OSError as error:
-        raise TrainingError(f"{out} cannot be made: {error.strerror}") from None
+        raise TrainingError(f"{folder.parent} cannot be made: {error.strerror}") from None
+    if kept != plan:
+        raise TrainingError(
+            f"{folder.parent} is half of a sweep with {kept.decode()}; expected the same --scale and --only, "
+            "or another --out"
+        )
+    cli.write_whole(folder / _PLAN_FILE, plan)
+    return any(folder.glob("*.safetensors"))
+
+
+def _unmake(folder: Path) -> None:
+    """Removes folders in which there is nothing to go on from: they would be in the next command's way."""
+    with contextlib.suppress(OSError):
+        if not any(folder.glob("*.safetensors")):
+            shutil.rmtree(folder)
+            folder.parent.rmdir()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 class _Progress:
@@ -145,6 +188,8 @@ class _Progress:
         self._task = self._bar.add_task("", total=total, rate="")
         self._total = total
         self._shards: dict[str, Shard] = {}
+        # Agent-steps of each shard when it was first heard of, and now.
+        self._first: dict[str, int] = {}
         self._done: dict[str, int] = {}
         self._before = 0
         self._started = self._last = time.monotonic()
@@ -164,9 +209,14 @@ class _Progress:
     def tell(self, name: str, n_flown: int) -> None:
         """Notes that each run of a shard has flown `n_flown` episodes."""
         shard = self._shards[name]
-        self._done[name] = shard.n_steps * n_flown // shard.population.n_episodes
+        n_episodes = shard.population.n_episodes
+        # A shard that went on from its checkpoint begins there; one that tells of its end only, at 0.
+        self._first.setdefault(
+            name, shard.n_steps * (n_flown - 1) // n_episodes if n_flown < n_episodes else 0
+        )
+        self._done[name] = shard.n_steps * n_flown // n_episodes
         done, now = sum(self._done.values()), time.monotonic()
-        rate = done / max(now - self._started, 1e-9)
+        rate = (done - sum(self._first.values())) / max(now - self._started, 1e-9)
         self._bar.update(self._task, completed=self._before + done, rate=f"{rate:,.0f} agent-steps/s")
         if not self._console.is_terminal and now - self._last > _LINE_EVERY_S:
             self._last = now

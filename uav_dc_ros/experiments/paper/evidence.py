@@ -39,7 +39,7 @@ RULES = f"""\
 - **An equality** (similar, stable, little difference) holds when the interval lies within ±{MARGIN:.0%}, does
   not hold when it lies outside, and is undecided otherwise.
 - **Everywhere** means each ratio by itself: it holds when every one holds, and does not when one does not.
-  "Almost all" allows one exception. The effect shown is that of the ratio which does worst.
+  "Almost all" allows one exception. The effect shown is the worst of those ratios that decide.
 - **A claim** holds when all its parts do, does not hold when one part does not, and is undecided otherwise.
 - Measures under "beside" never decide: they show what the claim's own measure hides.
 
@@ -134,7 +134,12 @@ class Evidence:
         Returns:
             Episodes, `[E]`; all of them where it never does.
         """
-        return settling(self.curves("reward", setting), goal, self.results.episode)
+        runs = self.results.of(setting)
+        own = [self.scale.environments.index(self.results.planned[i].environment) for i in runs]
+        values = np.zeros(len(self.results.planned))
+        reward = np.asarray(self.results.curves["reward"], np.float64)[runs]
+        values[runs] = settling(reward, goal[own], self.results.episode)
+        return self._by_environment(values, setting)
 
     def _by_environment(self, values: Array, setting: Setting) -> Array:
         """Means over repeats of what each run has, `[n_runs, ...]` to `[E, ...]`."""
@@ -236,12 +241,14 @@ def everywhere(text: str, effects: Array, ratios: Sequence[Ratio], unit: str, ex
     """A direction in each ratio by itself, but for some exceptions; effects `[E, R]`."""
     each = [interval(column) for column in effects.T]
     verdicts = [_direction(one) for one in each]
-    decisive = sorted(each, key=lambda one: one.mean)[min(exceptions, len(each) - 1)]
     verdict: Verdict = "undecided"
     if verdicts.count("holds") >= len(each) - exceptions:
         verdict = "holds"
     elif verdicts.count("does not hold") > exceptions:
         verdict = "does not hold"
+    decisive = min(
+        (one for one, own in zip(each, verdicts, strict=True) if own == verdict), key=lambda one: one.mean
+    )
     rule = f"above 0 in {'every' if not exceptions else f'all but {exceptions}'} ratio"
     return Part(text, decisive, unit, rule, verdict, _signs(effects, ratios))
 
@@ -258,11 +265,12 @@ def all_within(text: str, samples: Array, ratios: Sequence[Ratio]) -> Part:
         within(text, samples, lambda means, i=i: means[:, i] / means.mean(axis=1) - 1)  # type: ignore[misc]
         for i in range(samples.shape[1])
     ]
-    worst = max(range(len(parts)), key=lambda i: abs(parts[i].effect.mean))
+    verdict = joint([part.verdict for part in parts])
+    worst = max((part for part in parts if part.verdict == verdict), key=lambda part: abs(part.effect.mean))
     detail = "; ".join(
         f"{name(ratio)}: {part.effect.mean:+.1f}%" for ratio, part in zip(ratios, parts, strict=True)
     )
-    return parts[worst]._replace(verdict=joint([part.verdict for part in parts]), detail=detail)
+    return worst._replace(detail=detail)
 
 
 def joint(verdicts: Sequence[Verdict]) -> Verdict:

@@ -50,7 +50,7 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
         "## How it was made",
         _provenance(results),
         "## The rules",
-        "They were fixed before the sweep was run, as were all settings (`uav_dc_ros/experiments/paper/`).",
+        "The settings were fixed before the sweep ran, and the rules before any of its results was seen.",
         RULES,
         "## The figures",
         *(_figure(name) for name in drawn),

@@ -296,7 +296,7 @@ def _read(path: Path, schema: pa.Schema) -> tuple[pa.Table, Metadata]:
         metadata = msgspec.json.decode((found.metadata or {})[_KEY], type=Metadata)
     except KeyError:
         raise TrainingError(f"{path}: no metadata of a sweep; expected the key 'uav_dc_ros'") from None
-    except (OSError, pa.ArrowException, msgspec.DecodeError) as error:
+    except (OSError, pa.ArrowException, msgspec.DecodeError, UnicodeDecodeError) as error:
         raise TrainingError(f"{path} cannot be read: {error}") from None
     if not found.equals(schema):
         raise TrainingError(

@@ -13,6 +13,7 @@ from uav_dc_ros import cli, scenarios
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.batch import observe
 from uav_dc_ros.env.render import Track
 from uav_dc_ros.errors import TrainingError
@@ -108,9 +109,7 @@ def trajectories(planned: Sequence[Planned], scale: Scale, found: Found) -> Traj
 
 def fly_tracks(networks: Trajectories, scale: Scale) -> list[Track]:
     """A greedy mission of each network in its environment."""
-    setting = _trajectory_setting(scale)
-    population = _population(setting.scenario, [Planned(setting, 0, 0)], scale)
-    scenario, sizes = population.scenario, architecture(population, population.runs[0])
+    scenario, sizes = _trajectory_network(scale)
 
     def track(environment: int) -> Track:
         def act(state: world.State) -> Array:
@@ -128,13 +127,17 @@ def save_trajectories(networks: Trajectories, path: Path) -> None:
     cli.write_whole(path, safetensors.numpy.save(arrays))
 
 
-def load_trajectories(path: Path) -> Trajectories:
+def load_trajectories(path: Path, scale: Scale) -> Trajectories:
     """Reads what `save_trajectories` wrote; raises TrainingError for anything else."""
+    expected = network.shapes(_trajectory_network(scale)[1])
     networks: Trajectories = defaultdict(dict)
     try:
         for key, values in safetensors.numpy.load(path.read_bytes()).items():
             environment, _, name = key.partition(".")
             networks[int(environment)][name] = values
+        for own in networks.values():
+            if {name: values.shape for name, values in own.items()} != expected:
+                raise ValueError("not the parameters of the networks of a trajectory")
     except (OSError, SafetensorError, ValueError) as error:
         raise TrainingError(f"{path}: cannot be read: {error}") from None
     return networks
@@ -143,6 +146,13 @@ def load_trajectories(path: Path) -> Trajectories:
 def _trajectory_setting(scale: Scale) -> Setting:
     (setting,) = FIGURES["Traj"].panels[0].settings(scale)
     return setting
+
+
+def _trajectory_network(scale: Scale) -> tuple[Scenario, network.Architecture]:
+    """The world of the figure `Traj`, and the sizes of its networks."""
+    setting = _trajectory_setting(scale)
+    population = _population(setting.scenario, [Planned(setting, 0, 0)], scale)
+    return population.scenario, architecture(population, population.runs[0])
 
 
 def _population(scenario: str, runs: Sequence[Planned], scale: Scale) -> Population:

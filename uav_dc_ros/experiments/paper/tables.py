@@ -22,7 +22,7 @@ _UNITS = {
     "greedy_landing_rate": ("share of greedy missions that landed", 1.0, 2),
     "arrival_step": ("arrival step, T_cons when not landed", 1.0, 1),
     "greedy_arrival_step": ("arrival step of greedy missions, T_cons when not landed", 1.0, 1),
-    "convergence": ("convergence, episodes", 1.0, 0),
+    "convergence": ("convergence, episodes; all of them where it never converged", 1.0, 0),
     "fluctuation": ("fluctuation of the reward", 1.0, 4),
 }
 
