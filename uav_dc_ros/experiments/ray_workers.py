@@ -8,7 +8,7 @@ from pathlib import Path
 
 from uav_dc_ros import __version__
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.shards import Shard, Tell, keep, train_shard
+from uav_dc_ros.experiments.shards import Shard, Tell, code, keep, train_shard
 
 # Times that Ray starts a shard anew when its worker or its node dies.
 _RETRIES = 5
@@ -43,7 +43,7 @@ def train_on_ray(shards: Sequence[Shard], folder: Path, address: str, tell: Tell
         raise TrainingError(f"--ray {address}: no cluster answers: {str(error).splitlines()[0]}") from None
     try:
         task = ray.remote(_work).options(num_cpus=1, max_retries=_RETRIES)
-        pending = {task.remote(shard, __version__): shard for shard in shards}
+        pending = {task.remote(shard, code()): shard for shard in shards}
         while pending:
             done, _ = ray.wait(list(pending))
             shard = pending.pop(done[0])
@@ -73,10 +73,10 @@ def _knock(address: str) -> None:
         raise TrainingError(f"--ray {address}: no cluster answers: {error.strerror or error}") from None
 
 
-def _work(shard: Shard, version: str) -> bytes:
+def _work(shard: Shard, asked: str) -> bytes:
     """On a node of the cluster: trains a shard; gives back its result."""
-    if version != __version__:
+    if asked != code():
         raise TrainingError(
-            f"this node has uav_dc_ros {__version__}; expected {version}, as where it was asked"
+            f"a node has uav_dc_ros {__version__} with code {code()}; expected code {asked}, as the asker has"
         )
     return train_shard(shard).to_bytes()

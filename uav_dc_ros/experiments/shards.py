@@ -10,6 +10,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -17,6 +18,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError
 
+import uav_dc_ros
 from uav_dc_ros import __version__, cli
 from uav_dc_ros.agents import network
 from uav_dc_ros.core.arrays import Array
@@ -28,6 +30,17 @@ from uav_dc_ros.experiments.runs import Population
 Tell = Callable[[str, int], None]
 # Seconds between two checkpoints: more than a kill is worth, less than it is worth to wait for one.
 _CHECKPOINT_EVERY_S = 30.0
+
+
+@cache
+def code() -> str:
+    """Hash of this package's code: what was trained with other code is not gone on with."""
+    root = Path(uav_dc_ros.__file__).parent
+    sources = sorted(path.relative_to(root).as_posix() for path in root.rglob("*.py"))
+    digest = hashlib.sha256(__version__.encode())
+    for name in sources:
+        digest.update(name.encode() + (root / name).read_bytes())
+    return digest.hexdigest()[:16]
 
 
 class Shard(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,7 +57,7 @@ class Shard(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def name(self) -> str:
         """Tells its content: equal names mean equal results."""
-        content = msgspec.json.encode((self, __version__))
+        content = msgspec.json.encode((self, code()))
         return f"shard_{hashlib.sha256(content).hexdigest()[:16]}"
 
     @property
