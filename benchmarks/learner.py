@@ -1,10 +1,10 @@
 """How fast a population learns, as a multiple of stable-baselines3's DQN on the same machine in the same run.
 
-    python benchmarks/learner.py [--peer PYTHON] [--seconds S]
+    python benchmarks/learner.py [--peer PYTHON] [--seconds S] [--rounds N]
 
 An agent-step is one environment step and one gradient step of batch 32. World, observation (position),
-network (two hidden layers of 64), batch and buffer are those of `benchmarks/sb3_dqn.py`, which runs before
-and after in PYTHON, an interpreter that has stable-baselines3. Each line but the last two is one batch in
+network (two hidden layers of 64), batch and buffer are those of `benchmarks/sb3_dqn.py`, which runs in
+PYTHON, an interpreter that has stable-baselines3, by turns with this. Each line but the last two is one batch in
 one process on one core; those are as the sweep does it, shards of 64 runs in two processes at a time.
 Imports are not counted on either side.
 """
@@ -91,17 +91,22 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peer", default=sys.executable, metavar="PYTHON")
-    parser.add_argument("--seconds", default=8.0, type=float, metavar="S")
+    parser.add_argument("--seconds", default=6.0, type=float, metavar="S", help="of each measurement")
+    parser.add_argument("--rounds", default=5, type=int, metavar="N")
     options = parser.parse_args()
-    peers = [peer(options.peer) for _ in range(2)]
+    # Turn and turn about, since what else runs on the machine slows now the one and now the other.
+    peers, sweeps = [], []
+    for _ in range(options.rounds):
+        peers.append(peer(options.peer))
+        sweeps.append(measure(SHARD, 2, options.seconds))
+    same, best = (statistics.median(column) for column in zip(*peers, strict=True))
     lines = [(f"{n} in one batch", *measure(n, 1, options.seconds)) for n in (1, 16, 64, 256, 1024)]
     # Every further pair of shards takes its turn at the same rate and in the same memory.
-    rate, memory_mb = measure(SHARD, 2, 3 * options.seconds)
+    rate, memory_mb = (statistics.median(column) for column in zip(*sweeps, strict=True))
     lines += [(f"{n} as {n // SHARD} shards, 2 at a time", rate, memory_mb) for n in (256, 1024)]
-    peers += [peer(options.peer) for _ in range(2)]
-    same, best = (statistics.median(column) for column in zip(*peers, strict=True))
+    ratios = sorted(ours / theirs for (ours, _), (theirs, _) in zip(sweeps, peers, strict=True))
     print(f"stable-baselines3: {same:,.0f} agent-steps/s with these settings, {best:,.0f} at its best")
-    print(f"(each of {len(peers)} runs: {', '.join(f'{one:,.0f}' for one, _ in peers)})")
+    print(f"256 runs, round by round: {', '.join(f'{ratio:.0f}x' for ratio in ratios)}")
     print("| runs | agent-steps/s | times stable-baselines3 | times its best | memory, MB |")
     print("|---|---|---|---|---|")
     for title, rate, memory_mb in lines:

@@ -81,5 +81,5 @@ def test_what_was_not_measured_is_not_judged():
         greedy={name: values[kept] for name, values in results.greedy.items()},
     )
     written = claims_md(some, check(some), [])
-    assert "16 not tested." in written
+    assert "16 were not tested." in written
     assert re.search(r"^\| \[C1\]\(#c1\) .* \| \*\*not tested\*\* \| \|$", written, re.M)

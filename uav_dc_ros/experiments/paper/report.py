@@ -16,7 +16,12 @@ from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import Metadata, Results
 
 CLAIMS_FILE, VERDICTS_FILE = "claims.md", "claims.json"
-_VERDICTS: tuple[Verdict, ...] = ("holds", "does not hold", "undecided", "not tested")
+_VERDICTS: dict[Verdict, str] = {
+    "holds": "hold",
+    "does not hold": "do not hold",
+    "undecided": "are undecided",
+    "not tested": "were not tested",
+}
 
 
 def write(results: Results, tracks: Sequence[Track], folder: Path, only: Sequence[str] | None = None) -> None:
@@ -40,11 +45,13 @@ def write(results: Results, tracks: Sequence[Track], folder: Path, only: Sequenc
 
 def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str]) -> str:
     """The text of `claims.md`; `drawn` are the figures that lie beside it."""
-    counts = ", ".join(f"{n} {verdict}" for verdict in _VERDICTS if (n := count(findings, verdict)))
+    counts = ", ".join(
+        f"{n} {words}" for verdict, words in _VERDICTS.items() if (n := count(findings, verdict))
+    )
     sections = [
         "# What came of the paper's claims",
         *_warning(results.metadata),
-        f"Of {len(findings)} claims: {counts}.",
+        f"Of {len(findings)} claims {counts}.",
         _summary(findings),
         "Effect and interval are those of the part that decides: where a claim fails, the part it fails by.",
         "## How it was made",
