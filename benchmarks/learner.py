@@ -4,9 +4,9 @@
 
 An agent-step is one environment step and one gradient step of batch 32. World, observation (position),
 network (two hidden layers of 64), batch and buffer are those of `benchmarks/sb3_dqn.py`, which runs in
-PYTHON, an interpreter that has stable-baselines3, by turns with this. Each line but the last two is one batch in
-one process on one core; those are as the sweep does it, shards of 64 runs in two processes at a time.
-Imports are not counted on either side.
+PYTHON, an interpreter that has stable-baselines3, by turns with this. Each line but the last two is one
+batch in one process on one core; those are as the sweep does it, shards of 64 runs in two processes at a
+time. Imports are not counted on either side.
 """
 
 import argparse
