@@ -3,6 +3,7 @@
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.experiments.bootstrap import interval
 from uav_dc_ros.experiments.paper.evidence import (
     Evidence,
     Weighed,
@@ -10,7 +11,6 @@ from uav_dc_ros.experiments.paper.evidence import (
     greater,
     name,
     over_ratios,
-    resampled,
     within,
 )
 from uav_dc_ros.experiments.paper.setting import ALGORITHMS, FORMS, R_PLUS, Ratio, Setting
@@ -137,7 +137,7 @@ def c6(e: Evidence) -> Weighed:
     """Dueling has the best of the four curves with exponential at 1:1, and converges sooner than DQL."""
     axes = {"algorithm": ALGORITHMS, "form": FORMS}
     reward, settled = e.of("reward", _FIVE, **axes), e.of("convergence", _FIVE, **axes)
-    best = resampled(reward, lambda means: means[:, 1].max(axis=1) - means[:, 0].max(axis=1))
+    best = interval(reward, lambda means: means[:, 1].max(axis=1) - means[:, 0].max(axis=1))
     sooner = (settled[:, 0] - settled[:, 1]).mean(axis=1)
     return Weighed(
         parts=(
@@ -193,8 +193,8 @@ def c8(e: Evidence) -> Weighed:
     """DQL with 5 clusters: episode best and exponential fastest at 1:1, episode above immediate from 1:1."""
     axes = {"r_plus": R_PLUS, "form": FORMS}
     reward, settled = e.of("reward", _FIVE, **axes), e.of("convergence", _FIVE, **axes)
-    best = resampled(reward, lambda means: means[:, :, 1].max(axis=1) - means[:, :, 0].max(axis=1))
-    fastest = resampled(settled, lambda means: means[:, 0].min(axis=1) - means[:, 1].min(axis=1))
+    best = interval(reward, lambda means: means[:, :, 1].max(axis=1) - means[:, :, 0].max(axis=1))
+    fastest = interval(settled, lambda means: means[:, 0].min(axis=1) - means[:, 1].min(axis=1))
     ratios = e.scale.ratios
     share = e.of("reward_share", _FIVE, **axes, ratio=ratios)
     high = [i for i, ratio in enumerate(ratios) if ratio[0] >= ratio[1]]

@@ -1,6 +1,7 @@
 """The paper's claims on the throughput: C10 to C17."""
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.experiments.bootstrap import interval
 from uav_dc_ros.experiments.paper.evidence import (
     Evidence,
     Part,
@@ -12,7 +13,6 @@ from uav_dc_ros.experiments.paper.evidence import (
     lead,
     name,
     over_ratios,
-    resampled,
 )
 from uav_dc_ros.experiments.paper.setting import ALGORITHMS, FORMS, R_PLUS, Setting
 from uav_dc_ros.experiments.paper.tables import numbers
@@ -50,8 +50,8 @@ def c11(e: Evidence) -> Weighed:
     dueling_binary_one = 2 * n + one
     of_dqn = throughput[:, 0]  # [E, 2, R]
     others = [i for i in range(n) if i != half]
-    peak = resampled(of_dqn, lambda m: m[:, :, half].max(axis=1) - m[:, :, others].max(axis=(1, 2)))
-    above = resampled(everything, lambda m: m[:, dueling_binary_one] - m[:, : 2 * n].max(axis=1))
+    peak = interval(of_dqn, lambda m: m[:, :, half].max(axis=1) - m[:, :, others].max(axis=(1, 2)))
+    above = interval(everything, lambda m: m[:, dueling_binary_one] - m[:, : 2 * n].max(axis=1))
     return Weighed(
         parts=(
             greater(

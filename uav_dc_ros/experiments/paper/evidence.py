@@ -22,7 +22,6 @@ SMOOTHING = 5
 SETTLED = 0.9
 # What counts as "similar" and "stable", relative.
 MARGIN = 0.05
-_RESAMPLES = 10_000
 
 RULES = f"""\
 - **Performance** of a run is its mean over the last {FINAL:.0%} of its training episodes, exploration
@@ -212,19 +211,6 @@ def settling(curves: Array, goal: Array, episode: Array) -> Array:
     return np.asarray(episode)[np.minimum(settled, len(episode) - 1)].astype(np.float64)
 
 
-def resampled(samples: Array, statistic: Callable[[Array], Array]) -> Interval:
-    """A statistic of means over environments, with its 95% percentile-bootstrap interval.
-
-    Args:
-        samples: `[E, ...]`.
-        statistic: from means `[R, ...]` to numbers `[R]`.
-    """
-    samples = np.asarray(samples, np.float64)
-    rows = np.random.default_rng(0).integers(0, len(samples), (_RESAMPLES, len(samples)))
-    low, high = np.quantile(statistic(samples[rows].mean(axis=1)), [0.025, 0.975])
-    return Interval(float(statistic(samples.mean(axis=0)[None])[0]), float(low), float(high))
-
-
 def greater(text: str, effect: Array | Interval, unit: str) -> Part:
     """A direction: the effect, `[E]` or weighed already, is above 0."""
     weighed = effect if isinstance(effect, Interval) else interval(effect)
@@ -255,7 +241,7 @@ def everywhere(text: str, effects: Array, ratios: Sequence[Ratio], unit: str, ex
 
 def within(text: str, samples: Array, relative: Callable[[Array], Array], margin: float = MARGIN) -> Part:
     """An equality: a relative difference, of means over environments of `[E, ...]`, is near 0."""
-    effect = resampled(samples, lambda means: 100 * relative(means))
+    effect = interval(samples, lambda means: 100 * relative(means))
     return Part(text, effect, "%", f"within ±{margin:.0%}", _equality(effect, 100 * margin))
 
 
@@ -283,7 +269,7 @@ def joint(verdicts: Sequence[Verdict]) -> Verdict:
 def lead(options: Array, favourite: Sequence[int]) -> Interval:
     """By how much the worst of the favoured options is above the best of the others; options `[E, K]`."""
     others = [i for i in range(options.shape[1]) if i not in favourite]
-    return resampled(options, lambda means: means[:, favourite].min(axis=1) - means[:, others].max(axis=1))
+    return interval(options, lambda means: means[:, favourite].min(axis=1) - means[:, others].max(axis=1))
 
 
 def fall(values: Array) -> Array:

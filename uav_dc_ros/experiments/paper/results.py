@@ -19,23 +19,11 @@ from uav_dc_ros import __version__
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments.books import CURVES
 from uav_dc_ros.experiments.paper.setting import Planned, Scale, Setting
 
-# Of the missions flown to learn, exploration included, as in the paper's curves:
-#   reward            r^t at the end of the mission (eq. 7), which both forms of the reward share
-#   episode_return    what the agent was paid, undiscounted
-#   throughput_bps    sum-rate of the served users, mean over the mission's steps, bit/s
-#   users_collected   users collected
-#   landing_rate      share of missions that ended over the dock
-#   arrival_step      step after which the UAV stayed over the dock; max_steps when it did not land
-METRICS = (
-    "reward",
-    "episode_return",
-    "throughput_bps",
-    "users_collected",
-    "landing_rate",
-    "arrival_step",
-)
+# Of the missions flown to learn, exploration included, as in the paper's curves: `CURVES` without the loss.
+METRICS = CURVES[:-1]
 # The same of greedy missions after training, in the run's environment.
 GREEDY = (
     "greedy_reward",
