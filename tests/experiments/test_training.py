@@ -410,15 +410,15 @@ def test_the_score_counts_users_brought_home():
     np.testing.assert_allclose(validate(training).brought_home, brought)
 
 
-def test_policies_are_chosen_for_users_first_and_then_for_time(monkeypatch):
-    """Of four users a hundredth is 0.04: one more user in one of a hundred missions does not count."""
+def test_policies_are_chosen_for_users_and_for_battery(monkeypatch):
+    """Of four users and eight steps: a tenth of a user is worth two steps, and a hundredth is not."""
     scenario = tiny()
     collected = np.full((4, 100), 3)
     collected[1, 0] = 4
     collected[2, :10] = 4
     landed = np.ones((4, 100), bool)
     landed[3] = False
-    arrival = np.where(landed, np.array([[5.0], [7.0], [8.0], [4.0]]), np.nan)
+    arrival = np.where(landed, np.array([[5.0], [7.0], [6.0], [4.0]]), np.nan)
     nothing = np.zeros((4, 100))
     missions = Missions(
         users_collected=collected,

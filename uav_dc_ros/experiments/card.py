@@ -44,9 +44,9 @@ hidden layers of {hidden} units and {len(config.actions)} actions.
 ```
 
 - uav_dc_ros {__version__}; {seconds / 60:.1f} minutes for {n_runs} run(s) of {values.episodes} episodes
-- chosen among all runs and checkpoints by validation missions, which share no seed with those below, first
-  for the users brought home, to the nearest hundredth of the field, then for being early at the dock: the run
-  with seed {config.seed} after episode {config.episode}, which brought {score:.2f} of {n_users} users home
+- chosen among all runs and checkpoints by validation missions, which share no seed with those below, for the
+  share of users brought home, less a tenth of the share of the battery spent until the dock: the run with
+  seed {config.seed} after episode {config.episode}, which brought {score:.2f} of {n_users} users home
 - gamma {values.gamma:g}, epsilon {values.epsilon:g} (probability of the greedy action)
 - batches of {values.batch_size}, learning rate {values.learning_rate:g}
 - target network copied every {values.target_every} iterations, replay buffer of {values.buffer_size}

@@ -14,6 +14,8 @@ from uav_dc_ros.experiments.training import Training, rewards
 
 # Missions that choose among runs and checkpoints; those that judge the chosen one are seeds 0 to 99.
 VALIDATION_SEEDS = range(1_000_000, 1_000_100)
+# What all of the battery is worth, in shares of the users.
+_BATTERY = 0.1
 
 
 def fly_greedily(training: Training, seeds: range) -> Missions:
@@ -45,9 +47,9 @@ class Validation(NamedTuple):
 
     Attributes:
         brought_home: mean number of users; a mission that does not land brings nobody home.
-        merit: what policies are chosen by: first how many users they bring home, to the nearest hundredth
-            of the field, then how early they are at the dock. Collecting the last tenth of a user is
-            not worth minutes of flight.
+        merit: what policies are chosen by: the share of the users that they bring home, less a tenth of the
+            share of the battery that is spent when they are at the dock for good. So a hundredth of the
+            users is worth a tenth of the battery.
     """
 
     brought_home: np.ndarray
@@ -59,6 +61,5 @@ def validate(training: Training) -> Validation:
     scenario, missions = training.population.scenario, fly_greedily(training, VALIDATION_SEEDS)
     brought_home = np.where(missions.landed, missions.users_collected, 0).mean(axis=-1)
     max_steps = scenario.mission.max_steps
-    arrival = np.where(missions.landed, missions.arrival_step, max_steps).mean(axis=-1)
-    hundredths = np.round(100.0 * brought_home / scenario.n_users)
-    return Validation(brought_home, hundredths - arrival / (max_steps + 1))
+    spent = np.where(missions.landed, missions.arrival_step, max_steps).mean(axis=-1) / max_steps
+    return Validation(brought_home, brought_home / scenario.n_users - _BATTERY * spent)
