@@ -251,7 +251,8 @@ def _lines(title: str, wide: float) -> list[str]:
 
 def _facts(plan: FigurePlan, scale: Scale) -> str:
     """What the marks are."""
-    marks = f"mean of {len(scale.environments)} environments and its 95% bootstrap interval"
+    runs = f"{scale.repeats} runs" if scale.repeats > 1 else "1 run"
+    marks = f"{len(scale.environments)} environments × {runs}: mean, 95% bootstrap interval"
     if any(panel.kind == "curves" for panel in plan.panels):
         marks += f"; curves: moving average over {SMOOTHING * scale.episodes_per_point} episodes"
     if any(panel.kind != "curves" for panel in plan.panels):
