@@ -412,6 +412,7 @@ def test_what_a_kill_leaves_is_whole(left):
         ({"--algo": "dqn"}, "runs[0].algorithm = 'dueling_dqn'; expected 'dqn', as in this command"),
         ({"--episodes": 50}, "hyperparameters.episodes = 30; expected 50, as in this command"),
         ({"--scenario": "three_clusters"}, "scenario"),
+        ({"--checkpoint-every": 7}, "checkpoint_every = 10; expected 7, as in this command"),
     ],
     ids=str,
 )

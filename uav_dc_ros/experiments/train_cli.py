@@ -105,22 +105,35 @@ def _train(options: argparse.Namespace, command: str) -> int:
         training = Training(population, device)
     except (MemoryError, RuntimeError) as error:  # torch says with the latter that memory is short
         raise TrainingError(f"the training cannot be set up: {str(error).splitlines()[0]}") from None
-    progress: dict[str, Any] = {"merit": None, "score": None, "run": 0, "best": None, "seconds": 0.0}
+    every = options.checkpoint_every
+    progress: dict[str, Any] = {
+        "every": every,
+        "merit": None,
+        "score": None,
+        "run": 0,
+        "best": None,
+        "seconds": 0.0,
+    }
     if options.resume and saved.is_file():
         progress = checkpoint.restore(saved, training)
+        if progress["every"] != every:
+            raise TrainingError(
+                f"{saved} is the state of a training with checkpoint_every = {progress['every']}; "
+                f"expected {every}, as in this command"
+            )
         policy.load(folder / progress["best"])  # the result of what follows, unless there is a better one
     _reserve(folder, options.resume, training.n_flown)
     started = time.monotonic() - progress["seconds"]
     try:
         with ExitStack() as stack:
             stack.callback(_discard_empty, folder)
-            display = stack.enter_context(Display(training, options.checkpoint_every))
+            display = stack.enter_context(Display(training, every))
             scalars = stack.enter_context(Scalars(options.tensorboard, options.out.name, training))
             while training.n_flown < population.n_episodes:
                 training.fly_episode()
                 scalars.add_episode()
                 last = training.n_flown == population.n_episodes
-                if training.n_flown % options.checkpoint_every == 0 or last:
+                if training.n_flown % every == 0 or last:
                     found = validate(training)
                     if progress["merit"] is None or found.merit.max() > progress["merit"]:
                         run = int(found.merit.argmax())
