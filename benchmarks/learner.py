@@ -5,8 +5,8 @@
 An agent-step is one environment step and one gradient step of batch 32. World, observation (position),
 network (two hidden layers of 64), batch and buffer are those of `benchmarks/sb3_dqn.py`, which runs in
 PYTHON, an interpreter that has stable-baselines3, by turns with this. Each line but the last two is one
-batch in one process on one core; those are as the sweep does it, shards of 64 runs in two processes at a
-time. Imports are not counted on either side.
+batch in one process on one core; those are as the sweep does it, shards of 128 runs in two processes at
+a time. Imports are not counted on either side.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from uav_dc_ros.agents.policy import Hyperparameters
 from uav_dc_ros.experiments.runs import Population, Run
 from uav_dc_ros.experiments.training import Training, prepare_torch
 
-SHARD = 64
+SHARD = 128
 PEER = Path(__file__).with_name("sb3_dqn.py")
 
 

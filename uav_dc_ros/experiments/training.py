@@ -81,6 +81,7 @@ class Training:
         """Figures of every episode flown, float32 `[n_flown, N]` each; see `books.CURVES`."""
         return {name: self._curves[: self.n_flown, i] for i, name in enumerate(CURVES)}
 
+    @torch.inference_mode()  # the gradient is written out, so torch need not keep books for its own
     def fly_episode(self) -> None:
         """T_cons iterations of every run, each one step and one gradient step (algorithms 1 and 2).
 

@@ -27,7 +27,7 @@ from uav_dc_ros.experiments.tracks import fly_track
 
 # Runs of a shard: enough to hide the overhead of an operation, few enough for a core's cache, and enough
 # shards to keep the workers busy to the end.
-_SHARD_RUNS = 64
+_SHARD_RUNS = 128
 # Greedy missions of each run: seeds that no run was trained with and no policy is judged by.
 GREEDY_SEEDS = (2_000_000, 20)
 
