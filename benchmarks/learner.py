@@ -1,17 +1,20 @@
 """How fast a population learns, as a multiple of stable-baselines3's DQN on the same machine in the same run.
 
     python benchmarks/learner.py [--peer PYTHON] [--seconds S] [--rounds N]
+    python benchmarks/learner.py --profile
 
 An agent-step is one environment step and one gradient step of batch 32. World, observation (position),
 network (two hidden layers of 64), batch and buffer are those of `benchmarks/sb3_dqn.py`, which runs in
 PYTHON, an interpreter that has stable-baselines3, by turns with this. Each line but the last two is one
 batch in one process on one core; those are as the sweep does it, shards of 128 runs in two processes at
-a time. Imports are not counted on either side.
+a time. Imports are not counted on either side. With --profile: where the time of a shard goes.
 """
 
 import argparse
+import cProfile
 import json
 import multiprocessing
+import pstats
 import resource
 import statistics
 import subprocess
@@ -87,13 +90,39 @@ def peer(python: str) -> tuple[float, float]:
     return figures["agent_steps_per_s"], figures["best_agent_steps_per_s"]
 
 
+def profile() -> None:
+    """Prints where the time of some episodes of a shard goes, by function."""
+    prepare_torch(n_threads=1)
+    training = Training(population(SHARD), torch.device("cpu"))
+    training.fly_episode()
+    watch = cProfile.Profile()
+    watch.enable()
+    for _ in range(5):
+        training.fly_episode()
+    watch.disable()
+    figures = pstats.Stats(watch).sort_stats("tottime")
+    total_s = figures.total_tt  # type: ignore[attr-defined]
+    print(f"{1e6 * total_s / (5 * 60 * SHARD):.1f} us per agent-step, watched")
+    for (_, _, name), (_, calls, own_s, within_s, _) in sorted(
+        figures.stats.items(),  # type: ignore[attr-defined]
+        key=lambda item: -item[1][2],
+    )[:20]:
+        print(
+            f"{own_s / total_s:5.1%} itself  {within_s / total_s:6.1%} with what it calls  {calls:7}x  {name}"
+        )
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peer", default=sys.executable, metavar="PYTHON")
     parser.add_argument("--seconds", default=6.0, type=float, metavar="S", help="of each measurement")
     parser.add_argument("--rounds", default=5, type=int, metavar="N")
+    parser.add_argument("--profile", action="store_true")
     options = parser.parse_args()
+    if options.profile:
+        profile()
+        return
     # Turn and turn about, since what else runs on the machine slows now the one and now the other.
     peers, sweeps = [], []
     for _ in range(options.rounds):

@@ -37,17 +37,12 @@ def fly(training, n):
     return training
 
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "training.safetensors"
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("worlds_in", ["numpy", "torch"])

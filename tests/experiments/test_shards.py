@@ -16,6 +16,8 @@ from uav_dc_ros.experiments.local_workers import train_here
 from uav_dc_ros.experiments.runs import Population, Run
 from uav_dc_ros.experiments.shards import Shard
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def shard(seed, episodes=40, scenario=None):
     scenario = scenario or tiny()

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.small_worlds import tiny
 from uav_dc_ros.agents import policy
@@ -59,13 +58,8 @@ data_scale_bits = 6e6
 PICTURES = [policy.LEARNING_CURVE, policy.TRAJECTORY]
 
 
-@pytest.fixture(autouse=True)
-def torch_as_it_was():
-    """A command that runs in this process sets torch up for training, for the tests after it too."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-    torch.set_flush_denormal(False)
+# A command that runs in this process sets torch up for training, for the tests after it too.
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

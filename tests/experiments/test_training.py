@@ -28,13 +28,7 @@ CPU = torch.device("cpu")
 ENDS = ["at_time_limit", "on_arrival"]
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """What training promises to repeat, it promises for one number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def trained(made, n=None, worlds_in=None):
@@ -392,7 +386,7 @@ def test_validation_flies_what_is_exported():
         if one.environment is not None:
             drawn = np.random.default_rng(one.environment).random((scenario.n_users, 2))
             layouts = [drawn.astype(np.float32)]
-        alone = fly(own, act, seeds, runs=(1,), layouts=layouts)
+        alone = fly(own, act, seeds, layouts=layouts)
         np.testing.assert_array_equal(missions.users_collected[i], alone.users_collected[0])
         np.testing.assert_array_equal(missions.landed[i], alone.landed[0])
         np.testing.assert_allclose(missions.reward[i], alone.reward[0], rtol=1e-6)

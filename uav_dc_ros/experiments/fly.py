@@ -48,8 +48,7 @@ def flight(
     scenario: Scenario,
     act: Act,
     seeds: Sequence[int],
-    runs: tuple[int, ...] = (),
-    layouts: Sequence[Array | None] = (),
+    layouts: Sequence[Array | None] | None = None,
     rewards: Rewards | None = None,
 ) -> Iterator[tuple[world.State, world.Outcome | None]]:
     """The missions step by step: first their start, without an outcome, then every step.
@@ -58,11 +57,11 @@ def flight(
         scenario: the world's values.
         act: who steers.
         seeds: the S missions.
-        runs: leading dimensions of what steers: each flies all S missions.
-        layouts: for each run the draws for where users start, `[U, 2]`, or None for the seed's own;
-            none at all means the seed's own for all.
-        rewards: how each run is paid, `[*runs, 1]`; as the scenario says unless told.
+        layouts: when several runs fly all S missions each, `[R, S]`: for each the draws for where
+            users start, `[U, 2]`, or None for the seed's own.
+        rewards: how each run is paid, `[R, 1]`; as the scenario says unless told.
     """
+    runs = () if layouts is None else (len(layouts),)
     rngs = [np.random.default_rng(seed) for seed in seeds]
 
     def draws() -> Array:
@@ -70,7 +69,7 @@ def flight(
         return np.broadcast_to(one, (*runs, *one.shape))
 
     start = draws().copy()
-    for run, own in enumerate(layouts):
+    for run, own in enumerate(layouts or ()):
         if own is not None:
             start[run] = own
     state = world.initial(scenario, start)
@@ -84,12 +83,11 @@ def fly(
     scenario: Scenario,
     act: Act,
     seeds: Sequence[int],
-    runs: tuple[int, ...] = (),
-    layouts: Sequence[Array | None] = (),
+    layouts: Sequence[Array | None] | None = None,
     rewards: Rewards | None = None,
 ) -> Missions:
-    """Flies every mission to its end; arguments as in `flight`, results `[*runs, S]`."""
-    steps = flight(scenario, act, seeds, runs, layouts, rewards)
+    """Flies every mission to its end; arguments as in `flight`, results `[S]` or `[R, S]`."""
+    steps = flight(scenario, act, seeds, layouts, rewards)
     final, _ = next(steps)
     over = final.step < 0
     landed, arrival = over, np.full(over.shape, np.nan)

@@ -17,7 +17,7 @@ def fly_track(scenario: Scenario, act: Act, seed: int, layout: Array | None = No
         return type(batch)(**{f.name: getattr(batch, f.name)[0, 0] for f in fields(batch)})
 
     track = Track(scenario)
-    for state, outcome in flight(scenario, act, [seed], runs=(1,), layouts=[layout]):
+    for state, outcome in flight(scenario, act, [seed], layouts=[layout]):
         link: world.Link | None = alone(outcome.link) if outcome else None
         track.add(alone(state), link)
         if outcome and (outcome.terminated | outcome.truncated).all():

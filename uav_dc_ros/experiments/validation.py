@@ -36,7 +36,6 @@ def fly_greedily(training: Training, seeds: range) -> Missions:
         population.scenario,
         act,
         seeds,
-        runs=(len(population.runs),),
         layouts=fixed,
         rewards=rewards(population.runs, lambda values: values[:, None]),
     )

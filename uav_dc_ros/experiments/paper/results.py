@@ -147,30 +147,8 @@ class Results:
 
     def of(self, setting: Setting) -> Array:
         """Indices of a setting's runs by environment, then repeat, integers `[n]`; empty without any."""
-        return self._ordered(self._by_setting.get(setting, []))
-
-    def select(self, **criteria: Any) -> Array:
-        """Indices of the runs that meet all criteria, by environment, then repeat, integers `[n]`.
-
-        Args:
-            criteria: fields of `Setting`, `ratio`, `environment` or `repeat`; what is not named may be any.
-
-        Raises:
-            TrainingError: no such criterion.
-        """
-        found = []
-        for i, run in enumerate(self.planned):
-            values = {
-                **msgspec.structs.asdict(run.setting),
-                "ratio": run.setting.ratio,
-                "environment": run.environment,
-                "repeat": run.repeat,
-            }
-            if unknown := criteria.keys() - values.keys():
-                raise TrainingError(f"no criterion {min(unknown)!r}; expected one of {', '.join(values)}")
-            if all(values[name] == wanted for name, wanted in criteria.items()):
-                found.append(i)
-        return self._ordered(found)
+        runs = self._by_setting.get(setting, [])
+        return np.array(sorted(runs, key=lambda i: self.planned[i][1:]), np.intp)
 
     @cached_property
     def _by_setting(self) -> dict[Setting, list[int]]:
@@ -178,9 +156,6 @@ class Results:
         for i, run in enumerate(self.planned):
             found.setdefault(run.setting, []).append(i)
         return found
-
-    def _ordered(self, runs: list[int]) -> Array:
-        return np.array(sorted(runs, key=lambda i: self.planned[i][1:]), np.intp)
 
     def save(self, folder: Path) -> None:
         """Writes both files into an existing folder, each in one move.
