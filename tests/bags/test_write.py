@@ -12,7 +12,9 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from uav_dc_ros.bags.write import CHUNK_BYTES, METADATA_NAME, BagWriter
+from uav_dc_ros.bags.metadata import METADATA_NAME
+from uav_dc_ros.bags.part import CHUNK_BYTES
+from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
