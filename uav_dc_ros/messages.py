@@ -137,13 +137,13 @@ PAYLOADS: dict[str, type[Payload]] = {
 P = TypeVar("P", bound=Payload)
 
 
-def encode(payload: Payload) -> str:
-    """The payload as JSON.
+def encode(payload: Payload) -> bytes:
+    """The payload as JSON, UTF-8.
 
     Raises:
         MessageError: the payload breaks its own schema (a NaN, say): it must not leave the node.
     """
-    text = msgspec.json.encode(payload).decode()
+    text = msgspec.json.encode(payload)
     decode(text, type(payload))
     return text
 

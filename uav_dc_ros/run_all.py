@@ -5,6 +5,7 @@ python -m uav_dc_ros.run_all --scenario five_clusters --seed 3
 
 import argparse
 import os
+import re
 from pathlib import Path
 from typing import NoReturn
 
@@ -14,6 +15,9 @@ from uav_dc_ros.errors import ParameterError
 
 PROG = "python -m uav_dc_ros.run_all"
 DOMAIN_MAX = 232  # the ports of higher ones do not exist
+PORT_MAX = 65535
+LIVE_PORT = 8765  # Foxglove's own default
+NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")
 WATCHABLE_PACE = 90.0  # a mission of sixty steps of 15 s in ten seconds
 
 
@@ -61,6 +65,27 @@ def parser() -> cli.Parser:
         "--bag", type=Path, metavar="DIR", help="folder of the new bag (default: a dated one in bags/)"
     )
     recording.add_argument("--no-record", action="store_true", help="fly without a bag")
+    options.add_argument(
+        "--namespace",
+        type=_namespace,
+        default="/",
+        metavar="NS",
+        help="namespace of the mission: several fly side by side on one network, each in its own",
+    )
+    options.add_argument(
+        "--nodes",
+        type=_names,
+        metavar="A,B,...",
+        help="nodes to start on this host, the others being started elsewhere (default: all)",
+    )
+    options.add_argument(
+        "--live",
+        type=_port,
+        nargs="?",
+        const=LIVE_PORT,
+        metavar="PORT",
+        help="serve the mission to Foxglove over WebSocket (default port: %(const)s)",
+    )
     options.add_argument("--summary", type=Path, metavar="FILE", help="write the summary as JSON")
     options.add_argument("--version", action="version", version=__version__)
     return options
@@ -71,7 +96,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     options = parser().parse_args(arguments)
 
     def command() -> int:
-        _prepare_ros()  # before it is imported
+        _prepare_ros(alone=options.nodes is None)  # before it is imported
         from uav_dc_ros.nodes.flight import Flight
 
         return Flight(options).run()
@@ -79,8 +104,11 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     cli.run(command, PROG)
 
 
-def _prepare_ros() -> None:
+def _prepare_ros(*, alone: bool) -> None:
     """What holds for this command and its nodes, unless the user's environment says otherwise.
+
+    Args:
+        alone: do all nodes run on this host?
 
     Raises:
         ParameterError: an environment in which ROS cannot start.
@@ -89,7 +117,7 @@ def _prepare_ros() -> None:
     if not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
         raise ParameterError(f"ROS_DOMAIN_ID is {domain!r}; expected a whole number from 0 to {DOMAIN_MAX}")
     # Nobody else on the network should see these nodes by accident.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST" if alone else "SUBNET")
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "{severity}: {message}")
     # Jazzy's Fast DDS reads the first name, later ones the second.
     names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
@@ -103,6 +131,29 @@ def _pace(text: str) -> float | None:
         return pace.parse(text)
     except ParameterError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _namespace(text: str) -> str:
+    names = text.strip("/").split("/")
+    if text != "/" and not all(NAME.fullmatch(name) for name in names):
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; expected a ROS namespace: letters, digits and single '_', beginning with a letter, "
+            "with '/' between parts"
+        )
+    return "/" + "/".join(names)
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"{text!r}; expected names of nodes, each once, with ',' between")
+    return names
+
+
+def _port(text: str) -> int:
+    if not (text.isdecimal() and int(text) <= PORT_MAX):
+        raise argparse.ArgumentTypeError(f"{text!r}; expected a TCP port from 0 (any) to {PORT_MAX}")
+    return int(text)
 
 
 if __name__ == "__main__":

@@ -2,12 +2,18 @@
 
 Quality of service, with reasons:
 
-- `reliable` everywhere: a lost message would end a lockstep, and leave a hole in a bag.
-- `latched` (transient local) for what describes the state: whoever joins late learns it at once. A pose is
-  not latched, since an autopilot's is not, and a subscriber may not ask for more than is offered; a move
-  is not, since an old one is worth nothing.
-- Publishers keep 1000 messages for readers that fall behind. Who acts on messages keeps the newest hundred;
-  who must miss nothing (the recorder, while the disk is busy) keeps all: see `hears_all` in the node table.
+- *Offered reliable*: a lost message would leave a hole in a bag and make a lockstep wait. Only `clock` is
+  offered best effort, as everywhere in ROS: the next one is worth more than a lost one.
+- *Asked best effort*: poses and the clock. An autopilot's bridge publishes its pose best effort, and a
+  subscription that asks for more than is offered hears nothing.
+- *Latched* (transient local): what describes the state, so that whoever joins late, or again, learns it at
+  once. A pose is not latched, since an autopilot's is not; a move is not, since an old one is worth nothing.
+- *Depth*: publishers keep as much as a node that was restarted, or a reader that fell behind, may want to
+  catch up on. Payloads with an entry per user can be large, so fewer of them are kept. Who acts on messages
+  keeps the newest hundred; who must miss nothing keeps all: see `hears_all` in the node table.
+
+Every policy can be overridden for each node, the ROS way: parameters `qos_overrides./TOPIC.publisher.*` and
+`qos_overrides./TOPIC.subscription.*` with `history`, `depth`, `reliability`, `durability`.
 """
 
 from dataclasses import dataclass
@@ -20,30 +26,42 @@ class Topic:
     Attributes:
         name: relative name.
         type: ROS 2 message type; `std_msgs/msg/String` holds a JSON payload, see messages.PAYLOADS.
-        latched: durability transient local instead of volatile.
+        reliable: reliability offered by publishers.
+        asks_reliable: reliability asked for by subscriptions.
+        latched: durability transient local instead of volatile, offered and asked for.
         depth: messages that a publisher keeps.
         recorded: does the recorder write it?
     """
 
     name: str
     type: str
-    latched: bool
+    reliable: bool = True
+    asks_reliable: bool = True
+    latched: bool = False
     depth: int = 1000
     recorded: bool = True
 
 
 JSON = "std_msgs/msg/String"
 POSE = "geometry_msgs/msg/PoseStamped"
+PATH = "nav_msgs/msg/Path"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+CLOCK = "rosgraph_msgs/msg/Clock"
 
 TOPICS: dict[str, Topic] = {
     topic.name: topic
     for topic in (
-        Topic(name="pose", type=POSE, latched=False),
-        Topic(name="users", type=JSON, latched=True),
-        Topic(name="rates", type=JSON, latched=True),
+        Topic(name="pose", type=POSE, asks_reliable=False),
+        Topic(name="users", type=JSON, latched=True, depth=100),
+        Topic(name="rates", type=JSON, latched=True, depth=100),
         Topic(name="mission", type=JSON, latched=True),
-        Topic(name="move", type=JSON, latched=False),
+        Topic(name="move", type=JSON),
         Topic(name="target", type=POSE, latched=True),
-        Topic(name="ready", type=JSON, latched=True, recorded=False),
+        Topic(name="ready", type=JSON, latched=True, depth=10, recorded=False),
+        Topic(name="path", type=PATH, latched=True, depth=1),
+        Topic(name="markers", type=MARKERS, latched=True, depth=1),
+        Topic(name="diagnostics", type=DIAGNOSTICS, depth=10),
+        Topic(name="clock", type=CLOCK, reliable=False, asks_reliable=False, depth=1, recorded=False),
     )
 }

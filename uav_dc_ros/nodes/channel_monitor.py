@@ -1,6 +1,7 @@
 """The channel and rate monitor: SINR and rates of every user, and the data collected from them.
 
-It hears positions only, so it works the same around a simulated and a real vehicle.
+It hears positions only, so it works the same around a simulated and a real vehicle. Its books are what
+has been collected; a monitor that was killed finds them in its journal.
 """
 
 from collections import deque
@@ -8,37 +9,69 @@ from collections import deque
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 
-from uav_dc_ros import messages
+from uav_dc_ros import messages, scenarios
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.errors import MessageError
+from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes.journal import Journal
+from uav_dc_ros.nodes.mission_node import MissionNode
 
 POSES_KEPT = 256
 
 
-class ChannelMonitor(runtime.MissionNode):
+class ChannelMonitor(MissionNode):
     """Answers each `users` with the `rates` of that step."""
 
     def __init__(self) -> None:
         super().__init__("channel_monitor")
-        self.scenario = self.scenario_parameter()
-        self._poses: deque[tuple[int, Array]] = deque(maxlen=POSES_KEPT)
-        self._users: deque[messages.Users] = deque(maxlen=POSES_KEPT)
+
+    def configure(self) -> None:
+        """Load the world, and the books of a monitor that was killed."""
+        self.scenario = scenarios.load(self.values["scenario"])
+        self.journal = Journal(self.values["journal"])
         self._said: messages.Rates | None = None
         self._forget()
+        self._restore()
         core.measure(  # the first time takes longest
             self.scenario,
             np.asarray(self.scenario.mission.start_m),
             np.asarray(self.scenario.user_centres_m),
             self._collected,
         )
-        self.listen()
+
+    def activate(self) -> None:
+        """Begin with empty hands, and the books as they are."""
+        self._poses: deque[tuple[int, Array]] = deque(maxlen=POSES_KEPT)
+        self._users: deque[messages.Users] = deque(maxlen=POSES_KEPT)
+
+    def deactivate(self) -> None:
+        """Fall silent."""
+        self.journal.close()
 
     def _forget(self) -> None:
         """Begin a mission: nothing is collected."""
         self._data_bits = np.zeros(self.scenario.n_users)
         self._collected = np.zeros(self.scenario.n_users, dtype=bool)
+
+    def _restore(self) -> None:
+        """Open the books where they were left.
+
+        Raises:
+            NodeError: they are the books of something else.
+        """
+        lines = self.journal.lines()
+        if not lines:
+            return
+        try:
+            self._said = messages.decode(lines[-1], messages.Rates)
+            self._data_bits, self._collected = convert.collection(self._said, self.scenario)
+        except MessageError as error:
+            raise NodeError(
+                f"journal {self.values['journal']}: not that of a channel monitor in scenario "
+                f"{self.scenario.name!r}: {error}"
+            ) from None
+        self.get_logger().warning(f"goes on after step {self._said.step} of mission {self._said.mission}")
 
     def on_pose(self, message: PoseStamped) -> None:
         """Keep a pose; users may have waited for it."""
@@ -99,7 +132,10 @@ class ChannelMonitor(runtime.MissionNode):
         self._said = convert.rates(
             link, self._data_bits, self._collected, mission=users.mission, step=users.step
         )
-        self.say("rates", self._said)
+        text = messages.encode(self._said)
+        keep = self.journal.append if users.step else self.journal.begin
+        keep(text)  # before it is said: what others know is never forgotten
+        self.say_encoded("rates", text)
 
 
 if __name__ == "__main__":

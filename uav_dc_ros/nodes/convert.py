@@ -1,9 +1,12 @@
 """Messages to and from the core's arrays: the only code that knows both."""
 
+from typing import Literal
+
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosgraph_msgs.msg import Clock
 
 from uav_dc_ros import messages
 from uav_dc_ros.core.arrays import Array
@@ -11,8 +14,32 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Link
 from uav_dc_ros.errors import MessageError
 
+CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # how a serialised message says how its numbers are laid out
 FRAME = "map"  # ENU, as everywhere in this project
 _FOREVER = QosTime(9223372036, 854775807)  # how ROS 2 writes an infinite duration
+
+
+def cdr_of_text(text: bytes) -> bytes:
+    """A std_msgs/String, serialised: its JSON goes to the middleware, and comes from it, as bytes."""
+    return CDR_LITTLE_ENDIAN + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
+
+
+def text_in_cdr(data: bytes) -> bytes:
+    """The text in a serialised std_msgs/String.
+
+    Raises:
+        MessageError: it holds less than it says.
+    """
+    order: Literal["little", "big"] = "little" if data[1:2] == b"\1" else "big"
+    length = int.from_bytes(data[4:8], order)  # with the zero at its end
+    if len(data) < 8 + length:
+        raise MessageError("malformed", f"{len(data) - 8} bytes of text; expected {length}, as it says")
+    return data[8 : 7 + length]
+
+
+def clock(time_ns: int) -> Clock:
+    """A time, nanoseconds, as a message for `clock`."""
+    return Clock(clock=stamp(time_ns))
 
 
 def stamp(stamp_ns: int) -> Time:

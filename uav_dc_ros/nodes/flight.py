@@ -3,27 +3,30 @@
 import argparse
 import os
 import signal
+import tempfile
 import time
 from datetime import datetime
 from pathlib import Path
 
 import msgspec
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros import cli, scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import observer
 from uav_dc_ros.nodes.display import Display
-from uav_dc_ros.nodes.launcher import Launcher
+from uav_dc_ros.nodes.executor import DirectExecutor
+from uav_dc_ros.nodes.observer import MissionSoFar, Observer, Summary, summary
+from uav_dc_ros.nodes.supervisor import Supervisor
 from uav_dc_ros.nodes.table import NODES
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
-CHECK_PERIOD_S = 0.05
+LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
+TICK_S = 0.02
 
 
 class Flight:
@@ -39,7 +42,8 @@ class Flight:
         self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
         self.policy.check(self.scenario)
         pace.check(self.scenario, options.pace, options.missions)
-        self.bag = None if options.no_record else _new_bag(options.bag)
+        self.nodes = _nodes(options)
+        self.bag = _new_bag(options.bag) if "recorder" in self.nodes else None
         if options.summary is not None:
             _check_writable(options.summary, self.bag)
         self.display = Display(self.scenario, options.missions)
@@ -49,7 +53,7 @@ class Flight:
                 f"{self.policy.scenario.fingerprint}) than it flies in ({self.scenario.name} "
                 f"{self.scenario.fingerprint})"
             )
-        self.summaries: list[observer.Summary] = []
+        self.summaries: list[Summary] = []
         self._interrupted = False
         self._step_s = 0.0  # when the last step came, monotonic clock
 
@@ -58,30 +62,61 @@ class Flight:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._interrupt)
         status = 0
-        parameters = self._parameters()
-        with Launcher(self.display.node_line) as launcher, self.display:
-            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-            node = observer.Observer(
-                self.scenario, self.options.seed, list(parameters), self._on_step, self._on_end
-            )
-            executor = SingleThreadedExecutor()
+        remapped = ["--ros-args", "-r", f"__ns:={self.options.namespace}", "-r", "/clock:=clock"]
+        with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as journals, self.display:
+            rclpy.init(args=remapped, signal_handler_options=SignalHandlerOptions.NO)
+            parameters = self._parameters(Path(journals))
+            seed = self.options.seed if "world" in self.nodes else None
+            node = Observer(self.scenario, seed, self._peers(), self._on_step, self._on_end)
+            executor = DirectExecutor(node.rest_s)
             executor.add_node(node)
-            try:
-                for name, values in parameters.items():
-                    launcher.start(name, values)
-                self._follow(launcher, node, executor)
-            except NodeError as error:
-                self.display.error(str(error))
-                status = 1
-            status = max(status, self._stopped(launcher.stop()))
-            if (flown := len(self.summaries)) < self.options.missions:
-                not_begun = observer.MissionSoFar(mission=flown, seed=self.options.seed + flown)
-                now = node.mission or not_begun
-                self._on_end(now if now.mission == flown else not_begun, Phase.ABORTED)
-            node.destroy_node()
+            with Supervisor(node, parameters, self.display.node_line, self.display.note) as supervisor:
+                try:
+                    self._follow(supervisor, node, executor)
+                except NodeError as error:
+                    self.display.error(str(error))
+                    status = 1
+                status = max(status, self._stopped(supervisor.stop()))
+            self._account_for_all(node)
+            node.trigger_shutdown()
             rclpy.try_shutdown()
+        status = max(status, self._mend_bag())
         self._tell()
         return cli.INTERRUPTED if self._interrupted else status
+
+    def _follow(self, supervisor: Supervisor, node: Observer, executor: DirectExecutor) -> None:
+        """Spin until all missions are over, or Ctrl-C.
+
+        Raises:
+            NodeError: a node gave up, or no step came for too long.
+        """
+        node.trigger_configure()
+        node.trigger_activate()
+        self._step_s = time.monotonic()
+        check_s = 0.0
+        while len(self.summaries) < self.options.missions and not self._interrupted:
+            executor.spin_once(TICK_S)
+            now_s = time.monotonic()
+            if now_s >= check_s:
+                check_s = now_s + TICK_S
+                supervisor.tick()
+                node.restarts_of = supervisor.restarts
+                node.close(LAST_RATES_S)
+                self._check_patience(node, now_s)
+            time.sleep(node.rest_s)
+
+    def _check_patience(self, node: Observer, now_s: float) -> None:
+        """Wait for steps that are due, and for nodes that are started here; others may take their time."""
+        patience_s = SILENCE_S + pace.period_s(self.scenario, self.options.pace)
+        if now_s - self._step_s <= patience_s:
+            return
+        if node.mission is not None:
+            raise NodeError(f"no step came within {patience_s:.0f} s")
+        elsewhere = [name for name in self._peers() if name not in (*self.nodes, "observer")]
+        if not elsewhere:
+            raise NodeError(f"the nodes did not find each other within {patience_s:.0f} s")
+        self.display.note(f"still waiting for {', '.join(elsewhere)} of another run of run_all")
+        self._step_s = now_s
 
     def _stopped(self, statuses: dict[str, int]) -> int:
         """Tell which nodes did not end as they should; 1 if that spoilt anything: the recorder's bag."""
@@ -90,56 +125,69 @@ class Flight:
             self.display.error(f"node {name} ended with {code} when it was asked to stop")
         return int("recorder" in odd)
 
-    def _follow(self, launcher: Launcher, node: observer.Observer, executor: SingleThreadedExecutor) -> None:
-        """Spin until all missions are over, or Ctrl-C.
+    def _account_for_all(self, node: Observer) -> None:
+        """Every mission that was to be flown has its end: those without one were aborted."""
+        node.close()
+        flown = len(self.summaries)
+        if flown < self.options.missions:
+            not_begun = MissionSoFar(mission=flown, seed=self.options.seed + flown)
+            now = node.mission or not_begun
+            self._on_end(now if now.mission == flown else not_begun, Phase.ABORTED)
 
-        Raises:
-            NodeError: a node ended, or no step came for too long.
-        """
-        patience_s = SILENCE_S + pace.period_s(self.scenario, self.options.pace)
-        self._step_s = time.monotonic()
-        check_s = 0.0
-        while len(self.summaries) < self.options.missions and not self._interrupted:
-            executor.spin_once(timeout_sec=CHECK_PERIOD_S)
-            now_s = time.monotonic()
-            if now_s < check_s:
-                continue
-            check_s = now_s + CHECK_PERIOD_S
-            launcher.check()
-            if now_s - self._step_s > patience_s:
-                silent = "no step came" if node.mission else "the nodes did not find each other"
-                raise NodeError(f"{silent} within {patience_s:.0f} s")
+    def _mend_bag(self) -> int:
+        """Make a whole bag of one whose recorder did not close it; 1 if that cannot be."""
+        if self.bag is None or not self.bag.is_dir() or (self.bag / "metadata.yaml").is_file():
+            return 0
+        try:
+            mended = mend(self.bag)
+        except BagError as error:
+            self.display.error(str(error))
+            return 1
+        self.display.note(f"the recorder did not close its bag: {mended}")
+        return 0
 
-    def _parameters(self) -> dict[str, dict[str, object]]:
+    def _peers(self) -> list[str]:
+        """Nodes that a mission waits for, on whichever host they run."""
+        peers = [row.name for row in NODES.values() if row.needed]
+        if self.options.no_record:
+            peers.remove("recorder")
+        return peers
+
+    def _parameters(self, journals: Path) -> dict[str, dict[str, object]]:
         """ROS parameters of the nodes to start."""
         options = self.options
-        names = [row.name for row in NODES.values() if row.process]
-        if self.bag is None:
-            names.remove("recorder")
         scenario = options.scenario
         if scenario not in scenarios.names():
             scenario = str(Path(scenario).absolute())
-        shared: dict[str, object] = {"scenario": scenario, "peers": [*names, "observer"]}
-        course = {"seed": options.seed, "missions": options.missions, "pace": pace.text(options.pace)}
-        policy = {"policy": str(self.policy.folder.absolute())}
-        own: dict[str, dict[str, object]] = {
-            "world": {**course},
-            "channel_monitor": {},
-            "policy": {**policy},
-            "recorder": {"bag": str(self.bag), **course, **policy},
+        given: dict[str, object] = {
+            "scenario": scenario,
+            "policy": str(self.policy.folder.absolute()),
+            "seed": options.seed,
+            "missions": options.missions,
+            "pace": pace.text(options.pace),
+            "bag": str(self.bag),
+            "port": options.live,
         }
-        return {name: shared | own[name] for name in names}
+        started = {}
+        for name in self.nodes:
+            values = given | {"journal": str(journals / name)}
+            started[name] = {
+                "peers": self._peers(),
+                "use_sim_time": "clock" not in NODES[name].publishes,
+                **{row.name: values[row.name] for row in NODES[name].parameters if row.name in values},
+            }
+        return started
 
     def _interrupt(self, *_: object) -> None:
         self._interrupted = True
 
-    def _on_step(self, mission: observer.MissionSoFar) -> None:
+    def _on_step(self, mission: MissionSoFar) -> None:
         self._step_s = time.monotonic()
         self.display.step(mission)
 
-    def _on_end(self, mission: observer.MissionSoFar, outcome: Phase) -> None:
+    def _on_end(self, mission: MissionSoFar, outcome: Phase) -> None:
         bag = None if self.bag is None else str(self.bag)
-        self.summaries.append(observer.summary(mission, outcome, self.scenario, self.policy.name, bag))
+        self.summaries.append(summary(mission, outcome, self.scenario, self.policy.name, bag))
 
     def _tell(self) -> None:
         """Write the summary where it was asked for, and print it."""
@@ -150,6 +198,30 @@ class Flight:
             text = msgspec.json.format(msgspec.json.encode(told), indent=2)
             cli.write_whole(self.options.summary, text + b"\n")
         self.display.summary(self.summaries)
+
+
+def _nodes(options: argparse.Namespace) -> list[str]:
+    """Names of the nodes to start here.
+
+    Raises:
+        ParameterError: a node that does not exist, or contradicts another option.
+    """
+    known = [row.name for row in NODES.values() if row.process]
+    wanted = options.nodes
+    if wanted is None:
+        wanted = [name for name in known if not NODES[name].on_request]
+        if options.no_record:
+            wanted.remove("recorder")
+    for name in wanted:
+        if name not in known:
+            raise ParameterError(f"--nodes: {name!r}; expected some of {', '.join(known)}")
+    if options.live is not None and "live_view" not in wanted:
+        wanted = [*wanted, "live_view"]
+    if "recorder" in wanted and options.no_record:
+        raise ParameterError("--nodes: 'recorder', with --no-record; expected one or the other")
+    if "recorder" not in wanted and options.bag is not None:
+        raise ParameterError(f"--bag {options.bag}: no recorder is started here; expected it among --nodes")
+    return [name for name in known if name in wanted]
 
 
 def _check_writable(summary: Path, bag: Path | None) -> None:

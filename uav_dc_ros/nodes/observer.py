@@ -1,17 +1,20 @@
 """run_all's own eyes: follows the missions, for the progress display and the summary."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+import rclpy
 
 from uav_dc_ros import messages
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes import convert
+from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
 from uav_dc_ros.nodes.pairs import StepPairs
 
 
@@ -60,49 +63,59 @@ class MissionSoFar:
     reward: float = 0.0
     over: bool = False
     sum_of_sum_rates_bps: float = 0.0
+    unheard_steps: int = 0  # that were flown while nobody measured them
 
 
-class Observer(runtime.MissionNode):
+class Observer(MissionNode):
     """Follows `mission` and `rates`.
 
     Args:
         scenario: the world that is flown.
-        seed: seed of the first mission.
+        seed: seed of the first mission; none: whatever the vehicle says.
         peers: nodes of the mission.
         on_step: called after each step.
         on_end: called when a mission has come to its end, with how.
+
+    Attributes:
+        restarts_of: how often each node was started again, for the diagnostics.
     """
+
+    rest_s = 0.01  # nobody waits for it
 
     def __init__(
         self,
         scenario: Scenario,
-        seed: int,
+        seed: int | None,
         peers: list[str],
         on_step: Callable[[MissionSoFar], None],
         on_end: Callable[[MissionSoFar, messages.Phase], None],
     ) -> None:
-        self._given_peers = peers
-        super().__init__("observer")
+        super().__init__("observer", [rclpy.Parameter("peers", value=peers)])
         self.scenario = scenario
         self.seed = seed
-        self._position_m: Array = None  # before the first step
         self.mission: MissionSoFar | None = None
+        self.restarts_of: dict[str, int] = {}
         self._on_step, self._on_end = on_step, on_end
-        self._steps = StepPairs()
-        self.listen()
 
-    def _peers_parameter(self) -> list[str]:
-        return [peer for peer in self._given_peers if peer != "observer"]
+    def activate(self) -> None:
+        """Follow from here on."""
+        self._steps = StepPairs()
+        self._position_m: Array = None  # before the first step
+        self._ended: dict[int, messages.Phase] = {}  # missions that are over, and how
+        self._ended_s = 0.0  # when the last one was
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Follow the vehicle.
 
         Raises:
-            NodeError: it flies for somebody else, or a step was not heard.
+            NodeError: it flies for somebody else.
         """
         convert.check_world(payload, self.scenario)
-        if payload.seed != self.seed + payload.mission:
-            raise NodeError(runtime.ANOTHER_MISSION)
+        if self.seed is not None and payload.seed != self.seed + payload.mission:
+            raise NodeError(ANOTHER_MISSION)
+        if payload.phase.is_over and payload.mission not in self._ended:
+            self._ended[payload.mission] = payload.phase
+            self._ended_s = time.monotonic()
         self._hear(payload)
 
     def on_rates(self, payload: messages.Rates) -> None:
@@ -117,23 +130,19 @@ class Observer(runtime.MissionNode):
 
     def _follow(self, mission: messages.Mission, rates: messages.Rates) -> None:
         now = self.mission
+        if now is not None and (mission.mission, mission.step) <= (now.mission, now.step):
+            return  # a repeated step
         data_bits, collected = convert.collection(rates, self.scenario)
         cell = np.asarray(mission.cell)
         position_m = self.scenario.grid.centre_m(cell, like=data_bits)
-        if now is not None and (mission.mission, mission.step) <= (now.mission, now.step):
-            return  # a repeated step
-        if now is None or now.over:
-            expected = (0 if now is None else now.mission + 1, 0)
+        if now is None or mission.mission > now.mission:
+            self.close()
             now = MissionSoFar(mission=mission.mission, seed=mission.seed)
+            now.unheard_steps = mission.step
         else:
-            expected = (now.mission, now.step + 1)
             now.sum_of_sum_rates_bps += rates.sum_rate_bps
             now.distance_m += float(np.linalg.norm(position_m - self._position_m))
-        if (mission.mission, mission.step) != expected:
-            raise NodeError(
-                f"heard of step {mission.step} of mission {mission.mission}; expected step {expected[1]} of "
-                f"mission {expected[0]}: the nodes cannot keep up; fly at a slower pace, or in lockstep"
-            )
+            now.unheard_steps += mission.step - now.step - 1
         self.mission, self._position_m = now, position_m
         now.reward = float(core.total_reward(self.scenario, cell, data_bits)) if mission.step else 0.0
         now.over = mission.phase.is_over
@@ -143,8 +152,21 @@ class Observer(runtime.MissionNode):
         now.sum_rate_bps = rates.sum_rate_bps
         now.dock_distance_m = float(core.dock_distance_m(self.scenario, cell, like=data_bits))
         self._on_step(now)
-        if mission.phase.is_over:
+        if now.over:
             self._on_end(now, mission.phase)
+
+    def close(self, waited_s: float = 0.0) -> None:
+        """End the mission that is followed, if it is over since `waited_s`: its last rates may never come."""
+        now = self.mission
+        if now is None or now.over or now.mission not in self._ended:
+            return
+        if time.monotonic() - self._ended_s >= waited_s:
+            now.over = True
+            self._on_end(now, self._ended[now.mission])
+
+    def diagnose(self) -> tuple[list[str], dict[str, str]]:
+        """How often nodes were started again."""
+        return [], {f"restarts of {name}": str(n) for name, n in self.restarts_of.items()}
 
 
 def summary(
@@ -160,7 +182,7 @@ def summary(
         users_collected=now.users_collected,
         users_total=scenario.n_users,
         data_bits=now.data_bits,
-        sum_rate_bps=now.sum_of_sum_rates_bps / max(now.step, 1),
+        sum_rate_bps=now.sum_of_sum_rates_bps / max(now.step - now.unheard_steps, 1),
         distance_m=now.distance_m,
         reward=now.reward,
         bag=bag,

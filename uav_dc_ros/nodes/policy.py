@@ -10,24 +10,28 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.pairs import StepPairs
 
 
-class Policy(runtime.MissionNode):
+class Policy(MissionNode):
     """Flies a trained policy."""
 
     def __init__(self) -> None:
         super().__init__("policy")
-        self.policy = policies.load(
-            self.parameter("policy", "five_clusters_dueling", "name of a shipped policy, or its folder")
-        )
-        scenario = self.parameter("scenario", "", "scenario of the mission; empty: the policy's own")
-        self.scenario = self.policy.scenario if not scenario else scenarios.load(scenario)
+
+    def configure(self) -> None:
+        """Load the policy, and see whether it fits the mission's world."""
+        self.policy = policies.load(self.values["policy"])
+        scenario = self.values["scenario"]
+        self.scenario = scenarios.load(scenario) if scenario else self.policy.scenario
         self.policy.check(self.scenario)
         nothing = np.zeros(self.scenario.n_users)
         self._decide(self.scenario.start_cell, 0, nothing, nothing > 0)  # the first time takes longest
+
+    def activate(self) -> None:
+        """Wait for a step that the vehicle is ready for."""
         self._steps = StepPairs()
-        self.listen()
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Note a step that the vehicle is ready for."""

@@ -1,7 +1,9 @@
-"""The nodes, one row each: the only list. Topics are those of `topics.TOPICS`."""
+"""The nodes, one row each: the only list. Topics are those of `topics.TOPICS`. Knows no ROS."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+from uav_dc_ros.nodes import parameters as p
 from uav_dc_ros.topics import TOPICS
 
 
@@ -12,18 +14,29 @@ class NodeRow:
     Attributes:
         name: its name in the ROS graph.
         publishes, subscribes: names of topics.
+        parameters: its own, beside those that every node has.
         hears_all: does it keep every message until it gets to it, or the newest hundred?
         process: is it a process of its own, `python -m uav_dc_ros.nodes.NAME`?
-        stop_rank: run_all stops nodes of a lower rank first: the recorder must still hear the last word of
-            all others.
+        rank: nodes of a lower rank are brought up first, and taken down last: the recorder must hear the
+            first word and the last, and the world starts the mission.
+        restarts: how often a node that died is started again within `supervisor.RESTART_WINDOW_S`; once more
+            ends the mission, or, if the node is not needed for it, the restarts.
+        needed: can no mission be flown without it?
+        on_request: is it started only when it is asked for?
+        again: parameters with which it is restarted, beside those that it had.
     """
 
     name: str
     publishes: tuple[str, ...]
     subscribes: tuple[str, ...]
+    parameters: tuple[p.Parameter, ...] = ()
     hears_all: bool = False
     process: bool = True
-    stop_rank: int = 0
+    rank: int = 1
+    restarts: int = 3
+    needed: bool = True
+    on_request: bool = False
+    again: Mapping[str, object] = field(default_factory=dict)
 
 
 NODES: dict[str, NodeRow] = {
@@ -31,32 +44,54 @@ NODES: dict[str, NodeRow] = {
     for row in (
         NodeRow(
             name="world",
-            publishes=("pose", "users", "mission", "target"),
+            publishes=("pose", "users", "mission", "target", "diagnostics", "clock"),
             subscribes=("move", "ready"),
+            parameters=(p.SCENARIO, p.SEED, p.MISSIONS, p.PACE, p.JOURNAL),
+            rank=2,
         ),
         NodeRow(
             name="channel_monitor",
-            publishes=("rates", "ready"),
+            publishes=("rates", "ready", "diagnostics"),
             subscribes=("pose", "users"),
+            parameters=(p.SCENARIO, p.JOURNAL),
         ),
         NodeRow(
             name="policy",
-            publishes=("move", "ready"),
+            publishes=("move", "ready", "diagnostics"),
             subscribes=("mission", "rates"),
+            parameters=(p.POLICY, p.SCENARIO_OR_POLICYS),
         ),
         NodeRow(
             name="recorder",
-            publishes=("ready",),
+            publishes=("ready", "diagnostics"),
             subscribes=tuple(topic.name for topic in TOPICS.values() if topic.recorded),
+            parameters=(p.BAG, p.RESUME, p.SCENARIO, p.POLICY_IF_KNOWN, p.SEED, p.MISSIONS, p.PACE),
             hears_all=True,
-            stop_rank=1,
+            rank=0,
+            again={"resume": True},
+        ),
+        NodeRow(
+            name="visualizer",
+            publishes=("path", "markers", "ready", "diagnostics"),
+            subscribes=("pose", "users", "rates", "mission"),
+            parameters=(p.SCENARIO, p.RATE_HZ),
+            needed=False,
+        ),
+        NodeRow(
+            name="live_view",
+            publishes=("diagnostics",),
+            subscribes=tuple(topic.name for topic in TOPICS.values() if topic.name != "ready"),
+            parameters=(p.PORT, p.ADDRESS),
+            needed=False,
+            on_request=True,
         ),
         NodeRow(
             name="observer",
-            publishes=("ready",),
+            publishes=("ready", "diagnostics"),
             subscribes=("mission", "rates"),
             hears_all=True,
             process=False,
+            restarts=0,
         ),
     )
 }

@@ -4,52 +4,89 @@ The vehicle says in `mission` which step it is ready for, and flies the `move` t
 lockstep the next step starts when the move has come; at a pace, a step lasts its seconds divided by
 the pace, and no move in time means hover.
 
-Time in messages is mission time: it starts at zero and grows by `step_s` a step, so that equal seeds
-give equal messages at any pace.
+Time in messages, and on `clock`, is mission time: it starts at zero and grows by `step_s` a step, so that
+equal seeds give equal messages at any pace. With `use_sim_time` somebody else's clock says when a step is
+over, and this node publishes none.
+
+A world that was killed goes on where it was: seed and moves tell all, and its journal holds the moves.
 """
 
+import time
+from collections import deque
+
+import msgspec
 import numpy as np
 
-from uav_dc_ros import messages
+from uav_dc_ros import messages, scenarios
 from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.errors import MessageError, NodeError, ParameterError
+from uav_dc_ros.errors import MessageError, NodeError
+from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes.journal import Journal
+from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
+from uav_dc_ros.nodes.table import NODES
 
-STALL_S = 2.0  # a lockstep that stands still for so long repeats its last messages
+STALL_S = 0.5  # a lockstep that stands still for so long repeats its last messages
+CLOCK_PERIOD_S = 0.05
+OVERRUN_S = 0.005  # a step at a pace that starts later than this after its time
 
 
-class World(runtime.MissionNode):
+class Flown(msgspec.Struct, frozen=True):
+    """First line of the journal: which mission its moves belong to."""
+
+    mission: int
+    seed: int
+    fingerprint: str
+
+
+class World(MissionNode):
     """Simulates missions one after the other: seeds `seed`, `seed + 1`, ..."""
 
     def __init__(self) -> None:
         super().__init__("world")
-        self.scenario = self.scenario_parameter()
-        self.seed = self.whole_number("seed", 0, 0, "seed of the first mission's users")
-        self.missions = self.whole_number("missions", 1, 1, "missions to fly, one after the other")
-        wanted = self.parameter("pace", pace.LOCKSTEP, "'lockstep', or how many times faster than real time")
-        try:
-            self.pace = pace.parse(wanted)
-        except ParameterError as error:
-            raise ParameterError(f"pace: {error}") from None
-        pace.check(self.scenario, self.pace, self.missions)
+
+    def configure(self) -> None:
+        """Load the world, and see whether it can be flown at this pace."""
+        self.scenario = scenarios.load(self.values["scenario"])
+        self.pace: float | None = self.values["pace"]
+        pace.check(self.scenario, self.pace, self.values["missions"])
+        self.journal = Journal(self.values["journal"])
+
+    def activate(self) -> None:
+        """Wait for the peers; a journal tells where to go on."""
         self._ready_peers: set[str] = set()
         self._peers_seen = False
+        self._flying = False
         self._mission, self._step = -1, 0
-        self._phase: messages.Phase | None = None  # none before the first mission
+        self._phase: Phase | None = None  # none before the first mission
         self._action: Action | None = None  # that has come for this step
-        self._hovered = 0  # steps without a move in time
         self._seen_by_tick: tuple[int, int] | None = None
-        self.listen()
+        self._hovered = 0  # steps without a move in time
+        self._overruns, self._overruns_told = 0, 0
+        self._lateness_s: deque[float] = deque(maxlen=1000)
+        self._restore()
+
+    def deactivate(self) -> None:
+        """Say that a mission was stopped before its end, and what happened for want of a move."""
+        self.journal.close()
+        if self._hovered:
+            self.get_logger().warning(f"{self._hovered} steps were hovered: no move came in time")
+        if self._flying and self._phase is Phase.READY:
+            self._phase = Phase.ABORTED
+            self.say("mission", self._status())
 
     # Before the first mission.
 
     def on_ready(self, payload: messages.Ready) -> None:
-        """Note that a peer is ready."""
+        """Note that a peer is ready; one that came back is told where the mission stands."""
         self._ready_peers.add(payload.node)
-        self._start_if_all_ready()
+        if not self._flying:
+            self._start_if_all_ready()
+        elif payload.node in self.peers and NODES[payload.node].needed:
+            self._tell()
 
     def on_peers(self) -> None:
         """Note that all peers have been found."""
@@ -57,32 +94,77 @@ class World(runtime.MissionNode):
         self._start_if_all_ready()
 
     def _start_if_all_ready(self) -> None:
-        if self._mission < 0 and self._peers_seen and self._ready_peers.issuperset(self._peers):
-            if self.count_publishers("mission") > 1:
-                raise NodeError(runtime.ANOTHER_MISSION)
+        if self._flying or not self._peers_seen or not self._ready_peers.issuperset(self.peers):
+            return
+        if self.count_publishers("mission") > 1:
+            raise NodeError(ANOTHER_MISSION)
+        self._flying = True
+        if self._phase is None:
             self._begin(0)
-            period_s = pace.period_s(self.scenario, self.pace) or STALL_S
-            self._timer = self.create_timer(period_s, self._tick, clock=self.steady)
+        else:
+            self._tell()
+        self._start_clocks()
+
+    def _start_clocks(self) -> None:
+        """Time begins to pass: by this machine's steady clock, or by the one of `use_sim_time`."""
+        follows = self.get_parameter("use_sim_time").value
+        self._period_s = pace.period_s(self.scenario, self.pace)
+        self._step_began_s = time.monotonic()
+        self._due_s = self._step_began_s + self._period_s
+        self.timer(self._period_s or STALL_S, self._tick, self.get_clock() if follows else None)
+        if not follows:
+            self.timer(CLOCK_PERIOD_S, lambda: self.publish("clock", convert.clock(self._now_ns())))
 
     # Missions.
 
     def _begin(self, mission: int) -> None:
+        flown = Flown(mission, self.values["seed"], self.scenario.fingerprint)
+        self.journal.begin(msgspec.json.encode(flown))
+        self._place(mission)
+        self._tell()
+
+    def _place(self, mission: int) -> None:
+        """Put the vehicle and the users where a mission starts."""
         self._mission, self._step = mission, 0
-        self._rng = np.random.default_rng(self.seed + mission)
+        self._rng = np.random.default_rng(self.values["seed"] + mission)
         self._users_m = core.place_users(self.scenario, self._draw())
         self._cell = np.asarray(self.scenario.start_cell)
-        self._phase = messages.Phase.READY
+        self._phase = Phase.READY
         self._action = None
-        self._tell()
 
     def _draw(self) -> Array:
         """Random numbers in the order of the environment: one for the start, one for each step."""
         return self._rng.random((self.scenario.n_users, 2))
 
+    def _restore(self) -> None:
+        """Fly again, silently, what the journal of a killed world holds.
+
+        Raises:
+            NodeError: it is the journal of another flight.
+        """
+        head, *moves = self.journal.lines() or [b""]
+        if not head:
+            return
+        try:
+            flown = msgspec.json.decode(head, type=Flown)
+            actions = [Action(int(move)) for move in moves]
+        except (msgspec.DecodeError, ValueError) as error:
+            raise NodeError(f"journal {self.values['journal']}: not a world's: {error}") from None
+        if (flown.seed, flown.fingerprint) != (self.values["seed"], self.scenario.fingerprint):
+            raise NodeError(
+                f"journal {self.values['journal']}: of another flight (seed {flown.seed}, scenario "
+                f"{flown.fingerprint}); expected seed {self.values['seed']}, scenario "
+                f"{self.scenario.fingerprint}, or a new file"
+            )
+        self._place(flown.mission)
+        for action in actions:
+            self._move(action)
+        self.get_logger().warning(f"goes on with mission {self._mission} at step {self._step}")
+
     def on_move(self, payload: messages.Move) -> None:
         """Fly a move, or keep it for the next tick."""
         awaited = (self._mission, self._step)
-        if self._phase is not messages.Phase.READY or (payload.mission, payload.step) != awaited:
+        if self._phase is not Phase.READY or (payload.mission, payload.step) != awaited:
             raise MessageError(
                 "wrong_step", f"a move for mission {payload.mission}, step {payload.step}; expected {awaited}"
             )
@@ -91,12 +173,19 @@ class World(runtime.MissionNode):
             self._fly()
 
     def _tick(self) -> None:
-        if self._phase is not messages.Phase.READY:
+        if self._phase is not Phase.READY:
             return
         if self.pace is not None:
+            self._measure_lateness()
             self._fly()
         elif self._stood_still():
             self._tell()
+
+    def _measure_lateness(self) -> None:
+        late_s = time.monotonic() - self._due_s
+        self._due_s += self._period_s
+        self._lateness_s.append(late_s)
+        self._overruns += late_s > OVERRUN_S
 
     def _stood_still(self) -> bool:
         before, self._seen_by_tick = self._seen_by_tick, (self._mission, self._step)
@@ -106,33 +195,31 @@ class World(runtime.MissionNode):
         if self._action is None:
             self._hovered += 1
         action = Action.HOVER if self._action is None else self._action
+        self.journal.append(b"%d" % int(action))
+        self._move(action)
+        self._step_began_s = time.monotonic()
+        self._tell()
+        if self._phase is not Phase.READY and self._mission + 1 < self.values["missions"]:
+            self._begin(self._mission + 1)
+
+    def _move(self, action: Action) -> None:
+        """One step of the world."""
         self._cell = self.scenario.grid.move(self._cell, np.asarray(int(action)))
         self._users_m = core.walk_users(self.scenario, self._users_m, self._draw())
         self._step += 1
         self._action = None
         terminated, truncated, landed = core.ends(self.scenario, np.asarray(self._step), self._cell)
         if terminated or truncated:
-            self._phase = messages.Phase.LANDED if landed else messages.Phase.TIMEOUT
-        self._tell()
-        if self._phase is not messages.Phase.READY and self._mission + 1 < self.missions:
-            self._begin(self._mission + 1)
-
-    def on_stop(self) -> None:
-        """Say that a mission was stopped before its end, and what happened for want of a move."""
-        if self._hovered:
-            self.get_logger().warning(f"{self._hovered} steps were hovered: no move came in time")
-        if self._phase is messages.Phase.READY:
-            self._phase = messages.Phase.ABORTED
-            self.say("mission", self._status())
+            self._phase = Phase.LANDED if landed else Phase.TIMEOUT
 
     # What the others hear.
 
     def _tell(self) -> None:
-        """Publish the state of this step. The mission comes last: it asks for the move."""
+        """Publish the state of this step. What the move waits for comes first."""
         position_m = self.scenario.grid.centre_m(self._cell, like=self._users_m)
         time_ns = self._time_ns()
-        self.publish("target", convert.pose(position_m, time_ns))
-        self.publish("pose", convert.pose(position_m, time_ns))
+        pose = convert.pose(position_m, time_ns)
+        self.publish("pose", pose)
         self.say(
             "users",
             convert.users(
@@ -140,6 +227,7 @@ class World(runtime.MissionNode):
             ),
         )
         self.say("mission", self._status())
+        self.publish("target", pose)  # a simulated vehicle is where it was sent to
 
     def _status(self) -> messages.Mission:
         assert self._phase is not None, "a mission has begun"
@@ -150,15 +238,39 @@ class World(runtime.MissionNode):
             phase=self._phase,
             cell=(east, north, up),
             remaining_steps=self.scenario.mission.max_steps - self._step,
-            seed=self.seed + self._mission,
+            seed=self.values["seed"] + self._mission,
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
         )
 
     def _time_ns(self) -> int:
-        """Mission time; missions follow each other one step apart."""
+        """Mission time of this step; missions follow each other one step apart."""
         steps = self._mission * (self.scenario.mission.max_steps + 1) + self._step
         return round(steps * self.scenario.mission.step_s * 1e9)
+
+    def _now_ns(self) -> int:
+        """Mission time now: at a pace it passes within a step, up to the next one."""
+        passed_s = 0.0
+        if self.pace is not None and self._phase is Phase.READY:
+            passed_s = (time.monotonic() - self._step_began_s) * self.pace
+        return self._time_ns() + round(min(passed_s, self.scenario.mission.step_s) * 1e9)
+
+    def diagnose(self) -> tuple[list[str], dict[str, str]]:
+        """Where the mission stands, and whether its steps keep their time."""
+        if self.state != "active":
+            return [], {}
+        late, self._overruns_told = self._overruns > self._overruns_told, self._overruns
+        values = {
+            "mission": str(self._mission),
+            "step": str(self._step),
+            "phase": self._phase.value if self._phase else "waiting for peers",
+            "hovered steps": str(self._hovered),
+            "step overruns": str(self._overruns),
+        }
+        if self._lateness_s:
+            p50, p99 = np.percentile(np.asarray(self._lateness_s), (50, 99)) * 1e3
+            values |= {"step lateness p50 [ms]": f"{p50:.3f}", "step lateness p99 [ms]": f"{p99:.3f}"}
+        return (["steps start late"] if late else []), values
 
 
 if __name__ == "__main__":

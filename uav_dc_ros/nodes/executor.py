@@ -1,0 +1,149 @@
+"""An executor that handles what is ready straight from the wait set.
+
+rclpy's SingleThreadedExecutor makes a task, a coroutine and three guard triggers of every callback, and wakes
+itself once more for each; in a lockstep of small messages that is more than the messages themselves take.
+rclpy's EventsExecutor would be the one to use, but it is experimental, and called no callback in the wheels
+of 7.1.6. `benchmarks/lockstep.py` measures this one beside rclpy's own.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from rclpy.utilities import get_default_context
+
+TURN_MAX = 100  # messages of one topic before the others get their turn
+
+
+class DirectExecutor:
+    """One thread, in which callbacks run one after the other: timers, subscriptions, services, clients.
+
+    Callbacks may be plain functions only. Event callbacks of publishers and subscriptions are not handled:
+    `qos.incompatible` looks for peers that do not match.
+
+    Args:
+        rest_s: pause after each turn that handled something, seconds. Who need not answer at once takes
+            what came meanwhile in one turn, and leaves the cores to those who must.
+    """
+
+    def __init__(self, rest_s: float = 0.0) -> None:
+        self.rest_s = rest_s
+        self._context: Any = get_default_context()
+        self._guard = GuardCondition(callback=None, callback_group=None, context=self._context)
+        self._nodes: list[Node] = []
+        self._wait_set: Any = None
+        self._capacity: tuple[int, ...] = ()
+
+    def add_node(self, node: Node) -> None:
+        """Handle a node's callbacks from now on."""
+        self._nodes.append(node)
+
+    def wake(self) -> None:
+        """End the wait of `spin`, from any thread, so that it looks at its condition."""
+        self._guard.trigger()
+
+    def spin(self, stop: Callable[[], bool], quiet_s: float | None = None) -> None:
+        """Handle what comes until `stop` holds, or nothing came for `quiet_s` seconds.
+
+        Raises:
+            Exception: whatever a callback raises.
+        """
+        with self._context.handle:
+            while not stop():
+                if not self._turn(quiet_s):
+                    return
+                if self.rest_s:
+                    time.sleep(self.rest_s)
+
+    def spin_once(self, timeout_s: float) -> None:
+        """Handle what is ready, or becomes so within `timeout_s` seconds."""
+        with self._context.handle:
+            self._turn(timeout_s)
+
+    def _turn(self, timeout_s: float | None) -> bool:
+        """Wait, and handle all that is ready; False if the time was over before anything came."""
+        timers = [timer for node in self._nodes for timer in node.timers]
+        subscriptions = [subscription for node in self._nodes for subscription in node.subscriptions]
+        services = [service for node in self._nodes for service in node.services]
+        clients = [client for node in self._nodes for client in node.clients]
+        wait_set = self._emptied(len(subscriptions), 1, len(timers), len(clients), len(services))
+        timer_at = [wait_set.add_timer(timer.handle) for timer in timers]
+        subscription_at = [wait_set.add_subscription(entity.handle) for entity in subscriptions]
+        service_at = [wait_set.add_service(entity.handle) for entity in services]
+        client_at = [wait_set.add_client(entity.handle) for entity in clients]
+        guard_at = wait_set.add_guard_condition(self._guard.handle)
+        wait_set.wait(-1 if timeout_s is None else round(timeout_s * 1e9))
+        # All that is ready is noted before any callback may change what there is.
+        ready = [
+            *((_call_timer, timers[i]) for i, at in enumerate(timer_at) if wait_set.is_ready("timer", at)),
+            *(
+                (_take_messages, subscriptions[i])
+                for i, at in enumerate(subscription_at)
+                if wait_set.is_ready("subscription", at)
+            ),
+            *((_serve, services[i]) for i, at in enumerate(service_at) if wait_set.is_ready("service", at)),
+            *((_answer, clients[i]) for i, at in enumerate(client_at) if wait_set.is_ready("client", at)),
+        ]
+        woken = wait_set.is_ready("guard_condition", guard_at)
+        for handle, entity in ready:
+            try:
+                handle(entity)
+            except InvalidHandle:  # an earlier callback of this turn has destroyed it
+                continue
+        return bool(ready) or woken
+
+    def _emptied(self, *capacity: int) -> Any:
+        """The wait set, empty, with room for subscriptions, guards, timers, clients, services."""
+        if any(has < wants for has, wants in zip(self._capacity or (0,) * 5, capacity, strict=True)):
+            self._capacity = capacity
+            subscriptions, guards, timers, clients, services = capacity
+            self._wait_set = _rclpy.WaitSet(
+                subscriptions, guards, timers, clients, services, 0, self._context.handle
+            )
+        self._wait_set.clear_entities()
+        return self._wait_set
+
+
+def _call_timer(timer: Any) -> None:
+    with timer.handle:
+        if not timer.handle.is_timer_ready():
+            return
+        timer.handle.call_timer()
+    timer.callback()
+
+
+def _take_messages(subscription: Any) -> None:
+    with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
+    for _ in range(TURN_MAX):
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return
+        if with_info:
+            subscription.callback(*taken)
+        else:
+            subscription.callback(taken[0])
+
+
+def _serve(service: Any) -> None:
+    with service.handle:
+        request, header = service.handle.service_take_request(service.srv_type.Request)
+    if header is not None:
+        service.send_response(service.callback(request, service.srv_type.Response()), header)
+
+
+def _answer(client: Any) -> None:
+    with client.handle:
+        header, response = client.handle.take_response(client.srv_type.Response)
+    if header is None:
+        return
+    try:
+        future = client.get_pending_request(header.request_id.sequence_number)
+    except KeyError:
+        return  # nobody waits for it any more
+    future.set_result(response)

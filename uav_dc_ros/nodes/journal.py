@@ -1,0 +1,78 @@
+"""What a node must know again when it is started anew after a kill: lines in a file.
+
+The file is written for a killed process, not for a pulled plug: what was given to the operating system is
+there for the next process, so nothing waits for a disk.
+"""
+
+import os
+from pathlib import Path
+
+from uav_dc_ros.errors import NodeError
+
+
+class Journal:
+    """Lines of the mission that is being flown; `begin` starts a new mission's.
+
+    Args:
+        path: the file; empty: nothing is kept.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = Path(path) if path else None
+        self._file = -1
+
+    def lines(self) -> list[bytes]:
+        """Whole lines, without their ends; one that was not finished is taken away.
+
+        Raises:
+            NodeError: the file cannot be read.
+        """
+        if self._path is None:
+            return []
+        try:
+            text = self._path.read_bytes()
+            whole, _, torn = text.rpartition(b"\n")
+            if torn:
+                os.truncate(self._path, len(text) - len(torn))
+            return whole.split(b"\n") if whole else []
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise NodeError(f"journal {self._path} cannot be read: {error.strerror}") from None
+
+    def begin(self, line: bytes) -> None:
+        """Forget what is there, and write a first line; at no moment is there neither.
+
+        Raises:
+            NodeError: the file cannot be written.
+        """
+        if self._path is None:
+            return
+        self.close()
+        new = self._path.with_name(f"{self._path.name}.new")
+        try:
+            new.write_bytes(line + b"\n")
+            new.replace(self._path)
+        except OSError as error:
+            raise NodeError(f"journal {self._path} cannot be written: {error.strerror}") from None
+
+    def append(self, line: bytes) -> None:
+        """Write a line.
+
+        Raises:
+            NodeError: the file cannot be written.
+        """
+        if self._path is None:
+            return
+        try:
+            if self._file < 0:
+                self._file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+            os.write(self._file, line + b"\n")
+        except OSError as error:
+            raise NodeError(f"journal {self._path} cannot be written: {error.strerror}") from None
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1

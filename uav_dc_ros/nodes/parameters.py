@@ -1,0 +1,148 @@
+"""The nodes' ROS parameters: each declared once, with description, unit and range. Knows no ROS."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from uav_dc_ros.core import pace
+from uav_dc_ros.errors import ParameterError
+
+WHOLE_MAX = 2**63 - 1  # of a ROS integer
+PORT_MAX = 65535
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """A parameter.
+
+    Its type is that of its default. It can be set until the node is configured, and again after the node
+    was cleaned up: what a node has checked and loaded does not change under it.
+
+    Attributes:
+        name: its name.
+        default: its value unless another is given.
+        description: what it is for.
+        unit: of its value; empty for names, counts and switches.
+        least, most: range of a number.
+        read_only: is it fixed when the node starts?
+        parse: makes the value that the node uses; raises ParameterError.
+    """
+
+    name: str
+    default: bool | int | float | str | list[str]
+    description: str
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+    read_only: bool = False
+    parse: Callable[[Any], Any] | None = None
+
+    @property
+    def expected(self) -> str:
+        """What is expected of its value, in words."""
+        if self.least is None:
+            words = {bool: "true or false", list: "a list of texts"}
+            return words.get(type(self.default), "text")
+        kind = "a whole number" if isinstance(self.default, int) else "a number"
+        return f"{kind} from {self.least} to {self.most}{f' {self.unit}' if self.unit else ''}"
+
+    def value(self, given: Any) -> Any:
+        """The value that a node uses, checked.
+
+        Raises:
+            ParameterError: a value of another type, out of range, or that makes no sense.
+        """
+        if isinstance(self.default, list):
+            given = list(given) if isinstance(given, list | tuple) else given
+        elif isinstance(self.default, str) and isinstance(given, bool | int | float):
+            given = str(given)  # `-p pace:=90` arrives as a number
+        elif type(self.default) is float and type(given) is int:
+            given = float(given)
+        if type(given) is not type(self.default):
+            raise ParameterError(f"{self.name}: {given!r}; expected {self.expected}")
+        number: Any = given
+        if self.least is not None and not self.least <= number <= (self.most or 0):
+            raise ParameterError(f"{self.name}: {given!r}; expected {self.expected}")
+        if self.parse is None:
+            return given
+        try:
+            return self.parse(given)
+        except ParameterError as error:
+            raise ParameterError(f"{self.name}: {error}") from None
+
+
+AUTOSTART = Parameter(
+    name="autostart",
+    default=True,
+    description="configure and activate at once; false: wait for a lifecycle manager",
+    read_only=True,
+)
+PEERS = Parameter(
+    name="peers",
+    default=["world", "channel_monitor", "policy"],
+    description="nodes of this mission, by name; it starts when all of them are there",
+    read_only=True,
+)
+SCENARIO = Parameter(
+    name="scenario", default="five_clusters", description="name of a shipped scenario, or path of a TOML file"
+)
+SCENARIO_OR_POLICYS = Parameter(
+    name="scenario", default="", description="scenario of the mission; empty: the policy's own"
+)
+POLICY = Parameter(
+    name="policy",
+    default="five_clusters_dueling",
+    description="name of a shipped policy, or its folder",
+)
+POLICY_IF_KNOWN = Parameter(
+    name="policy", default="", description="policy that flies, by name or folder; empty: not known"
+)
+SEED = Parameter(
+    name="seed", default=0, least=0, most=WHOLE_MAX, description="seed of the first mission's users"
+)
+MISSIONS = Parameter(
+    name="missions",
+    default=1,
+    least=1,
+    most=WHOLE_MAX,
+    description="missions to fly, one after the other, with seeds that follow each other",
+)
+PACE = Parameter(
+    name="pace",
+    default=pace.LOCKSTEP,
+    description="'lockstep', or how many times faster than real time",
+    parse=pace.parse,
+)
+JOURNAL = Parameter(
+    name="journal",
+    default="",
+    description="file in which the node keeps what it must know again after a restart, one file for one "
+    "flight; empty: it forgets",
+)
+BAG = Parameter(name="bag", default="", description="folder of the new bag")
+RESUME = Parameter(
+    name="resume",
+    default=False,
+    description="go on with the bag of a recorder that was killed, instead of refusing an existing folder",
+)
+RATE_HZ = Parameter(
+    name="rate",
+    default=5.0,
+    least=0.1,
+    most=60.0,
+    unit="Hz",
+    description="how often path and markers are drawn, at most",
+)
+PORT = Parameter(
+    name="port",
+    default=8765,
+    least=0,
+    most=PORT_MAX,
+    description="TCP port of the Foxglove WebSocket server; 0: any that is free",
+)
+ADDRESS = Parameter(
+    name="address",
+    default="127.0.0.1",
+    description="network address that the server listens on; 0.0.0.0: all of this machine's",
+)
+EVERY = (AUTOSTART, PEERS)  # that every node has

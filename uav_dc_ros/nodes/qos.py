@@ -1,0 +1,86 @@
+"""Quality of service: profiles from the topic table, and peers that do not match them."""
+
+from collections.abc import Iterable, Iterator
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
+
+from uav_dc_ros import topics
+from uav_dc_ros.topics import Topic
+
+MESSAGE_TYPES: dict[str, type] = {
+    topics.JSON: String,
+    topics.POSE: PoseStamped,
+    topics.PATH: Path,
+    topics.MARKERS: MarkerArray,
+    topics.DIAGNOSTICS: DiagnosticArray,
+    topics.CLOCK: Clock,
+}
+# Messages kept by a subscription that acts on them: a burst of rubbish must not push out a real one.
+NEWEST = 100
+OVERRIDES = QoSOverridingOptions(
+    [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY]
+)
+
+
+def offered(topic: Topic) -> QoSProfile:
+    """The QoS that a topic's publisher offers, from its row."""
+    return QoSProfile(
+        depth=topic.depth,
+        reliability=ReliabilityPolicy.RELIABLE if topic.reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def requested(topic: Topic, *, all: bool) -> QoSProfile:
+    """The QoS that a subscription asks for; `all` as in the node table's `hears_all`."""
+    profile = offered(topic)
+    profile.depth = NEWEST
+    if not topic.asks_reliable:
+        profile.reliability = ReliabilityPolicy.BEST_EFFORT
+    if all:
+        profile.history = HistoryPolicy.KEEP_ALL
+    return profile
+
+
+def incompatible(
+    node: Node, publishers: Iterable[Publisher], subscriptions: Iterable[Subscription]
+) -> Iterator[tuple[str, str, str]]:
+    """Peers that a node cannot talk to: topic, the peer's full name, what does not match.
+
+    The middleware reports that some peer does not match, and which policy; only the graph knows who.
+    """
+    for publisher in publishers:
+        if node.count_subscribers(publisher.topic_name) != publisher.get_subscription_count():
+            for end in node.get_subscriptions_info_by_topic(publisher.topic_name):
+                yield from _mismatch(publisher.topic_name, end, publisher.qos_profile, end.qos_profile)
+    for subscription in subscriptions:
+        if node.count_publishers(subscription.topic_name) != subscription.get_publisher_count():
+            for end in node.get_publishers_info_by_topic(subscription.topic_name):
+                yield from _mismatch(subscription.topic_name, end, end.qos_profile, subscription.qos_profile)
+
+
+def _mismatch(
+    topic: str, end: TopicEndpointInfo, offer: QoSProfile, request: QoSProfile
+) -> Iterator[tuple[str, str, str]]:
+    compatibility, reason = qos_check_compatible(offer, request)
+    if compatibility == QoSCompatibility.ERROR:
+        yield topic, f"{end.node_namespace.rstrip('/')}/{end.node_name}", reason.removeprefix("ERROR: ")

@@ -1,0 +1,209 @@
+"""Brings nodes up in order, watches them, starts dead ones again, and takes them down in reverse."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.node import Node
+
+from uav_dc_ros.errors import NodeError
+from uav_dc_ros.nodes.launcher import NodeProcess
+from uav_dc_ros.nodes.runtime import GAVE_UP, NOT_BEGUN
+from uav_dc_ros.nodes.table import NODES
+
+RESTART_WINDOW_S = 60.0  # deaths longer ago are forgiven
+BACK_OFF_S = 0.2  # before the first restart; twice as long before each further one
+ANSWER_S = 1.0  # for an answer of a node; a dead one's service may stand in the graph for a while
+STOP_S = 5.0  # for a node to end after it was asked to
+UP = ("unconfigured", "inactive", "active")  # the way up; each transition leads to the next
+TRANSITIONS = {"unconfigured": Transition.TRANSITION_CONFIGURE, "inactive": Transition.TRANSITION_ACTIVATE}
+
+
+class Supervised:
+    """One node: its process, and how far it has come.
+
+    Attributes:
+        state: of its life cycle, as last told; none before its process has answered.
+        restarts: how often it was started again.
+    """
+
+    def __init__(self, name: str, parameters: Mapping[str, object], asker: Node) -> None:
+        self.row = NODES[name]
+        self.parameters = dict(parameters)
+        self.state: str | None = None
+        self.restarts = 0
+        self.process: NodeProcess | None = None
+        self.start_s = 0.0  # when to start it, while there is no process
+        self.deaths_s: deque[float] = deque()
+        self._get = asker.create_client(GetState, f"{name}/get_state")
+        self._change = asker.create_client(ChangeState, f"{name}/change_state")
+        self._answer: Any = None  # to come: the state
+        self._done: Any = None  # to come: did a transition succeed
+        self._asked_s = 0.0
+
+    def begin(self, process: NodeProcess) -> None:
+        """Take charge of a new process."""
+        self.process, self.state = process, None
+        self._answer = self._done = None
+
+    def climb(self, may_activate: bool) -> None:
+        """Go on with the way up.
+
+        Raises:
+            NodeError: the node refuses a transition.
+        """
+        now_s = time.monotonic()
+        if self._done is not None and self._done.done():
+            self._finish(self._done.result().success)
+        elif self._answer is not None and self._answer.done():
+            self.state, self._answer = self._answer.result().current_state.label, None
+        elif now_s - self._asked_s > ANSWER_S or (self._answer is None and self._done is None):
+            self._ask(now_s, may_activate)
+
+    def _ask(self, now_s: float, may_activate: bool) -> None:
+        """Ask for the state, or, if it is known, for the next transition."""
+        late = self._done is not None
+        if (self.state is None or late) and self._get.service_is_ready():
+            self._asked_s, self._answer = now_s, self._get.call_async(GetState.Request())
+            return
+        transition = TRANSITIONS.get(self.state or "")
+        allowed = self.state != "inactive" or may_activate
+        if transition is not None and allowed and not late and self._change.service_is_ready():
+            request = ChangeState.Request(transition=Transition(id=transition))
+            self._asked_s, self._done = now_s, self._change.call_async(request)
+
+    def _finish(self, success: bool) -> None:
+        self._done = None
+        if not success:
+            assert self.process is not None
+            wanted = {"unconfigured": "configured", "inactive": "activated"}.get(self.state or "", "started")
+            raise NodeError(f"node {self.row.name} could not be {wanted}: {self.process.last_line}")
+        self.state = UP[UP.index(self.state or UP[0]) + 1]
+
+
+class Supervisor:
+    """The nodes of a mission on this host; a context manager that leaves no process behind.
+
+    Args:
+        asker: a node of this process, in the mission's namespace, that somebody spins.
+        parameters: ROS parameters of each node to run, by name.
+        on_line: called, from threads, with each line that a node prints.
+        on_note: called with what the user should know.
+    """
+
+    def __init__(
+        self,
+        asker: Node,
+        parameters: Mapping[str, Mapping[str, object]],
+        on_line: Callable[[str, str], None],
+        on_note: Callable[[str], None],
+    ) -> None:
+        self._namespace = asker.get_namespace()
+        self._on_line, self._on_note = on_line, on_note
+        self.nodes = [Supervised(name, values, asker) for name, values in parameters.items()]
+        self._brought_up = False
+
+    def __enter__(self) -> Self:
+        """Start the processes."""
+        for node in self.nodes:
+            self._start(node)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop whatever still runs."""
+        self.stop()
+
+    @property
+    def restarts(self) -> dict[str, int]:
+        """How often each node was started again."""
+        return {node.row.name: node.restarts for node in self.nodes}
+
+    def _start(self, node: Supervised) -> None:
+        again = node.row.again if node.restarts else {}
+        values = {**node.parameters, **again, "autostart": False}
+        node.begin(NodeProcess(node.row.name, self._namespace, values, node.restarts, self._on_line))
+
+    def tick(self) -> None:
+        """Go on with whatever is to be done; to be called often.
+
+        Raises:
+            NodeError: a node that is needed refuses to start, gave up, or keeps dying.
+        """
+        for node in [node for node in self.nodes if node.state != "active" or node.process is None]:
+            if node.process is None and time.monotonic() >= node.start_s:
+                self._start(node)
+        for node in list(self.nodes):
+            if node.process is None:
+                continue
+            if node.process.ended:
+                self._bury(node)
+            elif node.state != "active":
+                try:
+                    node.climb(self._brought_up or self._lower_ranks_are_active(node))
+                except NodeError as error:
+                    self._lose(node, str(error))
+        self._brought_up = self._brought_up or all(node.state == "active" for node in self.nodes)
+
+    def _lower_ranks_are_active(self, node: Supervised) -> bool:
+        return all(
+            other.state == "active"
+            for other in self.nodes
+            if other.row.rank < node.row.rank and other.row.needed
+        )
+
+    def _bury(self, node: Supervised) -> None:
+        """A process has ended: start it again later, or give up."""
+        assert node.process is not None
+        name, row, now_s = node.row.name, node.row, time.monotonic()
+        status, how = node.process.process.returncode, node.process.how_it_ended()
+        node.process.close()
+        node.process, node.state = None, None
+        node.deaths_s.append(now_s)
+        while now_s - node.deaths_s[0] > RESTART_WINDOW_S:
+            node.deaths_s.popleft()
+        deaths = len(node.deaths_s)
+        if status in (NOT_BEGUN, GAVE_UP):  # it told why; it would do so again
+            self._lose(node, f"node {name} {how}")
+        elif deaths > row.restarts:
+            self._lose(node, f"node {name} {how} ({deaths} times within {RESTART_WINDOW_S:.0f} s)")
+        else:
+            node.restarts += 1
+            node.start_s = now_s + BACK_OFF_S * 2 ** (deaths - 1)
+            self._on_note(
+                f"node {name} {how}; it is started again ({deaths} of {row.restarts} within "
+                f"{RESTART_WINDOW_S:.0f} s)"
+            )
+
+    def _lose(self, node: Supervised, why: str) -> None:
+        """Do without a node from now on.
+
+        Raises:
+            NodeError: no mission can be flown without it.
+        """
+        if node.row.needed:
+            raise NodeError(why)
+        self._on_note(f"{why}; the mission goes on without it")
+        if node.process is not None:
+            node.process.ask_to_stop()
+            node.process.wait(time.monotonic() + STOP_S)
+        self.nodes.remove(node)
+
+    def stop(self) -> dict[str, int]:
+        """Stop all nodes, higher ranks of the node table first. Returns their exit statuses."""
+        statuses = {}
+        running = {node.row.name: node.process for node in self.nodes if node.process is not None}
+        for rank in sorted({NODES[name].rank for name in running}, reverse=True):
+            group = [process for name, process in running.items() if NODES[name].rank == rank]
+            for process in group:
+                process.ask_to_stop()
+            deadline_s = time.monotonic() + STOP_S
+            for process in group:
+                statuses[process.name] = process.wait(deadline_s)
+        self.nodes = []
+        return statuses
