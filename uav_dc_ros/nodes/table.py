@@ -76,6 +76,7 @@ NODES: dict[str, NodeRow] = {
             subscribes=("pose", "users", "rates", "mission"),
             parameters=(p.SCENARIO, p.RATE_HZ),
             needed=False,
+            on_request=True,
         ),
         NodeRow(
             name="live_view",
