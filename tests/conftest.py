@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from typing import IO, Any
 import pytest
 
 MARK = "UAV_DC_TEST"
+ROOT = Path(__file__).parents[1]
 
 
 class Ros:
@@ -30,13 +32,17 @@ class Ros:
             "ROS_DOMAIN_ID": str(domain),
             "ROS_LOG_DIR": str(folder / "log"),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "PYTHONPATH": str(Path(__file__).parents[1]),
+            "PYTHONPATH": str(ROOT),
         }
 
     def start(self, module: str, *arguments: object, **popen: Any) -> subprocess.Popen[str]:
         """Start `python -m module arguments...`; its output, both streams, is piped."""
+        return self.start_command(sys.executable, "-m", module, *arguments, **popen)
+
+    def start_command(self, *command: object, **popen: Any) -> subprocess.Popen[str]:
+        """Start a command; its output, both streams, is piped."""
         return subprocess.Popen(
-            [sys.executable, "-m", module, *(str(argument) for argument in arguments)],
+            [str(part) for part in command],
             env=self.environment,
             cwd=self.folder,
             text=True,
@@ -144,6 +150,23 @@ def ros(tmp_path: Path) -> Iterator[Ros]:
 def module_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
     """A ROS domain and a folder for the tests of a module."""
     yield from ros_in(tmp_path_factory.mktemp("ros"))
+
+
+@pytest.fixture(scope="session")
+def repository_files() -> list[str]:
+    """Paths of the repository's files, relative to its root: tracked, or new and not ignored."""
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("not a git checkout, so what belongs to the repository is unknown")
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [name for name in listed.split("\0") if name and (ROOT / name).is_file()]
+
+
+def copy_repository(files: list[str], folder: Path) -> None:
+    """Copy the repository's files, without what git ignores."""
+    for name in files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / name)
 
 
 def read_bag(folder: Path) -> list[tuple[str, Any]]:

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -12,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import copy_repository
+
 ROOT = Path(__file__).parent.parent
 # One worker builds the wheel, once.
 pytestmark = pytest.mark.xdist_group("packaging")
@@ -19,10 +20,12 @@ pytestmark = pytest.mark.xdist_group("packaging")
 TOP_LEVEL = {
     ".ci",
     ".gitignore",
+    "LICENSE",
     "README.md",
     "benchmarks",
     "docs",
     "msgs_json",
+    "package.xml",
     "policies",
     "pyproject.toml",
     "setup.py",
@@ -30,16 +33,6 @@ TOP_LEVEL = {
     "uav_dc_ros",
 }
 QUIET = os.environ | {"PIP_NO_INDEX": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
-
-
-@pytest.fixture(scope="module")
-def repository_files():
-    """Paths of the repository's files, relative to its root: tracked, or new and not ignored."""
-    if not (ROOT / ".git").exists() or shutil.which("git") is None:
-        pytest.skip("not a git checkout, so what belongs to the repository is unknown")
-    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    return [name for name in listed.split("\0") if name and (ROOT / name).is_file()]
 
 
 def pip(*arguments):
@@ -57,9 +50,7 @@ def pip(*arguments):
 def wheel(tmp_path_factory, repository_files):
     """A wheel built from a copy of the repository, without what git ignores."""
     folder = tmp_path_factory.mktemp("wheel")
-    for name in repository_files:
-        (folder / "copy" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(ROOT / name, folder / "copy" / name)
+    copy_repository(repository_files, folder / "copy")
     pip("wheel", "--no-deps", "--no-build-isolation", "-w", folder, folder / "copy")
     (path,) = folder.glob("*.whl")
     return path
@@ -100,6 +91,9 @@ def test_the_wheel_holds_the_package_and_its_data_and_nothing_else(wheel, reposi
     for kind in ("scenarios/three_clusters.toml", "py.typed", "core/world.py"):
         assert f"uav_dc_ros/{kind}" in wanted
     with zipfile.ZipFile(wheel) as archive:
+        about = {name.partition(".dist-info/")[2] for name in archive.namelist()} - {""}
+        # No entry_points.txt: the executables `world`, `policy` ... are for ROS only.
+        assert about == {"METADATA", "RECORD", "WHEEL", "licenses/LICENSE", "top_level.txt"}
         found = {name for name in archive.namelist() if ".dist-info/" not in name}
         assert found == wanted
         for name in found:

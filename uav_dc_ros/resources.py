@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-_PACKAGE = Path(__file__).parent
+# Resolved: `colcon build --symlink-install` reaches the package, and nothing beside it, through a link.
+_PACKAGE = Path(__file__).resolve().parent
 
 
 def folder(name: str) -> Path:

@@ -10,6 +10,7 @@ policy           decides moves with a trained policy
 recorder         writes the bag
 observer         run_all's own eyes: progress and summary
 launcher         starts, watches and stops the nodes of a mission
+executable       what `ros2 run` starts: any of the nodes, by the name that it is called
 """
 
 import importlib.util
