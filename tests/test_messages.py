@@ -112,7 +112,7 @@ def test_a_number_that_json_does_not_know_never_leaves(value: float) -> None:
 
 
 def test_columns_have_one_length() -> None:
-    text = messages.encode(EXAMPLES["users"]).replace("[1.5,-2.0]", "[1.5]")
+    text = messages.encode(EXAMPLES["users"]).replace(b"[1.5,-2.0]", b"[1.5]")
     with pytest.raises(MessageError, match="x_m 1, y_m 2"):
         messages.decode(text, Users)
 

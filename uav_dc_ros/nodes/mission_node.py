@@ -155,7 +155,7 @@ class MissionNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition to inactive: parameters are read, everything is loaded, publishers are there."""
-        return self._attempt(self._configure)
+        return self._attempt(self._configure, undo=self._cleanup)
 
     def _configure(self) -> None:
         for row in self.row.parameters:
@@ -163,20 +163,21 @@ class MissionNode(LifecycleNode):
         self.configure()
         for name in self.row.publishes:
             topic = TOPICS[name]
-            self.publishers_of[name] = self.create_publisher(
-                qos.MESSAGE_TYPES[topic.type],
-                name,
-                qos.offered(topic),
-                event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
-                qos_overriding_options=qos.OVERRIDES,
-            )
+            with qos.overridden(name):
+                self.publishers_of[name] = self.create_publisher(
+                    qos.MESSAGE_TYPES[topic.type],
+                    name,
+                    qos.offered(topic),
+                    event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+                    qos_overriding_options=qos.OVERRIDES,
+                )
         self._diagnostics_timer = self.create_timer(
             diagnostics.PERIOD_S, self._tell_diagnostics, clock=self.steady
         )
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition to active: subscriptions are made, and peers looked for."""
-        return self._attempt(self._activate)
+        return self._attempt(self._activate, undo=self._fall_silent)
 
     def _activate(self) -> None:
         self.activate()
@@ -195,6 +196,10 @@ class MissionNode(LifecycleNode):
         deadline_s = time.monotonic() + ACKNOWLEDGE_S
         for publisher in self.publishers_of.values():
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline_s - time.monotonic())))
+        self._fall_silent()
+
+    def _fall_silent(self) -> None:
+        """Hear nothing any more, and act on no timer."""
         for timer in self._timers_active:
             self.destroy_timer(timer)
         for subscription in self.subscriptions_of.values():
@@ -228,14 +233,17 @@ class MissionNode(LifecycleNode):
             self._deactivate()
         self._cleanup()
 
-    def _attempt(self, act: Callable[[], None]) -> TransitionCallbackReturn:
-        """Do what a transition asks for; what goes wrong is told, and refuses the transition."""
+    def _attempt(
+        self, act: Callable[[], None], undo: Callable[[], None] = lambda: None
+    ) -> TransitionCallbackReturn:
+        """Do what a transition asks for; what goes wrong is told, undone, and refuses the transition."""
         self.failure = None
         try:
             act()
         except UavDcError as error:
             self.failure = error
             self.get_logger().error(str(error))
+            undo()
             return TransitionCallbackReturn.FAILURE
         except Exception:  # the caller would swallow it
             self.get_logger().fatal(traceback.format_exc())
@@ -281,15 +289,16 @@ class MissionNode(LifecycleNode):
     ) -> Any:
         """A subscription with the table's QoS, as overridden; `callback` takes the message and its info."""
         handler: Any = callback  # rclpy sees by the signature what it takes; its types do not
-        return self.create_subscription(
-            qos.MESSAGE_TYPES[topic.type],
-            topic.name,
-            handler,
-            qos.requested(topic, all=self.row.hears_all),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            qos_overriding_options=qos.OVERRIDES,
-            raw=raw,
-        )
+        with qos.overridden(topic.name):
+            return self.create_subscription(
+                qos.MESSAGE_TYPES[topic.type],
+                topic.name,
+                handler,
+                qos.requested(topic, all=self.row.hears_all),
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                qos_overriding_options=qos.OVERRIDES,
+                raw=raw,
+            )
 
     def say(self, topic: str, payload: messages.Payload) -> None:
         """Publish a checked payload on a JSON topic."""

@@ -1,10 +1,12 @@
 """Quality of service: profiles from the topic table, and peers that do not match them."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import (
@@ -24,6 +26,7 @@ from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
 from uav_dc_ros import topics
+from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.topics import Topic
 
 MESSAGE_TYPES: dict[str, type] = {
@@ -59,6 +62,19 @@ def requested(topic: Topic, *, all: bool) -> QoSProfile:
     if all:
         profile.history = HistoryPolicy.KEEP_ALL
     return profile
+
+
+@contextmanager
+def overridden(topic: str) -> Iterator[None]:
+    """Make a publisher or subscription whose QoS parameters may have been given.
+
+    Raises:
+        ParameterError: a policy that does not exist, or a value of another type.
+    """
+    try:
+        yield
+    except (RuntimeError, InvalidParameterTypeException) as error:
+        raise ParameterError(f"qos_overrides of {topic}: {error}") from None
 
 
 def incompatible(

@@ -1,0 +1,84 @@
+"""A stranger who calls services of nodes, as `ros2 lifecycle` and `ros2 param` do.
+
+Commands come as JSON lines on standard input, answers go as JSON lines to standard output:
+
+    {"node": "/policy", "do": "configure"}            -> {"success": true, "state": "inactive"}
+    {"node": "/policy", "set": {"policy": "nobody"}}  -> {"policy": {"success": false, "reason": "..."}}
+    {"node": "/policy", "describe": ["policy"]}       -> {"policy": {"description": "...", ...}}
+"""
+
+import json
+import sys
+from typing import Any
+
+import rclpy
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+TRANSITIONS = {"configure": 1, "cleanup": 2, "activate": 3, "deactivate": 4}
+
+
+class Asker(Node):
+    """Calls a service, and waits for its answer."""
+
+    def call(self, kind: Any, service: str, **request: Any) -> Any:
+        client = self.create_client(kind, service)
+        assert client.wait_for_service(20.0), f"no service {service}"
+        future = client.call_async(kind.Request(**request))
+        rclpy.spin_until_future_complete(self, future, timeout_sec=20.0)
+        assert future.done(), f"{service} did not answer"
+        self.destroy_client(client)
+        return future.result()
+
+    def change(self, node: str, transition: str) -> dict[str, Any]:
+        request = ChangeState.Request()
+        request.transition.label = "" if transition in TRANSITIONS else transition
+        request.transition.id = TRANSITIONS.get(transition, 0)
+        answer = self.call(ChangeState, f"{node}/change_state", transition=request.transition)
+        state = self.call(GetState, f"{node}/get_state").current_state.label
+        return {"success": answer.success, "state": state}
+
+    def set(self, node: str, values: dict[str, Any]) -> dict[str, Any]:
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        results = self.call(SetParameters, f"{node}/set_parameters", parameters=given).results
+        return {
+            name: {"success": result.successful, "reason": result.reason}
+            for name, result in zip(values, results, strict=True)
+        }
+
+    def describe(self, node: str) -> dict[str, Any]:
+        names = self.call(ListParameters, f"{node}/list_parameters").result.names
+        told = self.call(DescribeParameters, f"{node}/describe_parameters", names=names).descriptors
+        return {
+            row.name: {
+                "description": row.description,
+                "expected": row.additional_constraints,
+                "read_only": row.read_only,
+                "range": [
+                    [bound.from_value, bound.to_value]
+                    for bound in (*row.integer_range, *row.floating_point_range)
+                ],
+            }
+            for row in told
+        }
+
+
+def main() -> None:
+    rclpy.init()
+    asker = Asker("asker")
+    for line in sys.stdin:
+        command = json.loads(line)
+        if "do" in command:
+            answer = asker.change(command["node"], command["do"])
+        elif "set" in command:
+            answer = asker.set(command["node"], command["set"])
+        else:
+            answer = asker.describe(command["node"])
+        print(json.dumps(answer), flush=True)
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Nodes that are killed at random moments, and started again: the mission is what it would have been.
+
+In lockstep a mission does not depend on time, so one with kills must end with the numbers of one without,
+to the last bit. Each fixture `ros` asserts at its end that no process of the test is left.
+"""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Ros, finish, read_bag
+from uav_dc_ros.nodes.table import NODES
+
+KILLED = ["world", "channel_monitor", "policy", "recorder"]
+MISSIONS = 60
+PERIOD_S = 60.0 / (NODES["world"].restarts * len(KILLED))  # so that nobody has died too often within a minute
+
+
+def flight(ros: Ros, name: str, *options: object, missions: int = MISSIONS) -> subprocess.Popen[str]:
+    """Start missions in lockstep with a bag and a summary of this name."""
+    given = ("--bag", ros.folder / name, "--summary", ros.folder / f"{name}.json", *options)
+    return ros.start("uav_dc_ros.run_all", "--pace", "lockstep", "--missions", missions, *given)
+
+
+def summaries(folder: Path, name: str) -> list[dict[str, Any]]:
+    """What run_all wrote, without the name of the bag."""
+    return [mission | {"bag": None} for mission in json.loads((folder / f"{name}.json").read_text())]
+
+
+def payloads(bag: Path, topic: str) -> dict[tuple[int, int], Any]:
+    """Payloads by mission and step; a step that was told twice was told twice the same."""
+    found: dict[tuple[int, int], Any] = {}
+    for name, payload in read_bag(bag):
+        if name == f"/{topic}":
+            key = (payload["mission"], payload["step"])
+            assert found.setdefault(key, payload) == payload, f"step {key} is told in two ways"
+    return found
+
+
+def kill_until_it_ends(ros: Ros, process: subprocess.Popen[str], rng: random.Random, kills: int) -> list[str]:
+    """Kill nodes in turn, one by one, at random moments; their names."""
+    killed: list[str] = []
+    order: list[str] = []
+    while len(killed) < kills and process.poll() is None:
+        time.sleep(rng.uniform(0.0, 1.5))
+        order = order or rng.sample(KILLED, len(KILLED))
+        name = order.pop()
+        for process_id, command in ros.processes().items():
+            if f"uav_dc_ros.nodes.{name} " in command:
+                os.kill(process_id, signal.SIGKILL)
+                killed.append(name)
+                break
+    return killed
+
+
+def check_a_flight_with_kills(ros: Ros, kills: int, seed: int) -> int:
+    """Fly once in peace, once with kills; how many came in time."""
+    calm = flight(ros, "calm")
+    status, output = finish(calm)
+    assert status == 0, output
+    disturbed = flight(ros, f"disturbed{seed}")
+    killed = kill_until_it_ends(ros, disturbed, random.Random(seed), kills)
+    status, output = finish(disturbed, 180.0)
+    assert status == 0, output
+    assert "Traceback" not in output
+    assert output.count("killed by SIGKILL") == len(killed), output
+    assert summaries(ros.folder, f"disturbed{seed}") == summaries(ros.folder, "calm")
+    for topic in ("users", "rates", "move"):
+        expected = payloads(ros.folder / "calm", topic)
+        told = payloads(ros.folder / f"disturbed{seed}", topic)
+        assert told.items() <= expected.items(), topic
+        if "recorder" not in killed:
+            assert told == expected, topic
+    assert (ros.folder / f"disturbed{seed}" / "metadata.yaml").is_file()
+    return len(killed)
+
+
+def test_missions_end_as_if_nobody_had_been_killed(ros: Ros) -> None:
+    assert check_a_flight_with_kills(ros, kills=10, seed=1) == 10
+
+
+@pytest.mark.long
+def test_fifty_kills(ros: Ros) -> None:
+    total = 0
+    for seed in range(2, 7):
+        for name in ("calm", "calm.json"):
+            (ros.folder / name).rename(ros.folder / f"{name}_{seed}") if seed > 2 else None
+        total += check_a_flight_with_kills(ros, kills=10, seed=seed)
+    assert total >= 40
+
+
+@pytest.mark.parametrize("node", KILLED)
+def test_a_node_that_keeps_dying_ends_the_mission(
+    ros: Ros, small_scenario: Path, small_policy: Path, node: str
+) -> None:
+    given = ("--scenario", small_scenario, "--policy", small_policy, "--pace", 1)
+    process = flight(ros, "bag", *given, missions=1)
+    killed: set[int] = set()
+    while process.poll() is None and len(killed) <= NODES[node].restarts:
+        killed_now = ros.node(node)
+        if killed_now not in killed:
+            os.kill(killed_now, signal.SIGKILL)
+            killed.add(killed_now)
+        time.sleep(0.05)
+    status, output = finish(process)
+    assert status == 1, output
+    assert "Traceback" not in output
+    times = NODES[node].restarts + 1
+    assert f"error: node {node} was killed by SIGKILL" in output
+    assert f"({times} times within 60 s)" in output
+    summary = json.loads((ros.folder / "bag.json").read_text())
+    assert summary["outcome"] == "aborted"
+    if (ros.folder / "bag").is_dir():  # killed early enough, the recorder had not made it yet
+        read_bag(ros.folder / "bag")
+        assert (ros.folder / "bag" / "metadata.yaml").is_file()

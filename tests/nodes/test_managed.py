@@ -1,0 +1,173 @@
+"""The life cycle and the parameters of each node, by the services that every ROS tool uses."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Ros, finish
+from uav_dc_ros.nodes.parameters import EVERY
+from uav_dc_ros.nodes.table import NODES
+
+PROCESSES = [name for name, row in NODES.items() if row.process and not row.on_request]
+
+
+class Asker:
+    """Calls services of nodes, in a process of its own."""
+
+    def __init__(self, ros: Ros) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("asker.py"))],
+            env=ros.environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def ask(self, **command: Any) -> dict[str, Any]:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
+        return answer
+
+    def close(self) -> None:
+        self.process.communicate(timeout=20)
+
+
+@pytest.fixture
+def asker(ros: Ros) -> Iterator[Asker]:
+    """Somebody who asks the nodes of this test."""
+    asker = Asker(ros)
+    yield asker
+    asker.close()
+
+
+def waiting(ros: Ros, node: str, *arguments: str) -> subprocess.Popen[str]:
+    """Start a node that waits for a lifecycle manager."""
+    given = ["-p", "autostart:=false", *arguments]
+    return ros.start(f"uav_dc_ros.nodes.{node}", "--ros-args", *given)
+
+
+def ended(process: subprocess.Popen[str]) -> str:
+    """Stop a node that a test started; what it printed."""
+    process.terminate()
+    status, output = finish(process)
+    assert status == 0, output
+    assert "Traceback" not in output
+    return output
+
+
+def test_a_bad_policy_fails_at_configure_with_its_reason_and_a_good_one_heals_it(
+    ros: Ros, asker: Asker
+) -> None:
+    node = waiting(ros, "policy", "-p", "policy:=nobody")
+    refused = {"success": False, "state": "unconfigured"}
+    assert asker.ask(node="/policy", do="configure") == refused
+    assert asker.ask(node="/policy", do="activate") == refused  # not a transition of this state
+    given = asker.ask(node="/policy", set={"policy": "five_clusters_dueling"})
+    assert given["policy"]["success"]
+    assert asker.ask(node="/policy", do="configure") == {"success": True, "state": "inactive"}
+    output = ended(node)
+    assert "policy 'nobody': no such name or folder; expected one of five_clusters_dueling" in output
+
+
+def test_every_node_goes_all_ways_twice(ros: Ros, asker: Asker) -> None:
+    nodes = {
+        name: waiting(ros, name, *(["-p", f"bag:={ros.folder / name}"] if name == "recorder" else []))
+        for name in PROCESSES
+    }
+    for turn in range(2):
+        for name in nodes:
+            for transition, state in (
+                ("configure", "inactive"),
+                ("activate", "active"),
+                ("deactivate", "inactive"),
+                ("cleanup", "unconfigured"),
+            ):
+                expected = {"success": True, "state": state}
+                assert asker.ask(node=f"/{name}", do=transition) == expected, (name, turn, transition)
+            if name == "recorder":
+                asker.ask(node="/recorder", set={"bag": str(ros.folder / "another")})
+    assert asker.ask(node="/world", do="shutdown") == {"success": True, "state": "finalized"}
+    for process in nodes.values():
+        ended(process)
+    assert {path.name for path in ros.folder.glob("*/metadata.yaml")} == {"metadata.yaml"}
+    assert (ros.folder / "another" / "metadata.yaml").is_file()
+
+
+def test_a_closed_bag_is_not_recorded_into_again(ros: Ros, asker: Asker) -> None:
+    node = waiting(ros, "recorder", "-p", f"bag:={ros.folder / 'bag'}")
+    for transition in ("configure", "activate", "deactivate"):
+        assert asker.ask(node="/recorder", do=transition)["success"]
+    assert asker.ask(node="/recorder", do="activate") == {"success": False, "state": "inactive"}
+    assert f"bag: {ros.folder / 'bag'} is closed" in ended(node)
+
+
+def test_parameters_are_refused_with_their_reason(ros: Ros, asker: Asker) -> None:
+    node = waiting(ros, "world")
+
+    def reason(**values: Any) -> str:
+        (answer,) = asker.ask(node="/world", set=values).values()
+        assert not answer["success"]
+        return str(answer["reason"])
+
+    assert "seed" in reason(seed=-1)
+    assert "missions" in reason(missions=0)
+    assert "pace: 'fast'; expected 'lockstep' or a number above 0" in reason(pace="fast")
+    assert "INTEGER" in reason(seed="three")
+    assert "read-only" in reason(autostart=True)
+    assert reason(sead=3)
+    assert asker.ask(node="/world", set={"seed": 3})["seed"]["success"]
+    assert asker.ask(node="/world", do="configure")["success"]
+    assert "seed: the node is inactive; expected it to be unconfigured" in reason(seed=4)
+    ended(node)
+
+
+def test_every_parameter_is_described_with_unit_and_range(ros: Ros, asker: Asker) -> None:
+    nodes = {name: waiting(ros, name) for name in PROCESSES}
+    for name in nodes:
+        told = asker.ask(node=f"/{name}")
+        for row in (*EVERY, *NODES[name].parameters):
+            unit = f" [{row.unit}]" if row.unit else ""
+            assert told[row.name] == {
+                "description": f"{row.description}{unit}",
+                "expected": row.expected,
+                "read_only": row.read_only,
+                "range": [] if row.least is None else [[row.least, row.most]],
+            }
+        own = {row.name for row in (*EVERY, *NODES[name].parameters)}
+        assert {n for n in told if not n.startswith(("use_sim_time", "start_type_"))} == own
+    for process in nodes.values():
+        ended(process)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("-p", "sead:=3"), "error: sead: no such parameter of node world; did you mean 'seed'?"),
+        (("-p", "wind_mps:=3"), "error: wind_mps: no such parameter of node world; expected some of autosta"),
+        (
+            ("-p", "qos_overrides./moves.subscription.depth:=5"),
+            "qos_overrides./moves.subscription.depth: no such parameter of node world; did you mean",
+        ),
+        (
+            ("-p", "qos_overrides./move.subscription.reliability:=often"),
+            "qos_overrides of move: Unexpected QoS override for policy `reliability`: `often`",
+        ),
+        (
+            ("-p", "qos_overrides./pose.publisher.depth:=deep"),
+            "qos_overrides of pose: Trying to set parameter",
+        ),
+    ],
+)
+def test_a_parameter_that_no_node_has(ros: Ros, arguments: tuple[str, ...], told: str) -> None:
+    status, output = ros.run("uav_dc_ros.nodes.world", "--ros-args", *arguments)
+    assert status == 2, output
+    assert told in output
+    assert "Traceback" not in output
