@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -229,11 +230,21 @@ def test_every_message_type_of_ros_can_be_recorded(tmp_path: Path) -> None:
         2, "link", "lost", "uav", [t["diagnostic_msgs/msg/KeyValue"]("sinr", "0.1")]
     )
     blank = TYPES.types["visualization_msgs/msg/MarkerArray"]([])
+    black = t["std_msgs/msg/ColorRGBA"](0.0, 0.0, 0.0, 1.0)
+    marker = t["visualization_msgs/msg/Marker"](
+        header=header, ns="users", id=7, type=2, action=0, pose=pose,
+        scale=t["geometry_msgs/msg/Vector3"](1.0, 1.0, 1.0), color=black,
+        lifetime=t["builtin_interfaces/msg/Duration"](0, 0), frame_locked=False, points=[], colors=[black],
+        texture_resource="", texture=t["sensor_msgs/msg/CompressedImage"](header, "", np.zeros(0, np.uint8)),
+        uv_coordinates=[], text="", mesh_resource="",
+        mesh_file=t["visualization_msgs/msg/MeshFile"]("", np.zeros(0, np.uint8)),
+        mesh_use_embedded_materials=False,
+    )  # fmt: skip
     messages = {
         "nav_msgs/msg/Path": t["nav_msgs/msg/Path"](
             header, [t["geometry_msgs/msg/PoseStamped"](header, pose)]
         ),
-        "visualization_msgs/msg/MarkerArray": blank,
+        "visualization_msgs/msg/MarkerArray": t["visualization_msgs/msg/MarkerArray"]([marker]),
         "diagnostic_msgs/msg/DiagnosticArray": t["diagnostic_msgs/msg/DiagnosticArray"](header, [status]),
         "rosgraph_msgs/msg/Clock": t["rosgraph_msgs/msg/Clock"](t["builtin_interfaces/msg/Time"](5, 6)),
     }
@@ -246,6 +257,7 @@ def test_every_message_type_of_ros_can_be_recorded(tmp_path: Path) -> None:
         read = {c.msgtype: reader.deserialize(data, c.msgtype) for c, _, data in reader.messages()}
     assert list(read) == list(messages)
     assert read["nav_msgs/msg/Path"].poses[0].pose.position.z == 3.0
+    assert read["visualization_msgs/msg/MarkerArray"].markers[0].ns == "users"
     assert read["diagnostic_msgs/msg/DiagnosticArray"].status[0].values[0].key == "sinr"
     assert read["rosgraph_msgs/msg/Clock"].clock.nanosec == 6
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as file:
