@@ -229,7 +229,6 @@ def test_every_message_type_of_ros_can_be_recorded(tmp_path: Path) -> None:
     status = t["diagnostic_msgs/msg/DiagnosticStatus"](
         2, "link", "lost", "uav", [t["diagnostic_msgs/msg/KeyValue"]("sinr", "0.1")]
     )
-    blank = TYPES.types["visualization_msgs/msg/MarkerArray"]([])
     black = t["std_msgs/msg/ColorRGBA"](0.0, 0.0, 0.0, 1.0)
     marker = t["visualization_msgs/msg/Marker"](
         header=header, ns="users", id=7, type=2, action=0, pose=pose,
