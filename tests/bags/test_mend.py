@@ -120,10 +120,11 @@ def test_a_file_cut_at_any_byte_keeps_all_that_is_there_in_full(
     assert (bag / mended.parts[-1]).read_bytes() == file
 
 
+@pytest.mark.parametrize("cut", [None, -40])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_mended_part_says_what_the_torn_one_said(tmp_path: Path, kind: str) -> None:
-    """Schemas, channels with their metadata, and metadata records."""
-    bag = folder_of(tmp_path / "bag", made(kind, finished=False))
+def test_a_mended_part_says_what_the_torn_one_said(tmp_path: Path, kind: str, cut: int | None) -> None:
+    """Schemas, channels with their metadata, and metadata records; once, also where a summary repeats them."""
+    bag = folder_of(tmp_path / "bag", made(kind, finished=cut is not None)[:cut])
     mend(bag)
     with (bag / "bag_0.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
@@ -220,6 +221,14 @@ def test_parts_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     bag = folder_of(tmp_path / "bag", *(made("zstd", n=1) for _ in range(11)))
     assert mend(bag).parts == tuple(f"bag_{i}.mcap" for i in range(11))
     assert information(bag)["relative_file_paths"][-2:] == ["bag_9.mcap", "bag_10.mcap"]
+
+
+def test_hidden_files_are_no_parts(tmp_path: Path) -> None:
+    """Such as those that a Mac leaves on a stick."""
+    bag = folder_of(tmp_path / "bag", made("zstd"))
+    (bag / "._bag_0.mcap").write_bytes(b"Mac OS X")
+    assert mend(bag).parts == ("bag_0.mcap",)
+    assert (bag / "._bag_0.mcap").exists()
 
 
 @pytest.mark.parametrize("left", [b"", b"\x89MCA", b"\x89MCAP0\r\n"])
@@ -343,6 +352,7 @@ def test_a_mending_that_is_killed_can_be_done_again(tmp_path: Path, step: str) -
     )  # fmt: skip
     assert killed.returncode == -signal.SIGKILL
     assert {path.name for path in bag.iterdir()} == {"bag_0.mcap", "bag_1.mcap", ".bag_0.mcap.partial"}
+    (bag / ".metadata.yaml.123.partial").write_text("rosbag2_")  # killed at the very end
     assert mend(bag).mended == ("bag_0.mcap", "bag_1.mcap")
     assert {path.name for path in bag.iterdir()} == {"bag_0.mcap", "bag_1.mcap", "metadata.yaml"}
     assert len(in_bag(bag)) == 60

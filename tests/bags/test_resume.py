@@ -200,16 +200,16 @@ def test_a_full_disk_leaves_the_bag_as_it_was(tmp_path: Path) -> None:
     assert content(bag) == before
 
 
-def test_a_failure_lets_the_folder_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("step", ["add_message", "add_channel", "finish"])
+def test_a_failure_lets_the_folder_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     bag = BagWriter(tmp_path / "bag", {})
-    bag.add_topic("/a", STRING)
-    monkeypatch.setattr(PartWriter, "add_message", full)
-    with pytest.raises(BagError, match="written any further: No space left"):
+    monkeypatch.setattr(PartWriter, step, full)
+    with pytest.raises(BagError, match="written any further: No space left"), bag:  # noqa: PT012
+        bag.add_topic("/a", STRING)
         bag.write("/a", text("x"), log_time_ns=1, publish_time_ns=1)
-    bag.close()
     monkeypatch.undo()
     monkeypatch.setattr(write, "PartWriter", full)
     with pytest.raises(BagError, match="cannot be written: No space left"):
