@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
+from ruamel.yaml import YAML
 
 from tests.bags.made import (
     HASH,
@@ -123,7 +124,7 @@ def test_a_file_cut_at_any_byte_keeps_all_that_is_there_in_full(
 @pytest.mark.parametrize("cut", [None, -40])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_mended_part_says_what_the_torn_one_said(tmp_path: Path, kind: str, cut: int | None) -> None:
-    """Schemas, channels with their metadata, and metadata records; once, also where a summary repeats them."""
+    """Schemas, channels with their metadata, and metadata records; once, though a summary repeats them."""
     bag = folder_of(tmp_path / "bag", made(kind, finished=cut is not None)[:cut])
     mend(bag)
     with (bag / "bag_0.mcap").open("rb") as file:
@@ -139,6 +140,19 @@ def test_a_mended_part_says_what_the_torn_one_said(tmp_path: Path, kind: str, cu
     assert [c.topic for c in summary.channels.values()] == ["/a", "/b", "/silent"]
     assert {c.metadata["topic_type_hash"] for c in summary.channels.values()} == {HASH}
     assert {"depth: 7" in c.metadata["offered_qos_profiles"] for c in summary.channels.values()} == {True}
+
+
+def test_a_part_tells_its_counts_once(tmp_path: Path) -> None:
+    """Killed at the very end, a part has rosbag2's record of itself already; the copy has its own."""
+    with BagWriter(tmp_path / "bag", {}) as writer:
+        writer.add_topic("/a", STRING)
+        writer.write("/a", text("x"), log_time_ns=1, publish_time_ns=1)
+    torn = folder_of(tmp_path / "torn", content(tmp_path / "bag")["bag_0.mcap"][:-1])
+    mend(torn)
+    with (torn / "torn_0.mcap").open("rb") as file:
+        records = [record for record in make_reader(file).iter_metadata() if record.name == "rosbag2"]
+    [told] = [YAML(typ="safe").load(record.metadata["serialized_metadata"]) for record in records]
+    assert (told["relative_file_paths"], told["message_count"]) == (["torn_0.mcap"], 1)
 
 
 def test_metadata_yaml_of_a_mended_bag(tmp_path: Path) -> None:
