@@ -108,7 +108,7 @@ def _rewrite(scan: Scan, path: Path) -> Part:
     """Put what can be read of a part into its place."""
     temporary = path.with_name(f".{path.name}.partial")
     try:
-        writer = PartWriter(temporary, name=path.name, replace=True)
+        writer = PartWriter(temporary, name=path.name)
         try:
             _copy(scan, writer)
             writer.finish()

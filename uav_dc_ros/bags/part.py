@@ -74,24 +74,17 @@ class PartWriter:
     """Writes one MCAP file with zstd chunks, and keeps count of what it holds.
 
     Args:
-        path: the file; made here.
+        path: the file; must not exist.
         name: the part's name, where the file has a temporary one.
-        replace: is a file of that path written over?
 
     Raises (all methods): OSError, which whoever owns the bag puts into words.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        name: str | None = None,
-        replace: bool = False,
-    ) -> None:
+    def __init__(self, path: Path, *, name: str | None = None) -> None:
         self.part = Part(name or path.name)
         self._topics: dict[int, str] = {}  # by channel
         self._types: dict[int, str] = {0: ""}  # by schema; channel without schema: 0, as MCAP has it
-        self._file = path.open("wb" if replace else "xb")
+        self._file = path.open("xb")
         try:
             self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
             self._mcap.start(profile="ros2", library=f"uav_dc_ros {__version__}")

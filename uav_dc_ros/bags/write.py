@@ -91,7 +91,7 @@ class BagWriter:
             offered_qos: QoS that the topic's publishers offer.
 
         Raises:
-            BagError: ROS 2 has no such type, or the topic has another one in earlier parts.
+            BagError: ROS 2 has no such type, the topic has another one in earlier parts, or the disk is full.
         """
         qos = dump_qos_v9(list(offered_qos))
         if name in self._whole.topics:
@@ -102,15 +102,14 @@ class BagWriter:
                 qos = row["offered_qos_profiles"]
         if type not in self._typestore.fielddefs:
             raise BagError(f"topic {name} is of type {type!r}; expected a type of ROS 2 Jazzy")
-        if type not in self._schemas:
-            definition, _ = self._typestore.generate_msgdef(type, ros_version=2)
-            self._schemas[type] = self._writer.add_schema(type, "ros2msg", definition.encode())
-        self._channels[name] = self._writer.add_channel(
-            name,
-            "cdr",
-            self._schemas[type],
-            {"offered_qos_profiles": to_yaml(qos), "topic_type_hash": self._typestore.hash_rihs01(type)},
-        )
+        told = {"offered_qos_profiles": to_yaml(qos), "topic_type_hash": self._typestore.hash_rihs01(type)}
+        try:
+            if type not in self._schemas:
+                definition, _ = self._typestore.generate_msgdef(type, ros_version=2)
+                self._schemas[type] = self._writer.add_schema(type, "ros2msg", definition.encode())
+            self._channels[name] = self._writer.add_channel(name, "cdr", self._schemas[type], told)
+        except OSError as error:  # a definition may be what fills the chunk
+            raise self._failure(error) from None
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:
         """Append a message.
