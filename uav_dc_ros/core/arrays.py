@@ -1,8 +1,8 @@
 """The array type, and the one place that asks which library an array belongs to.
 
 A node works on one world: fifty users, for which the call costs more than the numbers. So sums and the
-like are asked of the array, `values.sum(axis=-1)`, which numpy and torch spell alike and which takes a
-third of the time of numpy's function. A mean is a sum divided by a number: the same to the last bit.
+like are asked of the array, `values.sum(axis=-1)`, which numpy and torch spell alike and which takes half
+the time of numpy's function. A mean is a sum divided by a number, which on a CPU is what both compute.
 """
 
 from functools import lru_cache

@@ -116,6 +116,4 @@ def _sum_of_others(received_w: Array) -> Array:
     xp = array_namespace(received_w)
     strongest = received_w.argmax(axis=-1, keepdims=True)
     weaker_w = received_w * (constant(range(received_w.shape[-1]), strongest) != strongest)
-    return weaker_w.sum(axis=-1, keepdims=True) + (
-        xp.max(received_w, axis=-1, keepdims=True) - received_w
-    )
+    return weaker_w.sum(axis=-1, keepdims=True) + (xp.max(received_w, axis=-1, keepdims=True) - received_w)

@@ -104,4 +104,5 @@ def _switches(shape: tuple[int, int, int]) -> tuple[tuple[int, ...], ...]:
 def _cluster_means(scenario: Scenario, per_user: Array) -> Array:
     """Mean over the users of each cluster: `[..., U]` to `[..., M]`."""
     n_users = scenario.users.users_per_cluster
-    return per_user.reshape((*per_user.shape[:-1], -1, n_users)).sum(axis=-1) / n_users
+    shape = (*per_user.shape[:-1], scenario.n_clusters, n_users)
+    return per_user.reshape(shape).sum(axis=-1) / n_users
