@@ -77,7 +77,8 @@ def encode(
         progress = xp.astype(data_bits, xp.float32) / scenario.mission.r_min_bits
         data = _cluster_means(scenario, xp.minimum(progress, constant((1.0,), progress)))
         direction, index = _switches(scenario.grid.shape)
-        switches = xp.astype(cell[..., constant(direction, cell)] == constant(index, cell), xp.float32)
+        here = xp.take(cell_f, constant(direction, cell), axis=-1)
+        switches = xp.astype(here == constant(index, cell_f), xp.float32)
         ways_cells = constant(scenario.goals_cells, cell_f) - cell_f[..., None, :2]
         reach_cells = scenario.mission.d_cons_m / scenario.grid.cell_m
         ways_reach = ways_cells[..., :-1, :] / reach_cells
