@@ -84,9 +84,9 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             Indices, `[..., 3]`.
         """
         xp = array_namespace(cell)
-        target = cell + constant(MOVES, cell)[action]
+        target = cell + xp.take(constant(MOVES, cell), action.reshape((-1,)), axis=0).reshape(cell.shape)
         # A move changes one index by one, so to stay is to be clipped.
-        return xp.minimum(xp.maximum(target, constant((0, 0, 0), cell)), constant(self.last_cell, cell))
+        return xp.minimum(xp.maximum(target, constant((0,), cell)), constant(self.last_cell, cell))
 
     def centre_m(self, cell: Array, like: Array) -> Array:
         """Position of a cell's centre.
