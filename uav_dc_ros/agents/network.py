@@ -71,10 +71,9 @@ def q_values(architecture: Architecture, parameters: Parameters, observation: Ar
     Returns:
         `[..., B, A]`.
     """
-    xp = array_namespace(observation)
 
     def layer(name: str, inputs: Array) -> Array:
-        return inputs @ parameters[f"{name}.weight"] + parameters[f"{name}.bias"][..., None, :]
+        return inputs @ parameters[name + ".weight"] + parameters[name + ".bias"][..., None, :]
 
     features = observation
     for i in range(len(architecture.hidden)):
@@ -82,6 +81,9 @@ def q_values(architecture: Architecture, parameters: Parameters, observation: Ar
         features = before * (before > 0)  # ReLU in every array library
     if architecture.dueling is None:
         return layer("q", features)
-    subtract = xp.mean if architecture.dueling == "mean" else xp.max
     advantage = layer("advantage", features)
-    return layer("value", features) + (advantage - subtract(advantage, axis=-1, keepdims=True))
+    if architecture.dueling == "mean":
+        subtracted = advantage.sum(axis=-1, keepdims=True) / architecture.n_actions
+    else:
+        subtracted = array_namespace(advantage).max(advantage, axis=-1, keepdims=True)
+    return layer("value", features) + (advantage - subtracted)

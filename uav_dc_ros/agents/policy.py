@@ -153,7 +153,7 @@ class Policy:
 
     def act(self, observation: Array) -> Array:
         """The greedy action for observations `[..., D]`: values of `core.grid.Action`, `[...]`."""
-        return np.argmax(self.q_values(observation), axis=-1)
+        return self.q_values(observation).argmax(axis=-1)
 
     def check(self, scenario: Scenario) -> None:
         """Refuses a world in which what this policy sees would mean something else.

@@ -1,4 +1,9 @@
-"""The array type, and the one place that asks which library an array belongs to."""
+"""The array type, and the one place that asks which library an array belongs to.
+
+A node works on one world: fifty users, for which the call costs more than the numbers. So sums and the
+like are asked of the array, `values.sum(axis=-1)`, which numpy and torch spell alike and which takes half
+the time of numpy's function. A mean is a sum divided by a number, which on a CPU is what both compute.
+"""
 
 from functools import lru_cache
 from typing import Any, TypeAlias
@@ -6,7 +11,6 @@ from typing import Any, TypeAlias
 import array_api_compat
 import array_api_compat.numpy
 import numpy as np
-from array_api_compat import device
 
 # numpy.ndarray or torch.Tensor. The array API standard has no type to name them both.
 Array: TypeAlias = Any
@@ -14,10 +18,11 @@ Array: TypeAlias = Any
 
 def array_namespace(*arrays: Array) -> Any:
     """The array-API namespace of some arrays of one library."""
-    # A node asks some thirty times a step: the likeliest answer is worth a short way.
-    if all(type(array) is np.ndarray for array in arrays):
-        return array_api_compat.numpy
-    return array_api_compat.array_namespace(*arrays)
+    # A node asks some twenty times a step: the likeliest answer is worth a short way.
+    for array in arrays:
+        if type(array) is not np.ndarray:
+            return array_api_compat.array_namespace(*arrays)
+    return array_api_compat.numpy
 
 
 def constant(values: tuple[Any, ...] | range, like: Array, dtype: Any = None) -> Array:
@@ -28,7 +33,8 @@ def constant(values: tuple[Any, ...] | range, like: Array, dtype: Any = None) ->
         like: an array whose library and device the result takes.
         dtype: type of the result; that of `like` unless told.
     """
-    return _constant(values, array_namespace(like), device(like), like.dtype if dtype is None else dtype)
+    device = getattr(like, "device", None)  # which arrays of numpy 1 do not have
+    return _constant(values, array_namespace(like), device, like.dtype if dtype is None else dtype)
 
 
 @lru_cache(maxsize=256)

@@ -68,6 +68,11 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         """Number of cells east, north and up."""
         return self.n_x, self.n_y, self.n_z
 
+    @property
+    def last_cell(self) -> tuple[int, int, int]:
+        """Highest index east, north and up."""
+        return self.n_x - 1, self.n_y - 1, self.n_z - 1
+
     def move(self, cell: Array, action: Array) -> Array:
         """The cell after one move; a move off the grid leaves the UAV where it is.
 
@@ -79,9 +84,9 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             Indices, `[..., 3]`.
         """
         xp = array_namespace(cell)
-        target = cell + xp.take(constant(MOVES, cell), xp.reshape(action, (-1,)), axis=0).reshape(cell.shape)
+        target = cell + xp.take(constant(MOVES, cell), action.reshape((-1,)), axis=0).reshape(cell.shape)
         # A move changes one index by one, so to stay is to be clipped.
-        return xp.minimum(xp.maximum(target, xp.zeros_like(target)), constant(self.shape, cell) - 1)
+        return xp.minimum(xp.maximum(target, constant((0,), cell)), constant(self.last_cell, cell))
 
     def centre_m(self, cell: Array, like: Array) -> Array:
         """Position of a cell's centre.

@@ -39,15 +39,13 @@ def collect(
         `data_bits` and `collected` after the step. Data is never taken back, and a collected user
         stays collected for this mission.
     """
-    xp = array_namespace(data_bits)
-    data_bits = data_bits + rate_bps * step_s * xp.astype(served, rate_bps.dtype)
+    data_bits = data_bits + rate_bps * step_s * served
     return data_bits, collected | (data_bits >= r_min_bits)
 
 
 def sum_rate(served: Array, rate_bps: Array) -> Array:
     """Sum of the rates of the served users, bit/s, `[...]`."""
-    xp = array_namespace(rate_bps)
-    return xp.sum(rate_bps * xp.astype(served, rate_bps.dtype), axis=-1)
+    return (rate_bps * served).sum(axis=-1)
 
 
 def at_dock(cell: Array, dock_cell: tuple[int, int]) -> Array:

@@ -40,4 +40,5 @@ def _polar(radius_m: Array, turn: Array) -> Array:
     """Radius `[...]` and angle in turns `[...]` as x, y, `[..., 2]`."""
     xp = array_namespace(radius_m)
     angle_rad = (2.0 * math.pi) * turn
-    return xp.stack([radius_m * xp.cos(angle_rad), radius_m * xp.sin(angle_rad)], axis=-1)
+    radius_m, angle_rad = radius_m[..., None], angle_rad[..., None]  # as `stack` does, at twice the cost
+    return xp.concat([radius_m * xp.cos(angle_rad), radius_m * xp.sin(angle_rad)], axis=-1)

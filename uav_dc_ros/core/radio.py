@@ -4,7 +4,8 @@ The radio knows nothing of missions: who is served is decided in `mission`.
 """
 
 import math
-from typing import Literal, TypeAlias, get_args
+from functools import cache
+from typing import Any, Literal, TypeAlias, get_args
 
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
 
@@ -22,10 +23,11 @@ def distance(uav_m: Array, users_m: Array) -> Array:
         Distance, metres, `[..., U]`.
     """
     xp = array_namespace(uav_m, users_m)
-    uav_m, users_m = _floating(uav_m)[..., None, :], _floating(users_m)
-    dx = uav_m[..., 0] - users_m[..., 0]
-    dy = uav_m[..., 1] - users_m[..., 1]
-    return xp.sqrt(dx * dx + dy * dy + uav_m[..., 2] * uav_m[..., 2])
+    uav_m, users_m = _floating(xp, uav_m), _floating(xp, users_m)
+    dx = uav_m[..., 0:1] - users_m[..., 0]
+    dy = uav_m[..., 1:2] - users_m[..., 1]
+    dz = uav_m[..., 2:3]
+    return xp.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 def path_gain(distance_m: Array, ref_gain: float, exponent: float = 2.0) -> Array:
@@ -66,14 +68,13 @@ def sinr(
     Raises:
         ValueError: unknown `interference`, or `associated` without `served`.
     """
-    xp = array_namespace(gain)
     received_w = power_w * gain
     if interference == "none":
         return received_w / noise_w
     if interference == "associated":
         if served is None:
             raise ValueError("interference='associated' needs `served`, bool [..., U]; got None")
-        received_w = xp.where(served, received_w, 0.0)
+        received_w = array_namespace(gain).where(served, received_w, 0.0)
     elif interference != "all":
         raise ValueError(
             f"interference is {interference!r}; expected one of {', '.join(get_args(Interference))}"
@@ -95,10 +96,14 @@ def rate_bps(sinr: Array, bandwidth_hz: float) -> Array:
     return (bandwidth_hz / math.log(2.0)) * array_namespace(sinr).log1p(sinr)
 
 
-def _floating(values: Array) -> Array:
+def _floating(xp: Any, values: Array) -> Array:
     """Integers as float64: torch would take their square root in float32."""
-    xp = array_namespace(values)
-    return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.float64)
+    return values if _is_real(xp, values.dtype) else xp.astype(values, xp.float64)
+
+
+@cache
+def _is_real(xp: Any, dtype: Any) -> bool:
+    return bool(xp.isdtype(dtype, "real floating"))
 
 
 def _sum_of_others(received_w: Array) -> Array:
@@ -109,9 +114,6 @@ def _sum_of_others(received_w: Array) -> Array:
     half of its digits.
     """
     xp = array_namespace(received_w)
-    strongest = xp.argmax(received_w, axis=-1, keepdims=True)
-    is_weaker = constant(range(received_w.shape[-1]), strongest) != strongest
-    weaker_w = received_w * xp.astype(is_weaker, received_w.dtype)
-    return xp.sum(weaker_w, axis=-1, keepdims=True) + (
-        xp.max(received_w, axis=-1, keepdims=True) - received_w
-    )
+    strongest = received_w.argmax(axis=-1, keepdims=True)
+    weaker_w = received_w * (constant(range(received_w.shape[-1]), strongest) != strongest)
+    return weaker_w.sum(axis=-1, keepdims=True) + (xp.max(received_w, axis=-1, keepdims=True) - received_w)

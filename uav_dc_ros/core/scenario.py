@@ -167,6 +167,13 @@ class Scenario(_Section, frozen=True, dict=True):
         return cell[:2]
 
     @cached_property
+    def goals_cells(self) -> tuple[tuple[float, float], ...]:
+        """The clusters' centres and the dock, in cells from the grid's origin, `[M + 1, 2]`."""
+        cell_m = self.grid.cell_m
+        goals_m = (*self.users.cluster_centres_m, self.mission.dock_m)
+        return tuple((x_m / cell_m, y_m / cell_m) for x_m, y_m in goals_m)
+
+    @cached_property
     def fingerprint(self) -> str:
         """First 12 hex digits of the SHA-256 of every value but the reward's.
 

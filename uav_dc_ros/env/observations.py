@@ -14,6 +14,7 @@ at 1.2 `d_cons_m`.
 The encodings are made from what the nodes know, so that training and flying see the same vector.
 """
 
+from functools import cache
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -35,7 +36,7 @@ def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
     """Lowest and highest value of each entry of the encoding, float32 `[D]` each."""
     low, high = np.zeros(size(kind, scenario), np.float32), np.ones(size(kind, scenario), np.float32)
     if kind == "map":
-        goals = np.asarray(_goals(scenario), np.float32)
+        goals = np.asarray(scenario.goals_cells, np.float32)
         span = np.asarray(_spans(scenario)[:2], np.float32)
         start = size("mission", scenario)
         low[start:] = ((goals - span) / span).reshape(-1)
@@ -67,47 +68,42 @@ def encode(
     """
     xp = array_namespace(cell)
     cell_f = xp.astype(cell, xp.float32)
-    parts = [cell_f / _span(scenario, cell_f)]
+    span = constant(_spans(scenario), cell_f)
+    parts = [cell_f / span]
     if kind != "position":
         max_steps = scenario.mission.max_steps
-        parts.append(xp.astype(max_steps - step, xp.float32)[..., None] / max_steps)
+        parts.append(xp.astype(max_steps - step[..., None], xp.float32) / max_steps)
         done = _cluster_means(scenario, xp.astype(collected, xp.float32))
         progress = xp.astype(data_bits, xp.float32) / scenario.mission.r_min_bits
-        data = _cluster_means(scenario, xp.minimum(progress, xp.ones_like(progress)))
-        switches = [
-            xp.astype(cell[..., i : i + 1] == constant(range(n), cell), xp.float32)
-            for i, n in enumerate(scenario.grid.shape)
-        ]
-        ways_cells = constant(_goals(scenario), cell_f) - cell_f[..., None, :2]
+        data = _cluster_means(scenario, xp.minimum(progress, constant((1.0,), progress)))
+        direction, index = _switches(scenario.grid.shape)
+        here = xp.take(cell_f, constant(direction, cell), axis=-1)
+        switches = xp.astype(here == constant(index, cell_f), xp.float32)
+        ways_cells = constant(scenario.goals_cells, cell_f) - cell_f[..., None, :2]
         reach_cells = scenario.mission.d_cons_m / scenario.grid.cell_m
         ways_reach = ways_cells[..., :-1, :] / reach_cells
-        closeness = xp.exp(-0.5 * xp.sum(ways_reach * ways_reach, axis=-1))
-        parts += [done, data, *switches, closeness, closeness * done]
+        closeness = xp.exp(-0.5 * (ways_reach * ways_reach).sum(axis=-1))
+        parts += [done, data, switches, closeness, closeness * done]
     if kind == "map":
-        way = ways_cells / _span(scenario, cell_f)[:2]
-        parts.append(xp.reshape(way, (*cell.shape[:-1], -1)))
+        way = ways_cells / span[:2]
+        parts.append(way.reshape((*cell.shape[:-1], -1)))
     return xp.concat(parts, axis=-1)
 
 
 def _spans(scenario: Scenario) -> tuple[int, ...]:
     """Highest index in each direction, at least 1."""
-    return tuple(max(n - 1, 1) for n in scenario.grid.shape)
+    east, north, up = scenario.grid.last_cell
+    return max(east, 1), max(north, 1), max(up, 1)
 
 
-def _span(scenario: Scenario, like: Array) -> Array:
-    """`_spans` as an array of the library and dtype of `like`, `[3]`."""
-    return constant(_spans(scenario), like)
-
-
-def _goals(scenario: Scenario) -> tuple[tuple[float, float], ...]:
-    """The clusters' centres and the dock, in cells from the grid's origin, `[M + 1, 2]`."""
-    cell_m = scenario.grid.cell_m
-    goals_m = (*scenario.users.cluster_centres_m, scenario.mission.dock_m)
-    return tuple((x_m / cell_m, y_m / cell_m) for x_m, y_m in goals_m)
+@cache
+def _switches(shape: tuple[int, int, int]) -> tuple[tuple[int, ...], ...]:
+    """Direction (0 east, 1 north, 2 up) and index that each switch stands for."""
+    return tuple(zip(*((i, index) for i, n in enumerate(shape) for index in range(n)), strict=True))
 
 
 def _cluster_means(scenario: Scenario, per_user: Array) -> Array:
     """Mean over the users of each cluster: `[..., U]` to `[..., M]`."""
-    xp = array_namespace(per_user)
-    shape = (*per_user.shape[:-1], scenario.n_clusters, scenario.users.users_per_cluster)
-    return xp.mean(xp.reshape(per_user, shape), axis=-1)
+    n_users = scenario.users.users_per_cluster
+    shape = (*per_user.shape[:-1], scenario.n_clusters, n_users)
+    return per_user.reshape(shape).sum(axis=-1) / n_users

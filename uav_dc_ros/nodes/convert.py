@@ -102,7 +102,7 @@ def users_m(payload: messages.Users, scenario: Scenario) -> Array:
             f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
             f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
         )
-    return np.stack([np.asarray(payload.x_m, dtype=np.float64), np.asarray(payload.y_m)], axis=-1)
+    return np.asarray([payload.x_m, payload.y_m], dtype=np.float64).T
 
 
 def rates(link: Link, data_bits: Array, collected: Array, *, mission: int, step: int) -> messages.Rates:
