@@ -5,6 +5,7 @@ has been collected; a monitor that was killed finds them in its journal.
 """
 
 from collections import deque
+from operator import itemgetter
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -17,7 +18,7 @@ from uav_dc_ros.nodes import convert, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 
-POSES_KEPT = 256
+WAITING_MAX = 256  # poses without users, and users without a pose
 
 
 class ChannelMonitor(MissionNode):
@@ -42,8 +43,9 @@ class ChannelMonitor(MissionNode):
 
     def activate(self) -> None:
         """Begin with empty hands, and the books as they are."""
-        self._poses: deque[tuple[int, Array]] = deque(maxlen=POSES_KEPT)
-        self._users: deque[messages.Users] = deque(maxlen=POSES_KEPT)
+        self._poses: deque[tuple[int, Array]] = deque(maxlen=WAITING_MAX)
+        self._users: deque[tuple[messages.Users, Array, int]] = deque(maxlen=WAITING_MAX)
+        self._heard_ns = 0  # when the users measured last were published
 
     def deactivate(self) -> None:
         """Fall silent."""
@@ -80,18 +82,21 @@ class ChannelMonitor(MissionNode):
 
     def on_users(self, payload: messages.Users) -> None:
         """Keep users until their pose is there."""
-        convert.users_m(payload, self.scenario)  # refuse another scenario's users before they wait
-        self._users.append(payload)
+        self._users.append((payload, convert.users_m(payload, self.scenario), self.published_ns))
         self._pair()
 
     def _pair(self) -> None:
         """Measure every step whose pose has come: the first one not older than the users."""
         while self._users:
-            users = self._users[0]
-            found = next((pose for pose in self._poses if pose[0] >= users.stamp_ns), None)
+            users, users_m, published_ns = self._users[0]
+            found = min(
+                (pose for pose in self._poses if pose[0] >= users.stamp_ns), key=itemgetter(0), default=None
+            )
             if found is None:
                 return
             self._users.popleft()
+            while self._poses and self._poses[0][0] < users.stamp_ns:
+                self._poses.popleft()  # older than any users to come
             time_ns, uav_m = found
             late_s = (time_ns - users.stamp_ns) * 1e-9
             if late_s >= self.scenario.mission.step_s:
@@ -100,14 +105,22 @@ class ChannelMonitor(MissionNode):
                     f"step {users.step} of mission {users.mission}: the next pose is {late_s:g} s younger; "
                     f"expected one within the step's {self.scenario.mission.step_s:g} s",
                 )
-            self._measure(users, uav_m)
+            self._measure(users, users_m, uav_m, published_ns)
 
-    def _measure(self, users: messages.Users, uav_m: Array) -> None:
+    def _measure(self, users: messages.Users, users_m: Array, uav_m: Array, published_ns: int) -> None:
         said = self._said
-        if said is not None and (said.mission, said.step) == (users.mission, users.step):
+        now, before = (users.mission, users.step), (said.mission, said.step) if said else (-1, 0)
+        if said is not None and now == before:
             self.say("rates", said)  # a repeated step is measured, and booked, once
             return
-        if said is None or said.mission != users.mission:
+        if now < before and published_ns <= self._heard_ns:
+            raise MessageError(
+                "stale_step",
+                f"mission, step {now} after {before}: a middleware that lost its peer for a while and found it "
+                "again repeats what it had said",
+            )
+        self._heard_ns = published_ns
+        if now < before or users.mission != before[0]:
             if users.step > 0:
                 raise MessageError(
                     "joined_late",
@@ -115,16 +128,16 @@ class ChannelMonitor(MissionNode):
                     "collected before is not known; expected a mission from its step 0",
                 )
             self._forget()
-        elif users.step != said.step + 1:
+        elif users.step != before[1] + 1:
             self.reject(
                 "users",
                 MessageError(
                     "gap",
-                    f"step {users.step} of mission {users.mission} after step {said.step}; expected "
-                    f"{said.step + 1}: nothing is booked for what was not heard",
+                    f"step {users.step} of mission {users.mission} after step {before[1]}; expected "
+                    f"{before[1] + 1}: nothing is booked for what was not heard",
                 ),
             )
-        link = core.measure(self.scenario, uav_m, convert.users_m(users, self.scenario), self._collected)
+        link = core.measure(self.scenario, uav_m, users_m, self._collected)
         if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in
             self._data_bits, self._collected = core.collect(
                 self.scenario, link, self._data_bits, self._collected

@@ -18,6 +18,7 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context
 
 TURN_MAX = 100  # messages of one topic before the others get their turn
+BUSY_S = 0.01  # while messages keep coming, services and clients are looked at this often
 
 
 class DirectExecutor:
@@ -33,11 +34,13 @@ class DirectExecutor:
 
     def __init__(self, rest_s: float = 0.0) -> None:
         self.rest_s = rest_s
+        self._at_once = TURN_MAX if rest_s else 1
         self._context: Any = get_default_context()
         self._guard = GuardCondition(callback=None, callback_group=None, context=self._context)
         self._nodes: list[Node] = []
         self._wait_set: Any = None
         self._capacity: tuple[int, ...] = ()
+        self._looked_s = 0.0  # when services and clients were last looked at
 
     def add_node(self, node: Node) -> None:
         """Handle a node's callbacks from now on."""
@@ -66,11 +69,22 @@ class DirectExecutor:
             self._turn(timeout_s)
 
     def _turn(self, timeout_s: float | None) -> bool:
-        """Wait, and handle all that is ready; False if the time was over before anything came."""
+        """Wait, and handle all that is ready; False if the time was over before anything came.
+
+        Each entity in a wait costs time, and most of a node's are services that hardly anybody calls. So
+        while a node is busy they are left out, until it has been so for `BUSY_S`.
+        """
+        if time.monotonic() - self._looked_s < BUSY_S and self._wait(BUSY_S, all=False):
+            return True
+        handled = self._wait(timeout_s, all=True)
+        self._looked_s = time.monotonic()
+        return handled
+
+    def _wait(self, timeout_s: float | None, *, all: bool) -> bool:
         timers = [timer for node in self._nodes for timer in node.timers]
         subscriptions = [subscription for node in self._nodes for subscription in node.subscriptions]
-        services = [service for node in self._nodes for service in node.services]
-        clients = [client for node in self._nodes for client in node.clients]
+        services = [service for node in self._nodes for service in node.services if all]
+        clients = [client for node in self._nodes for client in node.clients if all]
         wait_set = self._emptied(len(subscriptions), 1, len(timers), len(clients), len(services))
         timer_at = [wait_set.add_timer(timer.handle) for timer in timers]
         subscription_at = [wait_set.add_subscription(entity.handle) for entity in subscriptions]
@@ -82,7 +96,7 @@ class DirectExecutor:
         ready = [
             *((_call_timer, timers[i]) for i, at in enumerate(timer_at) if wait_set.is_ready("timer", at)),
             *(
-                (_take_messages, subscriptions[i])
+                (self._take_messages, subscriptions[i])
                 for i, at in enumerate(subscription_at)
                 if wait_set.is_ready("subscription", at)
             ),
@@ -96,6 +110,18 @@ class DirectExecutor:
             except InvalidHandle:  # an earlier callback of this turn has destroyed it
                 continue
         return bool(ready) or woken
+
+    def _take_messages(self, subscription: Any) -> None:
+        with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
+        for _ in range(self._at_once):
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                return
+            if with_info:
+                subscription.callback(*taken)
+            else:
+                subscription.callback(taken[0])
 
     def _emptied(self, *capacity: int) -> Any:
         """The wait set, empty, with room for subscriptions, guards, timers, clients, services."""
@@ -115,19 +141,6 @@ def _call_timer(timer: Any) -> None:
             return
         timer.handle.call_timer()
     timer.callback()
-
-
-def _take_messages(subscription: Any) -> None:
-    with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
-    for _ in range(TURN_MAX):
-        with subscription.handle:
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-        if taken is None:
-            return
-        if with_info:
-            subscription.callback(*taken)
-        else:
-            subscription.callback(taken[0])
 
 
 def _serve(service: Any) -> None:

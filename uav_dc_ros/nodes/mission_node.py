@@ -59,6 +59,7 @@ class MissionNode(LifecycleNode):
         rest_s: pause after each turn of its executor: see there.
         values: values of its parameters; they are checked when it is configured.
         failure: why the last transition was refused.
+        published_ns: when the message that is being handled was published, nanoseconds since the epoch.
     """
 
     drains = False
@@ -72,6 +73,7 @@ class MissionNode(LifecycleNode):
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.values: dict[str, Any] = {}
         self.failure: UavDcError | None = None
+        self.published_ns = 0
         self.publishers_of: dict[str, Publisher] = {}
         self.subscriptions_of: dict[str, Any] = {}
         self._timers_active: list[Any] = []
@@ -274,13 +276,14 @@ class MissionNode(LifecycleNode):
         payload = messages.PAYLOADS.get(topic.name)
 
         def hear(message: Any, info: Any) -> None:
+            self.published_ns = info["source_timestamp"]
             try:
                 if payload is not None:
                     message = messages.decode(convert.text_in_cdr(message), payload)
                 handle(message)
             except MessageError as error:
                 self.reject(topic.name, error)
-            self.meter.heard(topic.name, time.time_ns() - info["source_timestamp"])
+            self.meter.heard(topic.name, time.time_ns() - self.published_ns)
 
         return self.create_quiet_subscription(topic, hear, raw=payload is not None)
 

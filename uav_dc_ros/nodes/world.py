@@ -231,7 +231,7 @@ class World(MissionNode):
 
     def _status(self) -> messages.Mission:
         assert self._phase is not None, "a mission has begun"
-        east, north, up = (int(index) for index in self._cell)
+        east, north, up = self._cell.tolist()
         return messages.Mission(
             mission=self._mission,
             step=self._step,
