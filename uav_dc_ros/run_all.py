@@ -119,11 +119,9 @@ def _prepare_ros(*, alone: bool) -> None:
     # Nobody else on the network should see these nodes by accident.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST" if alone else "SUBNET")
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "{severity}: {message}")
-    # Jazzy's Fast DDS reads the first name, later ones the second.
-    names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-    if not any(name in os.environ for name in names):
-        profiles = str(Path(__file__).parent / "nodes" / "fastdds.xml")
-        os.environ.update(dict.fromkeys(names, profiles))
+    from uav_dc_ros.nodes import fastdds
+
+    fastdds.use_profiles()
 
 
 def _pace(text: str) -> float | None:

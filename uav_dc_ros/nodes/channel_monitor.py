@@ -116,8 +116,8 @@ class ChannelMonitor(MissionNode):
         if now < before and published_ns <= self._heard_ns:
             raise MessageError(
                 "stale_step",
-                f"mission, step {now} after {before}: a middleware that lost its peer for a while and found it "
-                "again repeats what it had said",
+                f"mission, step {now} after {before}: a middleware that lost its peer for a while, and found "
+                "it again, repeats what it had said",
             )
         self._heard_ns = published_ns
         if now < before or users.mission != before[0]:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -13,6 +14,7 @@ from rich.table import Table
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes.observer import MissionSoFar, Summary
 
+REFRESH_S = 0.05
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
 
 
@@ -48,18 +50,24 @@ class Display:
             console=self.console,
             disable=not self.console.is_terminal,
         )
+        self._next_s = 0.0  # when the next step is shown
         self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, told="")
 
     def step(self, now: MissionSoFar) -> None:
-        """Show a step."""
+        """Show a step: on a terminal a few times a second, elsewhere a few lines a mission."""
+        shown = now.step % self._every == 0 if self._bar.disable else time.monotonic() >= self._next_s
+        if not (shown or now.over):
+            return
+        self._next_s = time.monotonic() + REFRESH_S
         title = "mission" if self.missions == 1 else f"mission {now.mission + 1} of {self.missions}"
         told = (
             f"{now.users_collected}/{self.scenario.n_users} users, "
             f"{now.sum_rate_bps / 1e6:.2f} Mbit/s, {now.dock_distance_m:.0f} m to the dock"
         )
-        self._bar.update(self._task, description=title, completed=now.step, told=told)
-        if self._bar.disable and (now.step % self._every == 0 or now.over):
+        if self._bar.disable:
             self.console.print(f"{title}: step {now.step}/{self.scenario.mission.max_steps}: {told}")
+        else:
+            self._bar.update(self._task, description=title, completed=now.step, told=told)
 
     def node_line(self, node: str, line: str) -> None:
         """Pass on a line that a node printed."""

@@ -130,7 +130,7 @@ class Flight:
         node.close()
         flown = len(self.summaries)
         if flown < self.options.missions:
-            not_begun = MissionSoFar(mission=flown, seed=self.options.seed + flown)
+            not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.options.seed + flown)
             now = node.mission or not_begun
             self._on_end(now if now.mission == flown else not_begun, Phase.ABORTED)
 

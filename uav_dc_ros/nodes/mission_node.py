@@ -34,8 +34,8 @@ from uav_dc_ros.topics import TOPICS, Topic
 
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this node has been started again
 PEERS_PERIOD_S = 0.02
-# Messages arrive at once, but the middleware may ask for receipts every three seconds only.
-ACKNOWLEDGE_S = 0.5
+# For the last words to be acknowledged: a bad link takes a while, and a peer that was killed never does.
+ACKNOWLEDGE_S = 1.5
 ANOTHER_MISSION = (
     "another mission is being flown here: somebody else publishes `mission`. Give this one a network of its "
     "own (export ROS_DOMAIN_ID=1, or any number up to 101), or a namespace"

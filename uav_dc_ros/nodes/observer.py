@@ -1,5 +1,6 @@
 """run_all's own eyes: follows the missions, for the progress display and the summary."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +11,6 @@ import rclpy
 
 from uav_dc_ros import messages
 from uav_dc_ros.core import world as core
-from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes import convert
@@ -50,20 +50,58 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(kw_only=True)
 class MissionSoFar:
-    """A mission so far."""
+    """A mission so far. What few ask for is worked out when it is asked for.
 
+    Attributes:
+        scenario: the world that is flown.
+        mission, seed, step: index of the mission, seed of its users, steps flown.
+        cell: where the UAV is.
+        rates: what was measured last.
+        distance_m: length of the path flown, metres.
+        over: has it come to its end?
+        sum_of_sum_rates_bps: sum-rates of all measured steps, added up, bit/s.
+        unheard_steps: that were flown while nobody measured them.
+    """
+
+    scenario: Scenario
     mission: int = 0
     seed: int
     step: int = 0
-    users_collected: int = 0
-    data_bits: float = 0.0
-    sum_rate_bps: float = 0.0  # of this step
-    dock_distance_m: float = 0.0
+    cell: tuple[int, int, int] | None = None
+    rates: messages.Rates | None = None
     distance_m: float = 0.0
-    reward: float = 0.0
     over: bool = False
     sum_of_sum_rates_bps: float = 0.0
-    unheard_steps: int = 0  # that were flown while nobody measured them
+    unheard_steps: int = 0
+
+    @property
+    def users_collected(self) -> int:
+        """Users who have given enough data."""
+        return sum(self.rates.collected) if self.rates else 0
+
+    @property
+    def data_bits(self) -> float:
+        """Data collected from all users, bit."""
+        return float(np.sum(self.rates.data_bits)) if self.rates else 0.0
+
+    @property
+    def sum_rate_bps(self) -> float:
+        """Sum-rate of the last step, bit/s."""
+        return self.rates.sum_rate_bps if self.rates else 0.0
+
+    @property
+    def dock_distance_m(self) -> float:
+        """Distance to the dock, metres."""
+        cell = np.asarray(self.cell or self.scenario.start_cell)
+        return float(core.dock_distance_m(self.scenario, cell, like=np.zeros(1)))
+
+    @property
+    def reward(self) -> float:
+        """r^t (eq. 7); 0 before the first step."""
+        if self.rates is None or not self.step:
+            return 0.0
+        data_bits, _ = convert.collection(self.rates, self.scenario)
+        return float(core.total_reward(self.scenario, np.asarray(self.cell), data_bits))
 
 
 class Observer(MissionNode):
@@ -100,7 +138,7 @@ class Observer(MissionNode):
     def activate(self) -> None:
         """Follow from here on."""
         self._steps = StepPairs()
-        self._position_m: Array = None  # before the first step
+        self._position_m: list[float] = []  # before the first step
         self._ended: dict[int, messages.Phase] = {}  # missions that are over, and how
         self._ended_s = 0.0  # when the last one was
 
@@ -132,25 +170,18 @@ class Observer(MissionNode):
         now = self.mission
         if now is not None and (mission.mission, mission.step) <= (now.mission, now.step):
             return  # a repeated step
-        data_bits, collected = convert.collection(rates, self.scenario)
-        cell = np.asarray(mission.cell)
-        position_m = self.scenario.grid.centre_m(cell, like=data_bits)
+        position_m = self.scenario.grid.centre_m(np.asarray(mission.cell), like=np.zeros(1)).tolist()
         if now is None or mission.mission > now.mission:
             self.close()
-            now = MissionSoFar(mission=mission.mission, seed=mission.seed)
+            now = MissionSoFar(scenario=self.scenario, mission=mission.mission, seed=mission.seed)
             now.unheard_steps = mission.step
         else:
             now.sum_of_sum_rates_bps += rates.sum_rate_bps
-            now.distance_m += float(np.linalg.norm(position_m - self._position_m))
+            now.distance_m += math.dist(position_m, self._position_m)
             now.unheard_steps += mission.step - now.step - 1
         self.mission, self._position_m = now, position_m
-        now.reward = float(core.total_reward(self.scenario, cell, data_bits)) if mission.step else 0.0
+        now.step, now.cell, now.rates = mission.step, mission.cell, rates
         now.over = mission.phase.is_over
-        now.step = mission.step
-        now.users_collected = int(collected.sum())
-        now.data_bits = float(data_bits.sum())
-        now.sum_rate_bps = rates.sum_rate_bps
-        now.dock_distance_m = float(core.dock_distance_m(self.scenario, cell, like=data_bits))
         self._on_step(now)
         if now.over:
             self._on_end(now, mission.phase)

@@ -15,11 +15,12 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros.errors import UavDcError
+from uav_dc_ros.nodes import fastdds
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.mission_node import SUPERVISED, MissionNode
 
 DRAIN_S = 2.0
-DRAIN_QUIET_S = 0.05
+DRAIN_QUIET_S = 0.2  # a message that was lost on the way is sent again within a tenth
 LEAVE_S = 1.0
 # Exit statuses. Python's own 1 is left to what nobody thought of: only that is worth another try.
 NOT_BEGUN = 2
@@ -61,6 +62,7 @@ class Stopper:
 def main(make: Callable[[], MissionNode]) -> NoReturn:
     """Run one node until it is asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`."""
     status = NOT_BEGUN
+    fastdds.use_profiles()
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make()

@@ -1,0 +1,151 @@
+"""What the nodes tell about themselves: diagnostics, the clock, peers that do not match."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Ros, finish, read_bag, wait_for
+from uav_dc_ros.nodes.table import NODES
+
+LISTENER = """
+import json, sys, time
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+rclpy.init()
+node = rclpy.create_node("listener")
+told = []
+qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+node.create_subscription(
+    Clock, sys.argv[1], lambda m: told.append((time.monotonic(), m.clock.sec + m.clock.nanosec * 1e-9)), qos
+)
+end = time.monotonic() + 30
+while time.monotonic() < end and len(told) < int(sys.argv[2]):
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(json.dumps(told))
+"""
+DEMANDING = """
+import sys, time
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+rclpy.init()
+node = rclpy.create_node("demanding", namespace="/somebody")
+node.create_subscription(
+    PoseStamped, "/pose", print, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+)
+print("listening", flush=True)
+rclpy.spin(node)
+"""
+
+
+@pytest.fixture
+def options(small_scenario: Path, small_policy: Path) -> list[object]:
+    """A small mission of three seconds: steps of a tenth of a second."""
+    return ["--scenario", small_scenario, "--policy", small_policy, "--pace", 100]
+
+
+def python(ros: Ros, program: str, *arguments: object) -> subprocess.Popen[str]:
+    """Run a program of a few lines beside the nodes."""
+    return subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        env=ros.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def diagnostics(bag: Path) -> dict[str, list[tuple[Any, dict[str, str]]]]:
+    """Statuses and values by node."""
+    found: dict[str, list[tuple[Any, dict[str, str]]]] = {}
+    for name, message in read_bag(bag):
+        if name.endswith("/diagnostics"):
+            for status in message.status:
+                values = {pair.key: pair.value for pair in status.values}
+                found.setdefault(status.name, []).append((status, values))
+    return found
+
+
+def test_every_node_tells_of_itself_once_a_second(ros: Ros, options: list[object]) -> None:
+    bag = ros.folder / "bag"
+    status, output = ros.run_all(*options, "--bag", bag)
+    assert status == 0, output
+    told = diagnostics(bag)
+    assert set(told) == {name for name, row in NODES.items() if not row.on_request}
+    assert all(2 <= len(each) <= 6 for each in told.values()), {n: len(e) for n, e in told.items()}
+    for each in told.values():
+        assert {status.level for status, _ in each} <= {b"\0", 0, 1}  # a warning: a busy machine is late
+        assert each[-1][1]["state"] == "active"
+        assert each[-1][1]["restarts"] == "0"
+    _, world = told["world"][-1]
+    assert world["phase"] == "ready"
+    assert float(world["pose said [Hz]"]) == pytest.approx(10.0, rel=0.3)
+    assert float(world["move heard [Hz]"]) == pytest.approx(10.0, rel=0.3)
+    assert 0.0 < float(world["move latency p50 [ms]"]) <= float(world["move latency p99 [ms]"]) < 100.0
+    assert float(world["step lateness p99 [ms]"]) < 100.0
+    assert {"step overruns", "hovered steps"} <= set(world)
+    assert float(told["channel_monitor"][-1][1]["users heard [Hz]"]) == pytest.approx(10.0, rel=0.3)
+    assert told["observer"][-1][1]["restarts of policy"] == "0"
+
+
+def test_the_clock_is_mission_time_and_the_nodes_go_by_it(ros: Ros, options: list[object]) -> None:
+    listener = python(ros, LISTENER, "/uav1/clock", 30)
+    bag = ros.folder / "bag"
+    status, output = ros.run_all(*options, "--namespace", "uav1", "--bag", bag)
+    assert status == 0, output
+    told = json.loads(listener.communicate(timeout=40)[0])
+    assert len(told) == 30
+    times_s = [time_s for _, time_s in told]
+    assert times_s == sorted(times_s)
+    passed_s, flown_s = told[-1][0] - told[0][0], times_s[-1] - times_s[0]
+    assert flown_s / passed_s == pytest.approx(100.0, rel=0.2)
+    stamps = {
+        name: [status_time(message) for topic, message in read_bag(bag) if is_of(topic, message, name)]
+        for name in ("policy", "world")
+    }
+    assert max(stamps["policy"]) <= 31 * 10.0, "the policy goes by the mission's clock"
+    assert min(stamps["world"]) > 1e9, "the world makes that clock, and goes by its own"
+
+
+def is_of(topic: str, message: Any, node: str) -> bool:
+    """Are these the diagnostics of a node."""
+    return topic == "/uav1/diagnostics" and message.status[0].name == f"uav1/{node}"
+
+
+def status_time(message: Any) -> float:
+    """Stamp of a message, seconds."""
+    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
+
+
+def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[object]) -> None:
+    peer = python(ros, DEMANDING)
+    assert peer.stdout is not None
+    wait_for(peer.stdout, "listening")
+    status, output = ros.run_all(*options, "--no-record")
+    peer.kill()
+    peer.communicate()
+    assert status == 0, output
+    assert output.count("world: WARN: /pose: QoS does not match that of /somebody/demanding: ") == 1, output
+
+
+def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
+    """A best-effort `mission`, which nobody who asks for reliability may hear: the monitor is not asked."""
+    peer = python(ros, DEMANDING.replace("/pose", "/target").replace("TRANSIENT_LOCAL", "VOLATILE"))
+    assert peer.stdout is not None
+    wait_for(peer.stdout, "listening")
+    world = ros.start(
+        "uav_dc_ros.nodes.world",
+        *("--ros-args", "-p", f"scenario:={small_scenario}"),
+        *("-p", "qos_overrides./target.publisher.reliability:=best_effort"),
+    )
+    assert world.stdout is not None
+    told = wait_for(world.stdout, "QoS does not match")
+    assert "/target: QoS does not match that of /somebody/demanding" in told
+    world.terminate()
+    peer.kill()
+    peer.communicate()
+    assert finish(world)[0] == 0
