@@ -21,6 +21,7 @@ class Track:
         self._step_ns = round(scenario.mission.step_s * 1e9)
         self._poses: list[tuple[int, Pose]] = []  # with the time of publication
         self._targets: list[Pose] = []
+        self._start_ns = -1  # time of the mission's start
         self._now: tuple[int, int] = (-1, 0)  # mission and step, as `users` told last
         self._told_ns = -1  # when that was published
 
@@ -30,8 +31,8 @@ class Track:
             self._poses.append((published_ns, pose))
 
     def target(self, target: Pose) -> None:
-        """Add a target, while no pose has been heard."""
-        if not self._poses:
+        """Add a target of before the first pose."""
+        if target.stamp_ns >= self._start_ns and not (self._poses and target.stamp_ns >= self._first_ns):
             self._targets.append(target)
 
     def users(self, *, mission: int, step: int, stamp_ns: int, published_ns: int) -> int | None:
@@ -44,11 +45,13 @@ class Track:
         last, self._now = self._now, (mission, step)
         if mission == last[0] and step >= last[1]:
             return None
-        start_ns = stamp_ns - step * self._step_ns
+        self._start_ns = stamp_ns - step * self._step_ns
         self._poses = [
-            (at_ns, pose) for at_ns, pose in self._poses if at_ns > before_ns and pose.stamp_ns >= start_ns
+            (at_ns, pose)
+            for at_ns, pose in self._poses
+            if at_ns > before_ns and pose.stamp_ns >= self._start_ns
         ]
-        self._targets = [target for target in self._targets if target.stamp_ns >= start_ns]
+        self._targets = [target for target in self._targets if target.stamp_ns >= self._start_ns]
         return before_ns
 
     @property
@@ -56,6 +59,10 @@ class Track:
         """Its poses so far, in order."""
         if not self._poses:
             return self._targets
-        first_ns = self._poses[0][1].stamp_ns
-        missed = [target for target in self._targets if target.stamp_ns < first_ns]
+        missed = [target for target in self._targets if target.stamp_ns < self._first_ns]
         return missed + [pose for _, pose in self._poses]
+
+    @property
+    def _first_ns(self) -> int:
+        """Time of the first pose that was heard."""
+        return self._poses[0][1].stamp_ns
