@@ -15,7 +15,7 @@ setup(
     ],
     package_dir={f"uav_dc_ros.{folder}": folder for folder in DATA_FOLDERS},
     package_data={
-        "uav_dc_ros": ["py.typed"],
+        "uav_dc_ros": ["py.typed", "share/foxglove/*.json"],
         "uav_dc_ros.nodes": ["*.xml"],
         "uav_dc_ros.scenarios": ["*.toml"],
         "uav_dc_ros.policies": ["*/*"],

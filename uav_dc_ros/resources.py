@@ -6,7 +6,7 @@ _PACKAGE = Path(__file__).parent
 
 
 def folder(name: str) -> Path:
-    """The folder `policies` or `msgs_json`.
+    """The folder `policies`, `msgs_json` or one in `share`.
 
     Raises:
         FileNotFoundError: an installation without it.

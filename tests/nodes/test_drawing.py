@@ -53,7 +53,7 @@ def scene(**changed: Any) -> Scene:
 
 
 def rewritten(data: bytes, type: str) -> bytes:
-    """A message, read and written by rosbags. (ROS itself leaves rubbish in the gaps.)"""
+    """A message, read and written by rosbags; ROS itself leaves rubbish in the gaps."""
     store = get_typestore(Stores.ROS2_JAZZY)
     return bytes(store.serialize_cdr(store.deserialize_cdr(data, type), type))
 
@@ -115,9 +115,7 @@ def test_the_users_colours_differ_in_lightness_too() -> None:
 
 def test_the_discs_are_the_clusters() -> None:
     discs = read(drawing.markers(SCENARIO, scene()))["clusters"]
-    assert [(m.pose.position.x, m.pose.position.y) for m in discs] == list(
-        SCENARIO.users.cluster_centres_m
-    )
+    assert [(m.pose.position.x, m.pose.position.y) for m in discs] == list(SCENARIO.users.cluster_centres_m)
     for marker in discs:
         assert marker.type == Marker.CYLINDER
         assert marker.scale.x == marker.scale.y == 2 * SCENARIO.users.cluster_radius_m

@@ -29,7 +29,7 @@ def distance(uav_m: Array, users_m: Array) -> Array:
 
 
 def ground_reach_m(distance_m: float, altitude_m: float) -> float:
-    """How far from the point below the UAV a user on the ground is within a 3D distance (eq. 1 solved for it).
+    """Radius of the circle on the ground within a 3D distance of the UAV (eq. 1, solved for it).
 
     Args:
         distance_m: greatest 3D distance, metres.

@@ -1,7 +1,7 @@
 """Messages written and read serialised, where an object for each point or pose would cost too much.
 
-The format is CDR (OMG's XCDR1, little endian): a number stands at a multiple of its own size, counted from the
-first byte after the head; a text has its length in front, and a zero at its end, which counts.
+The format is CDR (OMG's XCDR1, little endian): a number stands at a multiple of its own size, counted from
+the first byte after the head; a text has its length in front, and a zero at its end, which counts.
 """
 
 import math
