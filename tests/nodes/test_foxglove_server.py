@@ -1,5 +1,6 @@
 """The server alone, with a client that speaks its protocol by hand."""
 
+import socket
 import sys
 import threading
 import time
@@ -11,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from tests.nodes.foxglove_client import FoxgloveClient, is_free
 from uav_dc_ros.errors import NodeError, ParameterError
 from uav_dc_ros.nodes.convert import cdr_of_text
-from uav_dc_ros.nodes.foxglove_server import FoxgloveServer
+from uav_dc_ros.nodes.foxglove_server import FoxgloveServer, check
 from uav_dc_ros.topics import TOPICS
 
 ROWS = {f"/{row.name}": row for row in TOPICS.values()}
@@ -105,17 +106,34 @@ def test_a_stopped_server_is_gone(server: FoxgloveServer) -> None:
 
 
 def test_a_port_in_use_is_named(server: FoxgloveServer) -> None:
-    with pytest.raises(ParameterError, match=rf"port: {server.port} at .*in use.*expected a free port"):
+    told = rf"port: {server.port} at .*in use.*expected a free port"
+    with pytest.raises(ParameterError, match=told):
         serve(server.port)
+    with pytest.raises(ParameterError, match=told):
+        check(address="127.0.0.1", port=server.port)
 
 
 @pytest.mark.parametrize("address", ["192.0.2.1", "no such host"])
 def test_an_address_that_is_not_this_machine_s_is_named(address: str) -> None:
-    with pytest.raises(ParameterError, match=rf"'{address}'.*expected a free port of this machine"):
+    told = rf"'{address}'.*expected a free port of this machine"
+    with pytest.raises(ParameterError, match=told):
         serve(address=address)
+    with pytest.raises(ParameterError, match=told):
+        check(address=address, port=0)
+
+
+def test_a_port_that_was_only_checked_is_free_still() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    check(address="127.0.0.1", port=port)
+    serve(port).stop()
+    check(address="127.0.0.1", port=port)
 
 
 def test_without_the_sdk_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(NodeError, match=r"no module foxglove; pip install 'uav_dc_ros\[live\]'"):
+    told = r"no module foxglove; pip install 'uav_dc_ros\[live\]'"
+    with pytest.raises(NodeError, match=told):
         serve()
+    with pytest.raises(NodeError, match=told):
+        check(address="127.0.0.1", port=0)

@@ -18,7 +18,8 @@ Rgba = tuple[float, float, float, float]
 Xyz = tuple[float, float, float]
 
 USER_CELLS = 0.16  # diameter of a user, in cells, where they do not crowd
-USER_SPACING = 0.6  # and of its share of the cluster's disc, where they do
+USER_SPACING = 0.6  # and of its share of the cluster's disc, where they do ...
+USER_CELLS_MIN = 0.03  # ... down to this: a speck that is too small shows nothing
 SERVED_SCALE = 1.5  # a user being served is larger: told without colour, too
 UAV_CELLS = 0.3
 DOCK_CELLS = 0.5
@@ -149,7 +150,8 @@ def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
     crowded_m = (
         USER_SPACING * scenario.users.cluster_radius_m / float(np.sqrt(scenario.users.users_per_cluster))
     )
-    width_m = min(USER_CELLS * scenario.grid.cell_m, crowded_m)
+    cell_m = scenario.grid.cell_m
+    width_m = min(USER_CELLS * cell_m, max(crowded_m, USER_CELLS_MIN * cell_m))
     states = user_states(scene.served, scene.collected)
     shapes = []
     for state, colour in USER_COLOURS.items():

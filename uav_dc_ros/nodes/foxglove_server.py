@@ -4,6 +4,8 @@ The SDK's server keeps nothing for clients that come later. This one does: whoev
 gets its last message at once.
 """
 
+import importlib.util
+import socket
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +13,27 @@ from typing import Any
 from uav_dc_ros.bags.definitions import ENCODING, definition
 from uav_dc_ros.errors import NodeError, ParameterError
 from uav_dc_ros.topics import Topic
+
+MISSING = "the live view needs foxglove-sdk: no module foxglove; pip install 'uav_dc_ros[live]'"
+
+
+def check(*, address: str, port: int) -> None:
+    """See whether a server could be started, before anything is.
+
+    Raises:
+        NodeError, ParameterError: as FoxgloveServer does.
+    """
+    if importlib.util.find_spec("foxglove") is None:
+        raise NodeError(MISSING)
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    try:
+        socket.create_server((address, port), family=family).close()
+    except OSError as error:
+        raise ParameterError(_no_port(address, port, error.strerror or str(error))) from None
+
+
+def _no_port(address: str, port: int, why: str) -> str:
+    return f"port: {port} at address {address!r}: {why}; expected a free port of this machine (0: any)"
 
 
 class FoxgloveServer:
@@ -32,10 +55,8 @@ class FoxgloveServer:
     def __init__(self, *, name: str, address: str, port: int, topics: Mapping[str, Topic]) -> None:
         try:
             import foxglove
-        except ModuleNotFoundError as error:
-            raise NodeError(
-                f"the live view needs foxglove-sdk: no module {error.name}; pip install 'uav_dc_ros[live]'"
-            ) from None
+        except ModuleNotFoundError:
+            raise NodeError(MISSING) from None
         self._context = foxglove.Context()  # with the last reference to it, its channels would close
         self._last: dict[int, tuple[bytes, int]] = {}  # of latched topics, by channel: message, and its time
         self._lock = threading.Lock()  # the SDK calls from its own threads; no older message may come last
@@ -46,9 +67,7 @@ class FoxgloveServer:
             )
         except RuntimeError as error:
             why = str(error).removeprefix("FoxgloveError: ")
-            raise ParameterError(
-                f"port: {port} at address {address!r}: {why}; expected a free port of this machine (0: any)"
-            ) from None
+            raise ParameterError(_no_port(address, port, why)) from None
         self._topics = topics
         self._channels = {
             full_name: foxglove.Channel(

@@ -42,7 +42,9 @@ class LiveView(MissionNode):
         given = self.values["address"]
         host = ANYWHERE.get(given, given)
         where = f"[{host}]" if ":" in host else host
-        layout = resources.folder(LAYOUT_FOLDER) / LAYOUT
+        layout = str(resources.folder(LAYOUT_FOLDER) / LAYOUT)
+        if self.get_namespace() != "/":
+            layout += f" (put {self.get_namespace()} in front of its topics)"
         self.get_logger().info(
             f"live view: ws://{where}:{self._view.port} (Foxglove: Open connection, Foxglove WebSocket); "
             f"layout: {layout}"
