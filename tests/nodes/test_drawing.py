@@ -255,6 +255,18 @@ def test_a_new_mission_starts_a_new_path_whatever_the_order_of_topics() -> None:
     assert flight.steps == [(1.0, float(step)) for step in range(5)]
 
 
+def test_what_is_flown_between_two_missions_belongs_to_none() -> None:
+    """An aircraft tells its pose all the time."""
+    flight = Flight(Track(SCENARIO))
+    for call in flight.step(0, 60):
+        call()
+    between = cdr.Pose(serialize_message(convert.pose(np.array([9.0, 9.0, 100.0]), 61 * STEP_NS - 1)))
+    flight.track.pose(between, flight.published_ns())
+    for call in flight.step(1, 0):
+        call()
+    assert flight.steps == [(1.0, 0.0)]
+
+
 def test_a_step_that_is_repeated_is_one_pose() -> None:
     flight = Flight(Track(SCENARIO))
     for step in (0, 1, 1, 1, 2):

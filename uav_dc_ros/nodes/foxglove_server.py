@@ -29,7 +29,8 @@ def check(*, address: str, port: int) -> None:
     try:
         socket.create_server((address, port), family=family).close()
     except OSError as error:
-        raise ParameterError(_no_port(address, port, error.strerror or str(error))) from None
+        why = str(error.strerror).partition(" (while")[0]  # Python repeats the address there
+        raise ParameterError(_no_port(address, port, why)) from None
 
 
 def _no_port(address: str, port: int, why: str) -> str:
