@@ -7,7 +7,7 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def folder(name: str) -> Path:
-    """The folder `policies` or `msgs_json`.
+    """The folder `policies`, `msgs_json` or one in `share`.
 
     Raises:
         FileNotFoundError: an installation without it.

@@ -170,3 +170,12 @@ def test_float32_stays_float32(interference):
     assert radio.rate_bps(sinr, 1e6).dtype == torch.float32
     plain = radio.sinr(gain.numpy(), 5.0, 1e-14, interference, gain.numpy() > 0.0)
     assert radio.rate_bps(plain, 1e6).dtype == np.float32
+
+
+def test_the_reach_on_the_ground_is_where_the_distance_is_the_greatest_one():
+    reach_m = radio.ground_reach_m(250.0, 150.0)
+    assert reach_m == pytest.approx(200.0)
+    uav_m, users_m = np.array([10.0, 20.0, 150.0]), np.array([[10.0 + reach_m, 20.0]])
+    np.testing.assert_allclose(radio.distance(uav_m, users_m), [250.0], **EXACT)
+    assert radio.ground_reach_m(250.0, 250.0) == 0.0
+    assert radio.ground_reach_m(250.0, 300.0) == 0.0

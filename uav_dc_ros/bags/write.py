@@ -13,8 +13,8 @@ from typing import Self
 
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
-from rosbags.typesys import Stores, get_typestore
 
+from uav_dc_ros.bags.definitions import ENCODING, TYPESTORE, definition
 from uav_dc_ros.bags.mend import mend_parts
 from uav_dc_ros.bags.metadata import FILE_NAME, METADATA_NAME, Part, to_yaml, total, write_metadata
 from uav_dc_ros.bags.part import FolderLock, PartWriter, number, part_paths
@@ -37,7 +37,6 @@ class BagWriter:
 
     def __init__(self, folder: Path, about: Mapping[str, str], *, resume: bool = False) -> None:
         self.folder = folder
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._earlier: list[Part] = []
@@ -100,13 +99,10 @@ class BagWriter:
                 raise BagError(f"topic {name} is of type {type}; expected {row['type']}, as in earlier parts")
             if self._whole.counts[name]:
                 qos = row["offered_qos_profiles"]
-        if type not in self._typestore.fielddefs:
-            raise BagError(f"topic {name} is of type {type!r}; expected a type of ROS 2 Jazzy")
-        told = {"offered_qos_profiles": to_yaml(qos), "topic_type_hash": self._typestore.hash_rihs01(type)}
         try:
             if type not in self._schemas:
-                definition, _ = self._typestore.generate_msgdef(type, ros_version=2)
-                self._schemas[type] = self._writer.add_schema(type, "ros2msg", definition.encode())
+                self._schemas[type] = self._writer.add_schema(type, ENCODING, _definition(name, type))
+            told = {"offered_qos_profiles": to_yaml(qos), "topic_type_hash": TYPESTORE.hash_rihs01(type)}
             self._channels[name] = self._writer.add_channel(name, "cdr", self._schemas[type], told)
         except OSError as error:  # a definition may be what fills the chunk
             raise self._failure(error) from None
@@ -179,3 +175,10 @@ def _earlier_parts(folder: Path) -> list[Part]:
         raise BagError(f"folder {folder} holds files, but no MCAP file; expected a bag to go on with")
     parts, _ = mend_parts(folder)
     return parts
+
+
+def _definition(topic: str, type: str) -> bytes:
+    try:
+        return definition(type)
+    except BagError as error:
+        raise BagError(f"topic {topic} is of type {error}") from None

@@ -30,6 +30,19 @@ def distance(uav_m: Array, users_m: Array) -> Array:
     return xp.sqrt(dx * dx + dy * dy + dz * dz)
 
 
+def ground_reach_m(distance_m: float, altitude_m: float) -> float:
+    """Radius of the circle on the ground within a 3D distance of the UAV (eq. 1, solved for it).
+
+    Args:
+        distance_m: greatest 3D distance, metres.
+        altitude_m: altitude of the UAV, metres.
+
+    Returns:
+        Horizontal distance, metres; 0 where the UAV is higher than `distance_m`.
+    """
+    return math.sqrt(max(distance_m * distance_m - altitude_m * altitude_m, 0.0))
+
+
 def path_gain(distance_m: Array, ref_gain: float, exponent: float = 2.0) -> Array:
     """Channel power gain of a line-of-sight link, `beta_0 d^-exponent` (eq. 2).
 

@@ -10,7 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from uav_dc_ros.core import mission, world
+from uav_dc_ros.core import mission, radio, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 
@@ -111,7 +111,7 @@ def _draw_field(axes: Axes, track: Track) -> None:
         axes.annotate(text, (x_m, y_m), (0, lift), textcoords="offset points", color=INK, size=9, ha="center")
 
     altitude_m = float(scenario.grid.centre_m(track.cells[-1], like=state.users_m)[2])
-    reach_m = np.sqrt(max(scenario.mission.d_cons_m**2 - altitude_m**2, 0.0))
+    reach_m = radio.ground_reach_m(scenario.mission.d_cons_m, altitude_m)
     x_m, y_m = path_m[-1]
     axes.add_patch(Circle((x_m, y_m), reach_m, fill=False, ec=INK, lw=0.9, ls=(0, (5, 4)), zorder=2))
     axes.scatter(x_m, y_m, marker="^", s=90, c="#f2c14e", edgecolors=INK, lw=1.1, zorder=8, label="UAV")

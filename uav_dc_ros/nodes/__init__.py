@@ -8,6 +8,9 @@ world            the vehicle in simulation, and the users who walk about
 channel_monitor  SINR, rates, and the data collected
 policy           decides moves with a trained policy
 recorder         writes the bag
+visualizer       draws path and markers; track knows which poses belong to the mission, drawing and cdr make
+                 the messages
+live_view        serves the mission to Foxglove; foxglove_server is its server
 observer         run_all's own eyes: progress and summary
 launcher         starts, watches and stops the nodes of a mission
 executable       what `ros2 run` starts: any of the nodes, by the name that it is called

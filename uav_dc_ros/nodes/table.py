@@ -73,8 +73,9 @@ NODES: dict[str, NodeRow] = {
         NodeRow(
             name="visualizer",
             publishes=("path", "markers", "ready", "diagnostics"),
-            subscribes=("pose", "users", "rates", "mission"),
+            subscribes=("pose", "target", "users", "rates", "mission"),
             parameters=(p.SCENARIO, p.RATE_HZ),
+            hears_all=True,
             needed=False,
             on_request=True,
         ),

@@ -1,0 +1,107 @@
+"""A client of Foxglove's WebSocket protocol, written by hand after its specification.
+
+It shares no code with the server.
+"""
+
+import json
+import socket
+import struct
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from websockets.sync.client import connect
+
+SUBPROTOCOL = "foxglove.sdk.v1"
+MESSAGE = struct.Struct("<BIQ")  # operation, subscription, time in nanoseconds
+MESSAGE_DATA = 1
+
+
+@dataclass
+class Heard:
+    """A message: its topic, when it was received, and what the sent schema says it is."""
+
+    topic: str
+    time_ns: int
+    content: Any
+
+
+class FoxgloveClient:
+    """A context manager: connects, and reads what the server tells at once.
+
+    Attributes:
+        server: its `serverInfo`.
+        channels: what it advertised, by topic.
+    """
+
+    def __init__(self, port: int, n_channels: int) -> None:
+        self._stack = ExitStack()
+        self._socket = self._stack.enter_context(
+            connect(f"ws://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], max_size=None)
+        )
+        self.server: dict[str, Any] = json.loads(self._socket.recv(5))
+        self.channels: dict[str, dict[str, Any]] = {}
+        while len(self.channels) < n_channels:
+            told = json.loads(self._socket.recv(5))
+            if told["op"] == "advertise":
+                self.channels |= {channel["topic"]: channel for channel in told["channels"]}
+        self._store = get_typestore(Stores.EMPTY)  # all it knows of types is what the server tells
+        for channel in self.channels.values():
+            types = get_types_from_msg(channel["schema"], channel["schemaName"])
+            self._store.register(
+                {name: kind for name, kind in types.items() if name not in self._store.types}
+            )
+
+    def open(self, *topics: str) -> None:
+        """Subscribe; the channel's number is the subscription's, too."""
+        numbers = [self.channels[topic]["id"] for topic in topics]
+        wanted = [{"id": number, "channelId": number} for number in numbers]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+    def read(self, within_s: float) -> Heard | None:
+        """The next message; None if none comes in time."""
+        deadline_s = time.monotonic() + within_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            try:
+                told = self._socket.recv(left_s)
+            except TimeoutError:
+                return None
+            if isinstance(told, bytes) and told[0] == MESSAGE_DATA:
+                _, number, time_ns = MESSAGE.unpack_from(told)
+                (channel,) = (row for row in self.channels.values() if row["id"] == number)
+                content = self._store.deserialize_cdr(told[MESSAGE.size :], channel["schemaName"])
+                return Heard(channel["topic"], time_ns, content)
+        return None
+
+    def read_until(self, enough: Callable[[list[Heard]], bool], within_s: float) -> list[Heard]:
+        """Messages until there are enough of them."""
+        heard: list[Heard] = []
+        deadline_s = time.monotonic() + within_s
+        while not enough(heard):
+            message = self.read(deadline_s - time.monotonic())
+            topics = sorted({m.topic for m in heard})
+            assert message is not None, f"nothing more came; until then there were {topics}"
+            heard.append(message)
+        return heard
+
+    def __enter__(self) -> "FoxgloveClient":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+
+def is_free(port: int) -> bool:
+    """Can somebody listen on a port, now."""
+    with socket.socket() as trial:
+        trial.setsockopt(
+            socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
+        )  # connections that have ended do not count
+        try:
+            trial.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+        return True

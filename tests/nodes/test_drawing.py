@@ -1,0 +1,304 @@
+"""What the markers and the path say, read back by ROS itself and by rosbags, which share no code with it."""
+
+import math
+import time
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path as PathMessage
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.typesys import Stores, get_typestore
+from visualization_msgs.msg import Marker, MarkerArray
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.errors import MessageError
+from uav_dc_ros.messages import Mission, Phase
+from uav_dc_ros.nodes import cdr, convert, drawing
+from uav_dc_ros.nodes.drawing import Scene, UserState
+from uav_dc_ros.nodes.track import Track
+
+SCENARIO = scenarios.load("five_clusters")
+U = SCENARIO.n_users
+MISSION = Mission(
+    mission=0,
+    step=12,
+    phase=Phase.READY,
+    cell=(3, 4, 0),
+    remaining_steps=48,
+    seed=0,
+    scenario=SCENARIO.name,
+    fingerprint=SCENARIO.fingerprint,
+)
+STEP_NS = 15 * 10**9
+
+
+def scene(**changed: Any) -> Scene:
+    """Users 0 and 1 are served, 1 and 2 collected; the UAV is over (300, 400) at 150 m."""
+    served, collected = np.zeros(U, dtype=bool), np.zeros(U, dtype=bool)
+    served[[0, 1]] = True
+    collected[[1, 2]] = True
+    known: dict[str, Any] = {
+        "time_ns": 180_000_000_007,
+        "position_m": (300.0, 400.0, 150.0),
+        "users_m": np.arange(2.0 * U).reshape(U, 2),
+        "served": served,
+        "collected": collected,
+        "mission": MISSION,
+        "sum_rate_bps": 1.234e6,
+    }
+    return Scene(**(known | changed))
+
+
+def rewritten(data: bytes, type: str) -> bytes:
+    """A message, read and written by rosbags; ROS itself leaves rubbish in the gaps."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    return bytes(store.serialize_cdr(store.deserialize_cdr(data, type), type))
+
+
+def read(data: bytes) -> dict[str, list[Any]]:
+    """The markers by namespace, as ROS reads them; rosbags must read the same."""
+    message = deserialize_message(data, MarkerArray)
+    assert rewritten(data, "visualization_msgs/msg/MarkerArray") == data
+    found: dict[str, list[Any]] = {}
+    for marker in message.markers:
+        found.setdefault(marker.ns, []).append(marker)
+    return found
+
+
+def xyz(point: Any) -> tuple[float, float, float]:
+    return point.x, point.y, point.z
+
+
+def test_every_marker_is_in_the_map_at_the_time_of_the_pose() -> None:
+    shapes = read(drawing.markers(SCENARIO, scene()))
+    assert set(shapes) == {"clusters", "dock", "users", "footprint", "uav", "status"}
+    for marker in (marker for group in shapes.values() for marker in group):
+        assert marker.header.frame_id == "map"
+        assert (marker.header.stamp.sec, marker.header.stamp.nanosec) == (180, 7)
+        assert marker.pose.orientation.w == 1.0
+        assert marker.action == Marker.ADD
+    keys = [(m.ns, m.id) for group in shapes.values() for m in group]
+    assert len(set(keys)) == len(keys)
+
+
+def test_users_are_coloured_by_state() -> None:
+    users_m = np.arange(2.0 * U).reshape(U, 2)
+    expected = {
+        UserState.SERVED: users_m[[0]],
+        UserState.COLLECTED: users_m[[1, 2]],  # one of them in the step that served it
+        UserState.WAITING: users_m[3:],
+    }
+    shapes = {marker.id: marker for marker in read(drawing.markers(SCENARIO, scene()))["users"]}
+    assert set(shapes) == set(expected)
+    for state, marker in shapes.items():
+        assert marker.type == Marker.SPHERE_LIST
+        at_m = [xyz(point) for point in marker.points]
+        assert at_m == [(x_m, y_m, 0.0) for x_m, y_m in expected[state].tolist()]
+        colour = (marker.color.r, marker.color.g, marker.color.b, marker.color.a)
+        assert colour == pytest.approx(drawing.USER_COLOURS[state], abs=1e-6)
+    assert shapes[UserState.SERVED].scale.x > shapes[UserState.WAITING].scale.x
+
+
+def test_the_users_colours_differ_in_lightness_too() -> None:
+    """CIE lightness L*, 0 to 100; equal steps look equal."""
+
+    def lightness(rgb: tuple[float, ...]) -> float:
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in rgb[:3]]
+        return 116.0 * float(np.dot([0.2126, 0.7152, 0.0722], linear)) ** (1 / 3) - 16.0
+
+    steps = np.diff(sorted(lightness(colour) for colour in drawing.USER_COLOURS.values()))
+    assert (steps > 15.0).all()
+
+
+def test_the_discs_are_the_clusters() -> None:
+    discs = read(drawing.markers(SCENARIO, scene()))["clusters"]
+    assert [(m.pose.position.x, m.pose.position.y) for m in discs] == list(SCENARIO.users.cluster_centres_m)
+    for marker in discs:
+        assert marker.type == Marker.CYLINDER
+        assert marker.scale.x == marker.scale.y == 2 * SCENARIO.users.cluster_radius_m
+        assert 0 < marker.color.a < 1
+
+
+def test_the_footprint_is_where_users_can_be_served() -> None:
+    (marker,) = read(drawing.markers(SCENARIO, scene()))["footprint"]
+    assert (marker.pose.position.x, marker.pose.position.y) == (300.0, 400.0)
+    assert marker.scale.x == marker.scale.y == pytest.approx(2 * math.sqrt(250.0**2 - 150.0**2))
+    for altitude_m in (250.0, 400.0):
+        (marker,) = read(drawing.markers(SCENARIO, scene(position_m=(300.0, 400.0, altitude_m))))["footprint"]
+        assert marker.action == Marker.DELETE
+
+
+def test_the_uav_the_dock_and_the_text() -> None:
+    shapes = read(drawing.markers(SCENARIO, scene()))
+    body, line = shapes["uav"]
+    assert xyz(body.pose.position) == (300.0, 400.0, 150.0)
+    assert [xyz(point) for point in line.points] == [(300.0, 400.0, 150.0), (300.0, 400.0, 0.0)]
+    (dock,) = shapes["dock"]
+    assert xyz(dock.pose.position) == (*SCENARIO.mission.dock_m, 0.0)
+    (text,) = shapes["status"]
+    assert text.text == "step 12 of 60\n2 of 50 users collected\n1.23 Mbit/s"
+    landed = scene(mission=msgspec.structs.replace(MISSION, step=60, phase=Phase.LANDED))
+    (text,) = read(drawing.markers(SCENARIO, landed))["status"]
+    assert text.text.startswith("step 60 of 60: landed\n")
+
+
+def test_what_is_not_known_is_not_drawn() -> None:
+    nobody = np.zeros(0, dtype=bool)
+    nothing = scene(
+        position_m=None,
+        users_m=np.empty((0, 2)),
+        served=nobody,
+        collected=nobody,
+        mission=None,
+        sum_rate_bps=None,
+    )
+    shapes = read(drawing.markers(SCENARIO, nothing))
+    for ns in ("users", "uav", "footprint", "status"):
+        assert {marker.action for marker in shapes[ns]} == {Marker.DELETE}
+    for ns in ("clusters", "dock"):
+        assert {marker.action for marker in shapes[ns]} == {Marker.ADD}
+
+
+def test_ten_thousand_users_are_drawn_within_milliseconds() -> None:
+    users = msgspec.structs.replace(SCENARIO.users, users_per_cluster=2000)
+    crowded = msgspec.structs.replace(SCENARIO, users=users)
+    users_m = np.random.default_rng(0).random((10_000, 2)) * 1000.0
+    nobody = np.zeros(10_000, dtype=bool)
+    many = scene(users_m=users_m, served=nobody, collected=nobody)
+    durations_s = []
+    for _ in range(5):
+        began_s = time.perf_counter()
+        data = drawing.markers(crowded, many)
+        durations_s.append(time.perf_counter() - began_s)
+    waiting = read(data)["users"][0]
+    assert len(waiting.points) == 10_000
+    assert xyz(waiting.points[-1]) == (*users_m[-1], 0.0)
+    assert waiting.scale.x < 5.0  # smaller where they crowd
+    assert min(durations_s) < 0.02  # an object for each takes four times that
+
+
+def test_a_path_holds_its_poses() -> None:
+    given = [convert.pose(np.array([1.5 * i, -2.0 * i, 100.0]), i * STEP_NS + i) for i in range(4)]
+    for n in range(1, 5):
+        poses = [cdr.Pose(serialize_message(pose)) for pose in given[:n]]
+        message = deserialize_message(cdr.path(poses), PathMessage)
+        assert message.poses == given[:n]
+        assert message.header == given[n - 1].header
+        assert rewritten(cdr.path(poses), "nav_msgs/msg/Path") == cdr.path(poses)
+
+
+def test_a_pose_is_read_in_either_byte_order() -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    little = serialize_message(convert.pose(np.array([1.0, 2.0, 3.0]), 4_000_000_005))
+    message = store.deserialize_cdr(little, "geometry_msgs/msg/PoseStamped")
+    big = bytes(store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped", little_endian=False))
+    for data in (little, big):
+        pose = cdr.Pose(data)
+        assert (pose.stamp_ns, pose.position_m) == (4_000_000_005, (1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize("frame", ["odom", "", "map2"])
+def test_a_pose_in_another_frame_is_refused(frame: str) -> None:
+    message = PoseStamped()
+    message.header.frame_id = frame
+    with pytest.raises(MessageError, match="expected 'map'"):
+        cdr.Pose(serialize_message(message))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_pose_that_is_nowhere_is_refused(bad: float) -> None:
+    with pytest.raises(MessageError, match="expected finite metres"):
+        cdr.Pose(serialize_message(convert.pose(np.array([0.0, bad, 0.0]), 0)))
+
+
+class Flight:
+    """Tells a Track of steps, in the order in which the world publishes them."""
+
+    def __init__(self, track: Track) -> None:
+        self.track, self.clock_ns = track, 0
+
+    def published_ns(self) -> int:
+        self.clock_ns += 1
+        return self.clock_ns
+
+    def step(self, mission: int, step: int, *, heard: tuple[str, ...] = ("pose", "users", "target")) -> Any:
+        """One step; what is told in two halves comes as the executor may hand it over."""
+        time_ns = (mission * 61 + step) * STEP_NS
+        pose = cdr.Pose(serialize_message(convert.pose(np.array([mission, step, 100.0]), time_ns)))
+        at_ns = {topic: self.published_ns() for topic in ("pose", "users", "target")}
+        told = {
+            "pose": lambda: self.track.pose(pose, at_ns["pose"]),
+            "target": lambda: self.track.target(pose),
+            "users": lambda: self.track.users(
+                mission=mission, step=step, stamp_ns=time_ns, published_ns=at_ns["users"]
+            ),
+        }
+        return [told[topic] for topic in ("pose", "target", "users") if topic in heard]
+
+    @property
+    def steps(self) -> list[tuple[float, float]]:
+        return [pose.position_m[:2] for pose in self.track.poses]
+
+
+def test_a_new_mission_starts_a_new_path_whatever_the_order_of_topics() -> None:
+    """All poses of a turn come before all users of it."""
+    flight = Flight(Track(SCENARIO))
+    turns = [(0, step) for step in range(61)] + [(1, step) for step in range(5)]
+    calls = [flight.step(*turn, heard=("pose", "users")) for turn in turns]
+    for pose, _ in calls:
+        pose()
+    for _, users in calls:
+        users()
+    assert flight.steps == [(1.0, float(step)) for step in range(5)]
+
+
+def test_what_is_flown_between_two_missions_belongs_to_none() -> None:
+    """An aircraft tells its pose all the time."""
+    flight = Flight(Track(SCENARIO))
+    for call in flight.step(0, 60):
+        call()
+    between = cdr.Pose(serialize_message(convert.pose(np.array([9.0, 9.0, 100.0]), 61 * STEP_NS - 1)))
+    flight.track.pose(between, flight.published_ns())
+    for call in flight.step(1, 0):
+        call()
+    assert flight.steps == [(1.0, 0.0)]
+
+
+def test_a_step_that_is_repeated_is_one_pose() -> None:
+    flight = Flight(Track(SCENARIO))
+    for step in (0, 1, 1, 1, 2):
+        for call in flight.step(0, step):
+            call()
+    assert flight.steps == [(0.0, 0.0), (0.0, 1.0), (0.0, 2.0)]
+
+
+def test_another_run_of_the_same_mission_starts_a_new_path() -> None:
+    flight = Flight(Track(SCENARIO))
+    for run in range(2):
+        for step in range(8 - run):
+            for call in flight.step(0, step):
+                call()
+    assert flight.steps == [(0.0, float(step)) for step in range(7)]
+
+
+@pytest.mark.parametrize("pose_first", [False, True])
+def test_who_joins_late_knows_the_way_by_the_targets(pose_first: bool) -> None:
+    """What is latched comes from where it is kept, and may be overtaken by what is said now."""
+    flight = Flight(Track(SCENARIO))
+    missed = [(0, 59), (0, 60), (1, 0), (1, 1), (1, 2)]
+    latched = [call for step in missed for call in flight.step(*step, heard=("target",))]
+    now = [call for step in [(1, 3), (1, 4)] for call in flight.step(*step)]
+    for call in now + latched if pose_first else latched + now:
+        call()
+    assert flight.steps == [(1.0, float(step)) for step in range(5)]
+
+
+def test_who_joins_after_the_end_sees_where_it_ended() -> None:
+    flight = Flight(Track(SCENARIO))
+    for step in (0, 1, 2):
+        for call in flight.step(0, step, heard=("target", "users")):
+            call()
+    assert flight.steps == [(0.0, 0.0), (0.0, 1.0), (0.0, 2.0)]

@@ -1,0 +1,139 @@
+"""The server alone, with a client that speaks its protocol by hand."""
+
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+
+from tests.nodes.foxglove_client import FoxgloveClient, is_free
+from uav_dc_ros.errors import NodeError, ParameterError
+from uav_dc_ros.nodes.convert import cdr_of_text
+from uav_dc_ros.nodes.foxglove_server import FoxgloveServer, check
+from uav_dc_ros.topics import TOPICS
+
+ROWS = {f"/{row.name}": row for row in TOPICS.values()}
+
+
+def serve(port: int = 0, address: str = "127.0.0.1") -> FoxgloveServer:
+    return FoxgloveServer(name="test", address=address, port=port, topics=ROWS)
+
+
+@pytest.fixture
+def server() -> Iterator[FoxgloveServer]:
+    server = serve()
+    yield server
+    server.stop()
+
+
+def client(server: FoxgloveServer) -> FoxgloveClient:
+    return FoxgloveClient(server.port, len(ROWS))
+
+
+def test_a_client_is_told_every_topic_with_its_type(server: FoxgloveServer) -> None:
+    with client(server) as viewer:
+        assert viewer.server["name"] == "test"
+        assert viewer.server["capabilities"] == []  # whoever looks on cannot steer
+        assert set(viewer.channels) == set(ROWS)
+        for name, channel in viewer.channels.items():
+            assert channel["encoding"] == "cdr"
+            assert channel["schemaEncoding"] == "ros2msg"
+            assert channel["schemaName"] == ROWS[name].type
+
+
+def test_bytes_and_time_arrive_as_they_were(server: FoxgloveServer) -> None:
+    with client(server) as viewer:
+        viewer.open("/mission")
+        server.send("/mission", cdr_of_text(b"now"), 1_700_000_000_123_456_789)
+        (message,) = viewer.read_until(lambda heard: len(heard) == 1, 5.0)
+    assert message.content.data == "now"
+    assert message.time_ns == 1_700_000_000_123_456_789
+
+
+def test_who_comes_late_gets_the_last_message_of_latched_topics_only(server: FoxgloveServer) -> None:
+    for text in (b"old", b"newest"):
+        for topic in ("/users", "/mission", "/move"):
+            server.send(topic, cdr_of_text(text), 7)
+    with client(server) as first:
+        first.open("/users", "/mission", "/move", "/rates")
+        heard = [(m.topic, m.content.data, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 5.0)]
+        assert sorted(heard) == [("/mission", "newest", 7), ("/users", "newest", 7)]
+        assert first.read(0.3) is None
+        with client(server) as second:
+            second.open("/users")
+            (message,) = second.read_until(lambda h: len(h) == 1, 5.0)
+            assert message.content.data == "newest"
+
+
+def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> None:
+    """The SDK calls from its own threads: nothing may wait for itself, and no older message come last."""
+    stop = threading.Event()
+
+    def send() -> None:
+        n = 0
+        while not stop.is_set():
+            n += 1
+            server.send("/mission", cdr_of_text(b"%d" % n), n)
+            time.sleep(0.0005)
+        server.send("/mission", cdr_of_text(b"last"), n + 1)
+
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    with client(server) as watcher:
+        watcher.open("/mission")
+        for _ in range(10):
+            with client(server) as visitor:
+                visitor.open("/mission")
+                assert visitor.read(5.0) is not None
+        stop.set()
+        sender.join(5.0)
+        assert not sender.is_alive()
+        heard = watcher.read_until(lambda h: bool(h) and h[-1].content.data == "last", 10.0)
+    times = [message.time_ns for message in heard]
+    assert times == sorted(times)
+
+
+def test_a_stopped_server_is_gone(server: FoxgloveServer) -> None:
+    with client(server) as viewer:
+        assert not is_free(server.port)
+        server.stop()
+        with pytest.raises(ConnectionClosed):
+            viewer.read(5.0)
+    assert is_free(server.port)
+
+
+def test_a_port_in_use_is_named(server: FoxgloveServer) -> None:
+    told = rf"port: {server.port} at .*in use.*expected a free port"
+    with pytest.raises(ParameterError, match=told):
+        serve(server.port)
+    with pytest.raises(ParameterError, match=told):
+        check(address="127.0.0.1", port=server.port)
+
+
+@pytest.mark.parametrize("address", ["192.0.2.1", "no such host"])
+def test_an_address_that_is_not_this_machine_s_is_named(address: str) -> None:
+    told = rf"'{address}'.*expected a free port of this machine"
+    with pytest.raises(ParameterError, match=told):
+        serve(address=address)
+    with pytest.raises(ParameterError, match=told):
+        check(address=address, port=0)
+
+
+def test_a_port_that_was_only_checked_is_free_still() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    check(address="127.0.0.1", port=port)
+    serve(port).stop()
+    check(address="127.0.0.1", port=port)
+
+
+def test_without_the_sdk_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    told = r"no module foxglove; pip install 'uav_dc_ros\[live\]'"
+    with pytest.raises(NodeError, match=told):
+        serve()
+    with pytest.raises(NodeError, match=told):
+        check(address="127.0.0.1", port=0)

@@ -1,0 +1,107 @@
+"""`run_all --live`: a mission over real DDS, and a client that speaks Foxglove's protocol by hand."""
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed
+
+from tests.conftest import Ros, finish, wait_for
+from tests.nodes.foxglove_client import FoxgloveClient, Heard, is_free
+from uav_dc_ros import cli, messages
+from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.topics import TOPICS
+
+SERVED = NODES["live_view"].subscribes
+LATCHED = [name for name in SERVED if TOPICS[name].latched]
+LINE = re.compile(r"live view: ws://127\.0\.0\.1:(\d+) \(Foxglove: .*\); layout: (\S+)")
+
+
+def start(ros: Ros, scenario: Path, policy: Path, *options: object) -> tuple[subprocess.Popen[str], int, str]:
+    """A flight with a live view on any port: its process, the port, and the layout's path."""
+    given = ("--scenario", scenario, "--policy", policy, "--pace", 100, "--no-record", "--live", 0)
+    flight = ros.start("uav_dc_ros.run_all", *given, *options)
+    assert flight.stdout is not None
+    told = LINE.search(wait_for(flight.stdout, "live view: "))
+    assert told is not None
+    return flight, int(told[1]), told[2]
+
+
+def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
+    flight, port, layout = start(ros, small_scenario, small_policy, "--missions", 100)
+    try:
+        assert "3D!mission" in json.loads(Path(layout).read_text())["configById"]
+        with FoxgloveClient(port, len(SERVED)) as viewer:
+            assert viewer.server["name"] == "uav_dc_ros"
+            assert {name: row["schemaName"] for name, row in viewer.channels.items()} == {
+                f"/{name}": TOPICS[name].type for name in SERVED
+            }
+            viewer.open(*viewer.channels)
+            heard = viewer.read_until(lambda h: {m.topic for m in h} == set(viewer.channels), 30.0)
+            with FoxgloveClient(port, len(SERVED)) as late:
+                late.open(*(f"/{name}" for name in LATCHED))
+                late.read_until(lambda h: {m.topic for m in h} == {f"/{name}" for name in LATCHED}, 5.0)
+    finally:
+        flight.send_signal(signal.SIGINT)
+        status, output = finish(flight)
+    assert status == cli.INTERRUPTED, output
+    assert "Traceback" not in output
+    assert is_free(port)
+
+    first: dict[str, Any] = {}
+    for message in heard:
+        assert abs(message.time_ns - time.time_ns()) < 120e9  # the wall clock's
+        first.setdefault(message.topic[1:], message.content)
+    for name, kind in messages.PAYLOADS.items():
+        if name in SERVED:
+            messages.decode(first[name].data, kind)
+    mission = json.loads(first["mission"].data)
+    assert mission["scenario"] == "small"
+    assert len(json.loads(first["users"].data)["x_m"]) == 4
+    assert first["pose"].header.frame_id == first["path"].header.frame_id == "map"
+    assert first["path"].poses
+    assert {marker.ns for marker in first["markers"].markers} >= {"users", "clusters", "uav"}
+    assert first["diagnostics"].status[0].name in NODES
+    assert first["clock"].clock.sec >= 0
+
+
+def until_closed(viewer: FoxgloveClient) -> Iterator[Heard]:
+    """All messages, until the server closes the connection."""
+    try:
+        while True:
+            message = viewer.read(15.0)
+            assert message is not None, "the mission stands still, or the server did not end with it"
+            yield message
+    except ConnectionClosed:
+        return
+
+
+def test_topics_are_called_as_in_the_graph_and_the_server_ends_with_the_mission(
+    ros: Ros, small_scenario: Path, small_policy: Path
+) -> None:
+    flight, port, _ = start(ros, small_scenario, small_policy, "--namespace", "/uav1", "--missions", 3)
+    with FoxgloveClient(port, len(SERVED)) as viewer:
+        assert viewer.server["name"] == "uav_dc_ros /uav1"
+        assert set(viewer.channels) == {f"/uav1/{name}" for name in SERVED}
+        viewer.open("/uav1/mission")
+        heard = list(until_closed(viewer))
+    status, output = finish(flight)
+    assert status == 0, output
+    last = json.loads(heard[-1].content.data)
+    assert (last["mission"], last["remaining_steps"]) == (2, 0)
+    assert is_free(port)
+
+
+def test_a_port_in_use_is_one_line_and_status_2(ros: Ros) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        status, output = ros.run("uav_dc_ros.nodes.live_view", "--ros-args", "-p", f"port:={port}")
+    assert status == 2, output
+    assert len(output.splitlines()) == 1, output
+    assert f"port: {port} at address '127.0.0.1': " in output

@@ -1,0 +1,242 @@
+"""What RViz and Foxglove show of a mission: a MarkerArray, made of the core's values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from visualization_msgs.msg import Marker
+
+from uav_dc_ros.core import radio
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.messages import Mission
+from uav_dc_ros.nodes.cdr import Writer
+from uav_dc_ros.nodes.convert import FRAME
+
+Rgba = tuple[float, float, float, float]
+Xyz = tuple[float, float, float]
+
+USER_CELLS = 0.16  # diameter of a user, in cells, where they do not crowd
+USER_SPACING = 0.6  # and of its share of the cluster's disc, where they do ...
+USER_CELLS_MIN = 0.03  # ... down to this: a speck that is too small shows nothing
+SERVED_SCALE = 1.5  # a user being served is larger: told without colour, too
+UAV_CELLS = 0.3
+DOCK_CELLS = 0.5
+TEXT_CELLS = 0.32  # height of a capital
+TEXT_ABOVE_CELLS = 0.9
+THIN_CELLS = 0.01  # of what lies on the ground, layer upon layer, so that no two surfaces coincide
+
+
+class UserState(IntEnum):
+    """What a user is shown as; the value is the id of its marker."""
+
+    WAITING = 0
+    SERVED = 1
+    COLLECTED = 2
+
+
+def _rgba(hex: str, alpha: float = 1.0) -> Rgba:
+    red, green, blue = (value / 255.0 for value in bytes.fromhex(hex))
+    return red, green, blue, alpha
+
+
+# Okabe and Ito's palette, made for colour-blind eyes. Of its eight, these three users' colours also differ
+# in lightness (L* 54, 89, 70), so that a grey print, and any kind of colour blindness, tells them apart.
+USER_COLOURS: dict[UserState, Rgba] = {
+    UserState.WAITING: _rgba("D55E00"),  # vermilion: still to do
+    UserState.SERVED: _rgba("F0E442"),  # yellow: lit up
+    UserState.COLLECTED: _rgba("56B4E9"),  # sky blue: done
+}
+FOOTPRINT_COLOUR = _rgba("F0E442", 0.18)  # the light that users are lit by
+CLUSTER_COLOUR = _rgba("999999", 0.35)
+DOCK_COLOUR = _rgba("009E73", 0.9)  # bluish green
+UAV_COLOUR = _rgba("CC79A7")  # reddish purple, that nothing else has
+TEXT_COLOUR = _rgba("FFFFFF")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What is known of the mission now; what is not known yet is None, or empty.
+
+    Attributes:
+        time_ns: mission time of the pose, nanoseconds.
+        position_m: of the UAV: x, y, altitude, metres.
+        users_m: positions, metres, `[U, 2]`.
+        served, collected: of each user, bool `[U]`.
+        mission: what the vehicle said last.
+        sum_rate_bps: sum-rate of the last step, bit/s.
+    """
+
+    time_ns: int
+    position_m: Xyz | None
+    users_m: Array
+    served: Array
+    collected: Array
+    mission: Mission | None
+    sum_rate_bps: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """A visualization_msgs/Marker: those of its fields that are used here. Metres, frame `map`."""
+
+    ns: str
+    id: int = 0
+    type: int = Marker.CUBE
+    position_m: Xyz = (0.0, 0.0, 0.0)
+    scale_m: Xyz = (1.0, 1.0, 1.0)
+    colour: Rgba = TEXT_COLOUR
+    points_m: Array = field(default_factory=lambda: np.empty((0, 3)))
+    text: str = ""
+    shown: bool = True
+
+
+def markers(scenario: Scenario, scene: Scene) -> bytes:
+    """A visualization_msgs/MarkerArray of a scene, serialised: complete, whatever was drawn before."""
+    shapes = [*_ground(scenario), *_users(scenario, scene), *_uav(scenario, scene)]
+    writer = Writer()
+    writer.numbers("I", len(shapes))
+    for shape in shapes:
+        _write(writer, shape, scene.time_ns)
+    return writer.message()
+
+
+def user_states(served: Array, collected: Array) -> Array:
+    """The UserState of each user, `[U]`. Who was collected in the very step that served it is collected."""
+    return np.where(collected, UserState.COLLECTED, np.where(served, UserState.SERVED, UserState.WAITING))
+
+
+def status_text(scenario: Scenario, scene: Scene) -> str:
+    """Step, users collected and sum-rate, a line each."""
+    lines = []
+    if scene.mission is not None:
+        over = f": {scene.mission.phase}" if scene.mission.phase.is_over else ""
+        lines.append(f"step {scene.mission.step} of {scenario.mission.max_steps}{over}")
+    if scene.sum_rate_bps is not None:
+        lines.append(f"{int(np.sum(scene.collected))} of {scenario.n_users} users collected")
+        lines.append(f"{scene.sum_rate_bps / 1e6:.2f} Mbit/s")
+    return "\n".join(lines)
+
+
+def _ground(scenario: Scenario) -> Sequence[Shape]:
+    """What does not move: the discs in which the users start, and the dock."""
+    cell_m = scenario.grid.cell_m
+    thin_m = THIN_CELLS * cell_m
+    width_m = 2 * scenario.users.cluster_radius_m
+    clusters = [
+        Shape(
+            ns="clusters",
+            id=i,
+            type=Marker.CYLINDER,
+            position_m=(x_m, y_m, -2 * thin_m),
+            scale_m=(width_m, width_m, thin_m),
+            colour=CLUSTER_COLOUR,
+        )
+        for i, (x_m, y_m) in enumerate(scenario.users.cluster_centres_m)
+    ]
+    side_m = DOCK_CELLS * cell_m
+    dock = Shape(
+        ns="dock",
+        position_m=(*scenario.mission.dock_m, 0.0),
+        scale_m=(side_m, side_m, thin_m),
+        colour=DOCK_COLOUR,
+    )
+    return [*clusters, dock]
+
+
+def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
+    """The users on the ground, those of each state one marker."""
+    crowded_m = (
+        USER_SPACING * scenario.users.cluster_radius_m / float(np.sqrt(scenario.users.users_per_cluster))
+    )
+    cell_m = scenario.grid.cell_m
+    width_m = min(USER_CELLS * cell_m, max(crowded_m, USER_CELLS_MIN * cell_m))
+    states = user_states(scene.served, scene.collected)
+    shapes = []
+    for state, colour in USER_COLOURS.items():
+        users_m = scene.users_m[states == state]
+        size_m = width_m * (SERVED_SCALE if state is UserState.SERVED else 1.0)
+        shapes.append(
+            Shape(
+                ns="users",
+                id=state,
+                type=Marker.SPHERE_LIST,
+                scale_m=(size_m, size_m, size_m),
+                colour=colour,
+                points_m=np.column_stack([users_m, np.zeros(len(users_m))]),
+                shown=len(users_m) > 0,  # RViz complains about a list of nothing
+            )
+        )
+    return shapes
+
+
+def _uav(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
+    """The UAV, a line down to the ground, whom it can serve from there, and how its mission stands."""
+    cell_m = scenario.grid.cell_m
+    known = scene.position_m is not None
+    x_m, y_m, z_m = at_m = scene.position_m or (0.0, 0.0, 0.0)
+    reach_m = radio.ground_reach_m(scenario.mission.d_cons_m, z_m) if known else 0.0
+    text = status_text(scenario, scene)
+    return [
+        Shape(
+            ns="footprint",
+            type=Marker.CYLINDER,
+            position_m=(x_m, y_m, -THIN_CELLS * cell_m),
+            scale_m=(2 * reach_m, 2 * reach_m, THIN_CELLS * cell_m),
+            colour=FOOTPRINT_COLOUR,
+            shown=reach_m > 0,
+        ),
+        Shape(
+            ns="uav",
+            type=Marker.SPHERE,
+            position_m=at_m,
+            scale_m=(UAV_CELLS * cell_m, UAV_CELLS * cell_m, UAV_CELLS * cell_m / 2),
+            colour=UAV_COLOUR,
+            shown=known,
+        ),
+        Shape(
+            ns="uav",
+            id=1,
+            type=Marker.LINE_LIST,
+            scale_m=(2 * THIN_CELLS * cell_m, 0.0, 0.0),
+            colour=UAV_COLOUR,
+            points_m=np.array([at_m, (x_m, y_m, 0.0)]),
+            shown=known,
+        ),
+        Shape(
+            ns="status",
+            type=Marker.TEXT_VIEW_FACING,
+            position_m=(x_m, y_m, z_m + TEXT_ABOVE_CELLS * cell_m),
+            scale_m=(0.0, 0.0, TEXT_CELLS * cell_m),
+            colour=TEXT_COLOUR,
+            text=text,
+            shown=known and bool(text),
+        ),
+    ]
+
+
+def _write(writer: Writer, shape: Shape, time_ns: int) -> None:
+    """A visualization_msgs/Marker, field by field in the order of its definition."""
+    nothing = 0  # length of a sequence that is not used
+    writer.stamp(time_ns)
+    writer.text(FRAME)
+    writer.text(shape.ns)
+    writer.numbers("i", shape.id, shape.type, Marker.ADD if shape.shown else Marker.DELETE)
+    writer.numbers("d", *shape.position_m, 0.0, 0.0, 0.0, 1.0, *shape.scale_m)
+    writer.numbers("f", *shape.colour)
+    writer.stamp(0)  # lifetime: for ever
+    writer.numbers("?", False)  # frame_locked
+    writer.points(shape.points_m)
+    writer.numbers("I", nothing)  # colors
+    writer.text("")  # texture_resource, and texture: header, format, data
+    writer.stamp(0)
+    writer.text("")
+    writer.text("")
+    writer.numbers("I", nothing)
+    writer.numbers("I", nothing)  # uv_coordinates
+    writer.text(shape.text)
+    writer.text("")  # mesh_resource, and mesh_file: filename, data
+    writer.text("")
+    writer.numbers("I", nothing)
+    writer.numbers("?", False)  # mesh_use_embedded_materials
