@@ -20,7 +20,8 @@ from uav_dc_ros.nodes.table import NODES
 
 PEERS = ("world", "channel_monitor", "policy", "recorder", "observer")
 BY_HAND = ("world", "channel_monitor", "policy")
-HEARS = {"world": ("move", "ready"), "channel_monitor": ("users", "pose"), "policy": ("rates", "mission")}
+# What a burst of garbage pushes off the wire is sent again, from as far back as the publisher keeps it.
+KEPT = 10_000
 # Then the first poses have left the monitor's memory: users of the past find none.
 FROM_MISSION = 12
 COMPARED = ("users", "rates", "mission", "move")
@@ -53,11 +54,15 @@ class Running:
 
 
 def parameters(node: str) -> list[str]:
-    """ROS parameters with which a node keeps every message until it gets to it."""
-    values = {f"qos_overrides./{topic}.subscription.history": "keep_all" for topic in HEARS[node]}
-    if "pose" in HEARS[node]:
+    """ROS parameters with which a node loses nothing: neither of what it hears, nor of what it says."""
+    row = NODES[node]
+    values: dict[str, object] = {"peers": json.dumps(PEERS)}
+    values |= {f"qos_overrides./{topic}.subscription.history": "keep_all" for topic in row.subscribes}
+    values |= {
+        f"qos_overrides./{topic}.publisher.depth": KEPT for topic in row.publishes if topic in COMPARED
+    }
+    if "pose" in row.subscribes:
         values["qos_overrides./pose.subscription.reliability"] = "reliable"
-    values["peers"] = json.dumps(PEERS)
     return [argument for name, value in values.items() for argument in ("-p", f"{name}:={value}")]
 
 
