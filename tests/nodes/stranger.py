@@ -1,10 +1,13 @@
 """A stranger on the network who fires garbage at every topic, and loses none of it unnoticed.
 
-python -m tests.nodes.stranger SCENARIO SEED PER_TOPIC MISSION PEERS
+python -m tests.nodes.stranger SCENARIO SEED PER_TOPIC OVERSIZED MISSION PEERS
 
 Waits until MISSION is flown, so that the garbage's idea of the past is right. Each burst is sent when the
-burst before has been received by all; the readers must keep all (`qos_overrides`). Prints, as JSON: what
-was sent, by topic and reason, how long that took, and what each node of PEERS counts in its diagnostics.
+burst before has been received by all; the readers must keep all (`qos_overrides`). With each burst goes a
+message of another type on the same topic.
+
+Prints, as JSON: what was sent, by topic and reason; how long that took; what each node of PEERS counts in
+its diagnostics; and how many readers there were for the other type.
 """
 
 import itertools
@@ -18,9 +21,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from std_msgs.msg import String
+from std_msgs.msg import Int32, String
 
-from tests.nodes.garbage import TOPICS, garbage
+from tests.nodes.garbage import JSON_TOPICS, TOPICS, garbage, oversized
 from uav_dc_ros import scenarios
 from uav_dc_ros.nodes import qos
 from uav_dc_ros.nodes.table import NODES
@@ -28,6 +31,7 @@ from uav_dc_ros.topics import TOPICS as ROWS
 
 BURST = 500
 PATIENCE_S = 60.0
+SETTLED_S = 1.5  # longer than from one word of diagnostics to the next
 
 
 class Stranger(Node):
@@ -69,6 +73,11 @@ class Stranger(Node):
             self.publishers_of[name] = self.create_publisher(
                 qos.MESSAGE_TYPES[ROWS[name].type], name, profile
             )
+        # No participant may know one topic by two types.
+        self.elsewhere = rclpy.Context()
+        rclpy.init(context=self.elsewhere)
+        other = rclpy.create_node("other_types", context=self.elsewhere)
+        self.others = {name: other.create_publisher(Int32, name, qos.offered(ROWS[name])) for name in TOPICS}
 
     def all_hear(self) -> bool:
         return all(
@@ -79,6 +88,7 @@ class Stranger(Node):
     def fire(self, name: str, burst: list[bytes]) -> None:
         for data in burst:
             self.publishers_of[name].publish(data)
+        self.others[name].publish(Int32(data=len(burst)))
 
     def received(self) -> None:
         for name, publisher in self.publishers_of.items():
@@ -95,7 +105,7 @@ def wait_until(node: Node, condition: object) -> None:
 
 
 def main() -> None:
-    scenario, seed, per_topic, mission, peers = sys.argv[1:]
+    scenario, seed, per_topic, n_oversized, mission, peers = sys.argv[1:]
     rclpy.init()
     stranger = Stranger(peers.split(","))
     wait_until(stranger, lambda: stranger.mission >= int(mission))
@@ -112,16 +122,23 @@ def main() -> None:
             sent.update(f"{name} {one.reason}" for one in burst)
             stranger.fire(name, [one.data for one in burst])
         stranger.received()
+    for name in JSON_TOPICS * int(n_oversized):
+        sent[f"{name} oversized"] += 1
+        stranger.fire(name, [oversized().data])
+        stranger.received()
     fired_s = time.monotonic() - began_s
 
     # What was received is not yet read. Who has read all of it counts no more.
     before: dict[str, dict[str, int]] = {"": {}}
     while before != stranger.diagnosed or len(before) < len(peers.split(",")):
         before = dict(stranger.diagnosed)
-        until_s = time.monotonic() + 2.5
+        until_s = time.monotonic() + SETTLED_S
         while time.monotonic() < until_s:
             rclpy.spin_once(stranger, timeout_sec=0.1)
-    print(json.dumps({"sent": sent, "fired_s": fired_s, "diagnosed": stranger.diagnosed}), flush=True)
+    told = {"sent": sent, "fired_s": fired_s, "diagnosed": stranger.diagnosed}
+    told["other_type_heard"] = sum(each.get_subscription_count() for each in stranger.others.values())
+    print(json.dumps(told), flush=True)
+    rclpy.shutdown(context=stranger.elsewhere)
     rclpy.shutdown()
 
 
