@@ -15,7 +15,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from uav_dc_ros.nodes import runtime
+from uav_dc_ros.nodes import convert, qos
 from uav_dc_ros.topics import TOPICS
 
 SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of it
@@ -31,10 +31,10 @@ def main() -> None:
             print(json.dumps({"topic": name, "data": getattr(message, "data", None)}), flush=True)
 
         node.create_subscription(
-            runtime.MESSAGE_TYPES[topic.type],
+            qos.MESSAGE_TYPES[topic.type],
             name,
             lambda m, h=hear: h(m),
-            runtime.requested_qos(topic, all=True),
+            qos.requested(topic, all=True),
         )
     publishers = {}
 
@@ -44,8 +44,8 @@ def main() -> None:
             name = command["topic"]
             row = TOPICS[name.rsplit("/", 1)[-1]]
             if name not in publishers:
-                kind = runtime.MESSAGE_TYPES[row.type]
-                publishers[name] = node.create_publisher(kind, name, runtime.offered_qos(row))
+                kind = qos.MESSAGE_TYPES[row.type]
+                publishers[name] = node.create_publisher(kind, name, qos.offered(row))
                 while publishers[name].get_subscription_count() < command["hearing"]:
                     time.sleep(0.01)
                 time.sleep(SETTLE_S)
@@ -53,6 +53,7 @@ def main() -> None:
                 message = PoseStamped()
                 message.header.frame_id = command["frame"]
                 message.pose.position.x = float(command["pose"])
+                message.header.stamp = convert.stamp(command.get("stamp_ns", 0))
             else:
                 message = String(data=command["data"])
             publishers[name].publish(message)
