@@ -108,7 +108,10 @@ class Mission(Stepped, frozen=True):
     scenario: Annotated[Name, Meta(description="name of the scenario")]
     fingerprint: Annotated[
         str,
-        Meta(pattern=r"^[0-9a-f]{12}(?!\n)$", description="of the scenario's world: equal for equal worlds only"),
+        Meta(
+            pattern=r"^[0-9a-f]{12}(?!\n)$",
+            description="of the scenario's world: equal for equal worlds only",
+        ),
     ]
 
 

@@ -16,7 +16,7 @@ from tests.conftest import Ros, finish, wait_for
 from tests.nodes.conftest import SMALL
 from tests.nodes.test_fuzz import COMPARED, PEERS, flown, said_by_nodes
 from tests.small_worlds import saved
-from uav_dc_ros import messages, scenarios
+from uav_dc_ros import scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes.table import NODES
 
