@@ -187,7 +187,7 @@ def write_schemas(folder: Path) -> None:
 
 
 def _told(error: Exception) -> str:
-    """An error in words. It may quote the payload: as much as fits a line, and nothing that a terminal obeys."""
+    """An error in words. It may quote the payload: a line of it, and nothing that a terminal obeys."""
     text = str(error)
     told = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:TOLD_MAX])
     return told if len(text) <= TOLD_MAX else f"{told}..."
