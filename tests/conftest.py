@@ -10,11 +10,13 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
+
+from uav_dc_ros.errors import MessageError
 
 MARK = "UAV_DC_TEST"
 ROOT = Path(__file__).parents[1]
@@ -101,6 +103,14 @@ def finish(process: subprocess.Popen[str], timeout_s: float = 90.0) -> tuple[int
         output, _ = process.communicate()
         raise AssertionError(f"still running after {timeout_s} s; it printed:\n{output}") from None
     return process.returncode, output
+
+
+def outcome(act: Callable[[], Any]) -> Any:
+    """What an act returns, or the MessageError that it raises: nothing else may be raised."""
+    try:
+        return act()
+    except MessageError as refused:
+        return refused
 
 
 def wait_for(stream: IO[str], text: str) -> str:

@@ -1,13 +1,17 @@
 """The JSON contract: what travels, what is refused, and that msgs_json/ tells the same."""
 
 import json
+import math
+import time
+from typing import Any
 
 import jsonschema
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.conftest import outcome
 from uav_dc_ros import messages, resources, topics
 from uav_dc_ros.core.grid import ACTION_LABELS, ActionLabel
 from uav_dc_ros.errors import MessageError
@@ -88,20 +92,93 @@ def test_an_independent_validator_agrees(topic: str) -> None:
         ('{"mission":0,"step":"1","action":"hover"}', "invalid"),
         ('{"mission":0,"step":NaN,"action":"hover"}', "malformed"),
         ('{"mission":0,"step":1e400,"action":"hover"}', "invalid"),
+        (b'{"mission":0,"step":0,"action":"\xff"}', "malformed"),
+        (b'{"mission":0,"st\xffep":0,"action":"hover"}', "malformed"),
+        (b'{"mission":0,"step":0,"action":"hover"}\0', "malformed"),
         (" " * (messages.MAX_BYTES + 1), "oversized"),
     ],
 )
-def test_what_is_not_a_payload_is_refused_by_reason(text: str, reason: str) -> None:
+def test_what_is_not_a_payload_is_refused_by_reason(text: str | bytes, reason: str) -> None:
     with pytest.raises(MessageError) as refused:
         messages.decode(text, Move)
     assert refused.value.reason == reason
 
 
-@given(st.text() | st.recursive(st.none() | st.floats() | st.text(), lambda x: st.lists(x)).map(json.dumps))
-def test_junk_is_only_ever_a_message_error(text: str) -> None:
+SCHEMAS = {
+    topic: jsonschema.Draft202012Validator(
+        json.loads((resources.folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
+    )
+    for topic in PAYLOADS
+}
+JUNK = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers(-(2**70), 2**70) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+def check_decode(topic: str, text: str | bytes) -> None:
+    """A payload comes out that the schema allows as well, or a MessageError of a line."""
+    came = outcome(lambda: messages.decode(text, PAYLOADS[topic]))
+    if isinstance(came, MessageError):
+        assert came.reason in ("malformed", "invalid", "oversized")
+        assert str(came).isprintable()
+        assert len(str(came)) <= 10 * messages.TOLD_MAX
+    else:
+        assert SCHEMAS[topic].is_valid(json.loads(text))
+        assert messages.decode(messages.encode(came), PAYLOADS[topic]) == came
+
+
+@given(st.sampled_from(sorted(PAYLOADS)), st.binary() | st.text() | JUNK.map(json.dumps))
+@example("ready", b'{"node":"a\xff"}')
+def test_junk_is_a_payload_or_a_message_error(topic: str, text: str | bytes) -> None:
+    check_decode(topic, text)
+
+
+@given(st.sampled_from(sorted(PAYLOADS)), st.data())
+def test_a_payload_with_another_value_is_a_payload_or_a_message_error(topic: str, data: Any) -> None:
+    good = json.loads(messages.encode(EXAMPLES[topic]))
+    name = data.draw(st.sampled_from([*good, "surplus"]))
+    near = [good.get(name), 0, 1, 1.0, -1, 2**31, 2**63, [0], [0, 1, 2], "hover", "policy\n", math.inf]
+    check_decode(topic, json.dumps(good | {name: data.draw(JUNK | st.sampled_from(near))}))
+
+
+@given(st.sampled_from(sorted(PAYLOADS)), st.data())
+def test_a_damaged_payload_is_a_payload_or_a_message_error(topic: str, data: Any) -> None:
+    text = bytearray(messages.encode(EXAMPLES[topic]))
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(text) - 1))
+        text[at : at + data.draw(st.integers(0, 2))] = data.draw(st.binary(max_size=3))
+        text = text or bytearray(b" ")
+    check_decode(topic, bytes(text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"[" * messages.MAX_BYTES,
+        b'{"node":' * (messages.MAX_BYTES // 8),
+        b'{"x_m":' + b"[" * (messages.MAX_BYTES - 7),
+        b'{"a":' + b"[" * (messages.MAX_BYTES - 5),
+        b" " * messages.MAX_BYTES,
+        b'"' + b"a" * (messages.MAX_BYTES - 2) + b'"',
+        b'{"' + b"a" * (messages.MAX_BYTES - 2),
+        b'{"node":"' + b"a" * (messages.MAX_BYTES - 11) + b'"}',
+        b'{"mission":' + b"9" * (messages.MAX_BYTES - 12) + b"}",
+        b'{"cluster":[' + b"1," * (messages.MAX_BYTES // 2 - 7) + b"1]}",
+        b"x" * (messages.MAX_BYTES + 1),
+    ],
+    ids=lambda text: text[:12].decode(),
+)
+def test_the_largest_junk_is_refused_at_once(text: bytes) -> None:
     for kind in PAYLOADS.values():
-        with pytest.raises(MessageError):
+        began_s = time.process_time()
+        with pytest.raises(MessageError) as refused:
             messages.decode(text, kind)
+        assert time.process_time() - began_s < 5.0  # a second or two, for millions of numbers
+        assert (
+            len(str(refused.value)) <= 10 * messages.TOLD_MAX
+        )  # escapes are longer than what they stand for
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

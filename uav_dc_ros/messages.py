@@ -20,12 +20,14 @@ from uav_dc_ros.core.grid import ActionLabel
 from uav_dc_ros.errors import MessageError
 
 MAX_BYTES = 64 * 2**20  # of one payload; a hundred thousand users take about 8 MiB
+TOLD_MAX = 200  # characters of what is told about a bad one
 
 Index: TypeAlias = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 StampNs: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Seed: TypeAlias = StampNs
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
-Name: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
+# In Python, `$` also stands before a newline at the end; in other languages `(?!\n)` changes nothing.
+Name: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}(?!\n)$")]
 
 
 class Phase(StrEnum):
@@ -106,7 +108,10 @@ class Mission(Stepped, frozen=True):
     scenario: Annotated[Name, Meta(description="name of the scenario")]
     fingerprint: Annotated[
         str,
-        Meta(pattern=r"^[0-9a-f]{12}$", description="of the scenario's world: equal for equal worlds only"),
+        Meta(
+            pattern=r"^[0-9a-f]{12}(?!\n)$",
+            description="of the scenario's world: equal for equal worlds only",
+        ),
     ]
 
 
@@ -159,9 +164,9 @@ def decode(text: str | bytes, kind: type[P]) -> P:
     try:
         return msgspec.json.decode(text, type=kind)
     except msgspec.ValidationError as error:
-        raise MessageError("invalid", str(error)) from None
-    except (msgspec.DecodeError, RecursionError, UnicodeEncodeError) as error:
-        raise MessageError("malformed", str(error)) from None
+        raise MessageError("invalid", _told(error)) from None
+    except (msgspec.DecodeError, RecursionError, UnicodeError) as error:
+        raise MessageError("malformed", _told(error)) from None
 
 
 def schema(kind: type[Payload]) -> dict[str, Any]:
@@ -179,6 +184,13 @@ def write_schemas(folder: Path) -> None:
     """Write the schema of every JSON topic."""
     for topic, kind in PAYLOADS.items():
         (folder / f"{topic}.schema.json").write_text(schema_text(kind), "utf-8")
+
+
+def _told(error: Exception) -> str:
+    """An error in words. It may quote the payload: a line of it, and nothing that a terminal obeys."""
+    text = str(error)
+    told = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:TOLD_MAX])
+    return told if len(text) <= TOLD_MAX else f"{told}..."
 
 
 def _same_length(**columns: list[Any]) -> None:

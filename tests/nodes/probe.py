@@ -15,7 +15,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from uav_dc_ros.nodes import qos
+from uav_dc_ros.nodes import convert, qos
 from uav_dc_ros.topics import TOPICS
 
 SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of it
@@ -53,6 +53,7 @@ def main() -> None:
                 message = PoseStamped()
                 message.header.frame_id = command["frame"]
                 message.pose.position.x = float(command["pose"])
+                message.header.stamp = convert.stamp(command.get("stamp_ns", 0))
             else:
                 message = String(data=command["data"])
             publishers[name].publish(message)

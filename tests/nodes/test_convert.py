@@ -1,0 +1,79 @@
+"""Messages into the core's arrays: whatever comes, an array or a MessageError."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import String
+
+from tests.conftest import outcome
+from tests.small_worlds import tiny
+from uav_dc_ros import messages
+from uav_dc_ros.errors import MessageError
+from uav_dc_ros.nodes import convert
+
+ANY_NUMBER = st.floats(allow_nan=True, allow_infinity=True)
+LATEST_NS = 2**31 * 10**9 - 1  # of a ROS time: its seconds have 32 bits
+SCENARIO = tiny()
+
+
+@given(st.binary(max_size=64))
+@example(b"")
+@example(b"\0\1\0\0")
+@example(b"\0\1\0\0\0\0\0\0")
+@example(b"\0\1\0\0\xff\xff\xff\xff")
+@example(b"\0\0\0\0\0\0\0\2a\0")
+def test_any_bytes_are_a_text_or_malformed(data: bytes) -> None:
+    came = outcome(lambda: convert.text_in_cdr(data))
+    if isinstance(came, MessageError):
+        assert came.reason == "malformed"
+    else:
+        assert came in data
+
+
+@given(st.text(st.characters(codec="utf-8", exclude_characters="\0")))
+def test_a_text_is_serialised_as_ros_does(text: str) -> None:
+    ours, theirs = convert.cdr_of_text(text.encode()), serialize_message(String(data=text))
+    assert convert.text_in_cdr(theirs) == text.encode()
+    assert deserialize_message(ours, String).data == text
+
+
+@given(st.text(max_size=20), ANY_NUMBER, ANY_NUMBER, ANY_NUMBER)
+@example("map", 1e308, -1e308, 5e-324)
+def test_any_pose_is_a_position_or_refused(frame: str, x: float, y: float, z: float) -> None:
+    message = convert.pose(np.asarray([x, y, z]), 0)
+    message.header.frame_id = frame
+    came = outcome(lambda: convert.position_m(message))
+    if isinstance(came, MessageError):
+        assert came.reason == ("frame" if frame != "map" else "not_finite")
+        assert frame != "map" or not all(map(math.isfinite, (x, y, z)))
+    else:
+        assert frame == "map"
+        assert came.tolist() == [x, y, z]
+
+
+@given(st.integers(0, LATEST_NS))
+def test_a_stamp_keeps_its_nanoseconds(time_ns: int) -> None:
+    assert convert.stamp_ns(convert.stamp(time_ns)) == time_ns
+
+
+@given(st.lists(st.integers(0, 3), max_size=6))
+@pytest.mark.parametrize("convert_it", [convert.users_m, convert.collection])
+def test_other_users_are_refused(convert_it: Callable[..., object], cluster: list[int]) -> None:
+    zeros, no = [0.0] * len(cluster), [False] * len(cluster)
+    users = messages.Users(mission=0, step=0, stamp_ns=0, cluster=cluster, x_m=zeros, y_m=zeros)
+    numbers = {"sinr": zeros, "rate_bps": zeros, "data_bits": zeros, "served": no, "collected": no}
+    rates = messages.Rates(mission=0, step=0, sum_rate_bps=0.0, **numbers)
+    mine = SCENARIO.user_cluster.tolist()
+    fits = cluster == mine if convert_it is convert.users_m else len(cluster) == len(mine)
+    payload = users if convert_it is convert.users_m else rates
+    if fits:
+        convert_it(payload, SCENARIO)
+    else:
+        with pytest.raises(MessageError) as refused:
+            convert_it(payload, SCENARIO)
+        assert refused.value.reason == "layout"
