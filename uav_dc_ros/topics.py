@@ -53,8 +53,8 @@ TOPICS: dict[str, Topic] = {
     topic.name: topic
     for topic in (
         Topic(name="pose", type=POSE, asks_reliable=False),
-        Topic(name="users", type=JSON, latched=True, depth=100),
-        Topic(name="rates", type=JSON, latched=True, depth=100),
+        Topic(name="users", type=JSON, latched=True, depth=500),
+        Topic(name="rates", type=JSON, latched=True, depth=500),
         Topic(name="mission", type=JSON, latched=True),
         Topic(name="move", type=JSON),
         Topic(name="target", type=POSE, latched=True),

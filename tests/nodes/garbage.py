@@ -19,6 +19,7 @@ from typing import Any
 import jsonschema
 from rclpy.serialization import serialize_message
 
+from tests.nodes import poses
 from uav_dc_ros import messages, resources
 from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.scenario import Scenario
@@ -337,7 +338,7 @@ def oversized(size: int = messages.MAX_BYTES + 1) -> Garbage:
 
 
 def _pose(rng: random.Random) -> Garbage:
-    message = convert.pose([rng.uniform(-1e3, 1e3) for _ in range(3)], 0)
+    message = poses.pose([rng.uniform(-1e3, 1e3) for _ in range(3)], 0)
     message.header.stamp.sec = rng.choice((0, -1, -(2**31), 2**31 - 1))
     message.header.stamp.nanosec = rng.choice((0, 2**32 - 1))
     kind = rng.choice(("not_finite", "frame", UNDECODABLE))

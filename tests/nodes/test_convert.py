@@ -11,6 +11,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 
 from tests.conftest import outcome
+from tests.nodes import poses
 from tests.small_worlds import tiny
 from uav_dc_ros import messages
 from uav_dc_ros.errors import MessageError
@@ -45,7 +46,7 @@ def test_a_text_is_serialised_as_ros_does(text: str) -> None:
 @given(st.text(max_size=20), ANY_NUMBER, ANY_NUMBER, ANY_NUMBER)
 @example("map", 1e308, -1e308, 5e-324)
 def test_any_pose_is_a_position_or_refused(frame: str, x: float, y: float, z: float) -> None:
-    message = convert.pose(np.asarray([x, y, z]), 0)
+    message = poses.pose(np.asarray([x, y, z]), 0)
     message.header.frame_id = frame
     came = outcome(lambda: convert.position_m(message))
     if isinstance(came, MessageError):

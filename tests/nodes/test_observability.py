@@ -129,7 +129,7 @@ def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[ob
     peer.kill()
     peer.communicate()
     assert status == 0, output
-    assert output.count("world: WARN: /pose: QoS does not match that of /somebody/demanding: ") == 1, output
+    assert output.count("world: WARN: /pose: /somebody/demanding does not match: its QoS: ") == 1, output
 
 
 def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
@@ -143,8 +143,8 @@ def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
         *("-p", "qos_overrides./target.publisher.reliability:=best_effort"),
     )
     assert world.stdout is not None
-    told = wait_for(world.stdout, "QoS does not match")
-    assert "/target: QoS does not match that of /somebody/demanding" in told
+    told = wait_for(world.stdout, "does not match")
+    assert "/target: /somebody/demanding does not match: its QoS: " in told
     world.terminate()
     peer.kill()
     peer.communicate()

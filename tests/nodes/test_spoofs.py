@@ -105,27 +105,24 @@ HARMLESS = (
     "ready, of the policy",
     "a pose of the past",
     "a pose beyond all distances",
+    "users whose pose is far away in time",
+    "a pose of the far future",
+    "a step in a cell of no grid",
+    "a step with more steps left than there are",
 )
-# No word of another time should keep the monitor from pairing users with their pose. It does.
-STOPS_TODAY = [
-    pytest.param(lie, marks=pytest.mark.xfail(reason="one such message stops the channel monitor"))
-    for lie in ("users whose pose is far away in time", "a pose of the far future")
-]
 # These may change a move or a summary, or end the run: they say what only the true node should say.
 HARMFUL = (
     "users at the start of another mission",  # the books of this one are closed: no further rates
     "rates of a later step",  # the policy decides that step, and the summary tells of it, by the lie
     "rates of a later step, without bounds",
     "a later step",  # the policy decides by the lie, if the rates come before the true word
-    "a step in a cell of no grid",
-    "a step with more steps left than there are",
     "the end of a later mission",
     "a mission with another seed",  # run_all takes it for somebody else's mission, and ends
 )
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("lie", [*HARMLESS, *STOPS_TODAY, *HARMFUL])
+@pytest.mark.parametrize("lie", [*HARMLESS, *HARMFUL])
 def test_a_lie_ends_no_node_and_no_run_hangs(ros: Ros, truth: dict[str, list[Any]], lie: str) -> None:
     given = options(ros.folder)
     topic, payload = lies(scenarios.load(ros.folder / "small.toml"))[lie]
@@ -159,5 +156,5 @@ def test_a_lie_ends_no_node_and_no_run_hangs(ros: Ros, truth: dict[str, list[Any
 
 
 def test_every_lie_is_told() -> None:
-    told = [*HARMLESS, *(param.values[0] for param in STOPS_TODAY), *HARMFUL]
+    told = [*HARMLESS, *HARMFUL]
     assert sorted(told) == sorted(lies(scenarios.load("five_clusters")))

@@ -9,15 +9,18 @@ import struct
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.serialization import deserialize_message, serialize_message
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.convert import CDR_LITTLE_ENDIAN, FRAME, position_m
 
 HEAD = len(CDR_LITTLE_ENDIAN)
 FRAME_CDR = (len(FRAME) + 1).to_bytes(4, "little") + FRAME.encode() + b"\0"
 # A PoseStamped in the frame `map`: stamp, frame, and position and orientation without a gap between.
 _POSE = struct.Struct(f"<iI{len(FRAME_CDR)}s7d")
+_LEVEL = (0.0, 0.0, 0.0, 1.0)  # orientation x, y, z, w
 _NUMBERS_AT = 8 + len(FRAME_CDR)
 assert _NUMBERS_AT % 8 == 0, "poses one after the other need no gaps then"
 
@@ -59,11 +62,17 @@ class Writer:
         self._data += bytes(-len(self._data) % size)
 
 
+def pose(position_m: Array, time_ns: int) -> bytes:
+    """A position `[3]` (x, y, altitude, metres) as a level geometry_msgs/PoseStamped, serialised."""
+    sec, nanosec = divmod(time_ns, 10**9)
+    return CDR_LITTLE_ENDIAN + _POSE.pack(sec, nanosec, FRAME_CDR, *position_m.tolist(), *_LEVEL)
+
+
 class Pose:
     """A geometry_msgs/PoseStamped in the frame `map`, read from its serialised form.
 
     Raises:
-        MessageError: another frame, or a position that is not finite.
+        MessageError: no such message, another frame, or a position that is not finite.
 
     Attributes:
         stamp_ns: its stamp.
@@ -75,7 +84,10 @@ class Pose:
 
     def __init__(self, data: bytes) -> None:
         if not _is_usual(data):
-            message: Any = deserialize_message(data, PoseStamped)
+            try:
+                message: Any = deserialize_message(data, PoseStamped)
+            except _rclpy.RMWError as error:
+                raise MessageError("malformed", str(error)) from None
             position_m(message)  # says what is wrong with it
             data = serialize_message(message)
         sec, nanosec, _, x_m, y_m, z_m, *_ = _POSE.unpack_from(data, HEAD)

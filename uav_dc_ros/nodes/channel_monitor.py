@@ -5,16 +5,15 @@ has been collected; a monitor that was killed finds them in its journal.
 """
 
 from collections import deque
-from operator import itemgetter
+from operator import attrgetter
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 
 from uav_dc_ros import messages, scenarios
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import MessageError, NodeError
-from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes import cdr, convert, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 
@@ -31,6 +30,7 @@ class ChannelMonitor(MissionNode):
         """Load the world, and the books of a monitor that was killed."""
         self.scenario = scenarios.load(self.values["scenario"])
         self.journal = Journal(self.values["journal"])
+        self._step_ns = round(self.scenario.mission.step_s * 1e9)
         self._said: messages.Rates | None = None
         self._forget()
         self._restore()
@@ -43,7 +43,7 @@ class ChannelMonitor(MissionNode):
 
     def activate(self) -> None:
         """Begin with empty hands, and the books as they are."""
-        self._poses: deque[tuple[int, Array]] = deque(maxlen=WAITING_MAX)
+        self._poses: deque[cdr.Pose] = deque(maxlen=WAITING_MAX)
         self._users: deque[tuple[messages.Users, Array, int]] = deque(maxlen=WAITING_MAX)
         self._heard_ns = 0  # when the users measured last were published
 
@@ -75,9 +75,9 @@ class ChannelMonitor(MissionNode):
             ) from None
         self.get_logger().warning(f"goes on after step {self._said.step} of mission {self._said.mission}")
 
-    def on_pose(self, message: PoseStamped) -> None:
+    def on_pose(self, pose: cdr.Pose) -> None:
         """Keep a pose; users may have waited for it."""
-        self._poses.append((convert.stamp_ns(message.header.stamp), convert.position_m(message)))
+        self._poses.append(pose)
         self._pair()
 
     def on_users(self, payload: messages.Users) -> None:
@@ -86,26 +86,32 @@ class ChannelMonitor(MissionNode):
         self._pair()
 
     def _pair(self) -> None:
-        """Measure every step whose pose has come: the first one not older than the users."""
-        while self._users:
-            users, users_m, published_ns = self._users[0]
-            found = min(
-                (pose for pose in self._poses if pose[0] >= users.stamp_ns), key=itemgetter(0), default=None
-            )
-            if found is None:
-                return
-            self._users.popleft()
-            while self._poses and self._poses[0][0] < users.stamp_ns:
-                self._poses.popleft()  # older than any users to come
-            time_ns, uav_m = found
-            late_s = (time_ns - users.stamp_ns) * 1e-9
-            if late_s >= self.scenario.mission.step_s:
-                raise MessageError(
-                    "no_pose",
-                    f"step {users.step} of mission {users.mission}: the next pose is {late_s:g} s younger; "
-                    f"expected one within the step's {self.scenario.mission.step_s:g} s",
-                )
-            self._measure(users, users_m, uav_m, published_ns)
+        """Measure every step whose pose has come: the first one of the step's own time.
+
+        A stamp of another time, true or not, keeps nobody waiting.
+        """
+        for waiting in tuple(self._users):
+            users, users_m, published_ns = waiting
+            begun_ns = users.stamp_ns
+            poses = [pose for pose in self._poses if 0 <= pose.stamp_ns - begun_ns < self._step_ns]
+            if not poses:
+                continue
+            while (passed := self._users.popleft()) is not waiting:
+                self.reject("users", self._no_pose(passed[0]))
+            for pose in [pose for pose in self._poses if pose.stamp_ns < begun_ns]:
+                self._poses.remove(pose)  # older than any users to come
+            found = min(poses, key=attrgetter("stamp_ns"))
+            try:
+                self._measure(users, users_m, np.asarray(found.position_m), published_ns)
+            except MessageError as error:
+                self.reject("users", error)
+
+    def _no_pose(self, users: messages.Users) -> MessageError:
+        return MessageError(
+            "no_pose",
+            f"step {users.step} of mission {users.mission}: no pose of the step's "
+            f"{self.scenario.mission.step_s:g} s came before a later step had both",
+        )
 
     def _measure(self, users: messages.Users, users_m: Array, uav_m: Array, published_ns: int) -> None:
         said = self._said
@@ -137,15 +143,13 @@ class ChannelMonitor(MissionNode):
                     f"{before[1] + 1}: nothing is booked for what was not heard",
                 ),
             )
-        link = core.measure(self.scenario, uav_m, users_m, self._collected)
+        data_bits, collected = self._data_bits, self._collected
+        link = core.measure(self.scenario, uav_m, users_m, collected)
         if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in
-            self._data_bits, self._collected = core.collect(
-                self.scenario, link, self._data_bits, self._collected
-            )
-        self._said = convert.rates(
-            link, self._data_bits, self._collected, mission=users.mission, step=users.step
-        )
-        text = messages.encode(self._said)
+            data_bits, collected = core.collect(self.scenario, link, data_bits, collected)
+        rates = convert.rates(link, data_bits, collected, mission=users.mission, step=users.step)
+        text = messages.encode(rates)  # refuses what is no number, before it comes into the books
+        self._said, self._data_bits, self._collected = rates, data_bits, collected
         keep = self.journal.append if users.step else self.journal.begin
         keep(text)  # before it is said: what others know is never forgotten
         self.say_encoded("rates", text)

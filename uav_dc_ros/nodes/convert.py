@@ -52,17 +52,6 @@ def stamp_ns(time: Time) -> int:
     return int(time.sec) * 10**9 + int(time.nanosec)
 
 
-def pose(position_m: Array, time_ns: int) -> PoseStamped:
-    """A position `[3]` (x, y, altitude, metres) as a level pose in the frame `map`."""
-    message = PoseStamped()
-    message.header.frame_id = FRAME
-    message.header.stamp = stamp(time_ns)
-    point = message.pose.position
-    point.x, point.y, point.z = (float(value) for value in position_m)
-    message.pose.orientation.w = 1.0
-    return message
-
-
 def position_m(message: PoseStamped) -> Array:
     """Position x, y, altitude, metres, `[3]`.
 
@@ -70,7 +59,7 @@ def position_m(message: PoseStamped) -> Array:
         MessageError: another frame than `map`, or a position that is not finite.
     """
     if message.header.frame_id != FRAME:
-        raise MessageError("frame", f"frame {message.header.frame_id!r}; expected {FRAME!r}")
+        raise MessageError("frame", f"frame {message.header.frame_id[:64]!r}; expected {FRAME!r}")
     point = message.pose.position
     position = np.asarray([point.x, point.y, point.z], dtype=np.float64)
     if not np.isfinite(position).all():
@@ -134,16 +123,23 @@ def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Arra
 
 
 def check_world(payload: messages.Mission, scenario: Scenario) -> None:
-    """Refuse a mission in another world.
+    """Refuse a mission in another world, or where this one has nothing.
 
     Raises:
-        MessageError: the fingerprints differ.
+        MessageError: the fingerprints differ; a cell outside the grid; more steps than the battery allows.
     """
     if payload.fingerprint != scenario.fingerprint:
         raise MessageError(
             "scenario",
             f"the mission flies {payload.scenario!r} ({payload.fingerprint}); expected "
             f"{scenario.name!r} ({scenario.fingerprint}): start this node with the mission's scenario",
+        )
+    beyond = any(index > last for index, last in zip(payload.cell, scenario.grid.last_cell, strict=True))
+    if beyond or payload.remaining_steps > scenario.mission.max_steps:
+        raise MessageError(
+            "layout",
+            f"cell {payload.cell}, {payload.remaining_steps} remaining steps; expected a cell up to "
+            f"{scenario.grid.last_cell} and at most {scenario.mission.max_steps} steps",
         )
 
 

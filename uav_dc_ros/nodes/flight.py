@@ -18,9 +18,11 @@ from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.nodes import foxglove_server
 from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.observer import MissionSoFar, Observer, Summary, summary
+from uav_dc_ros.nodes.parameters import ADDRESS
 from uav_dc_ros.nodes.supervisor import Supervisor
 from uav_dc_ros.nodes.table import NODES
 
@@ -43,6 +45,8 @@ class Flight:
         self.policy.check(self.scenario)
         pace.check(self.scenario, options.pace, options.missions)
         self.nodes = _nodes(options)
+        if options.live is not None:
+            foxglove_server.check(address=str(ADDRESS.default), port=options.live)
         self.bag = _new_bag(options.bag) if "recorder" in self.nodes else None
         if options.summary is not None:
             _check_writable(options.summary, self.bag)
@@ -166,7 +170,7 @@ class Flight:
             "missions": options.missions,
             "pace": pace.text(options.pace),
             "bag": str(self.bag),
-            "port": options.live,
+            **({} if options.live is None else {"port": options.live}),
         }
         started = {}
         for name in self.nodes:

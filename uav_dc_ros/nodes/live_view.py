@@ -66,7 +66,7 @@ class LiveView(MissionNode):
             self.meter.heard(topic.name, received_ns - info["source_timestamp"])
             view.send(full_name, data, received_ns)
 
-        return self.create_quiet_subscription(topic, hear, raw=True)
+        return self.create_raw_subscription(topic, hear)
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """Where it listens."""

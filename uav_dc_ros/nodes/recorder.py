@@ -86,7 +86,7 @@ class Recorder(MissionNode):
             if published_ns > self.writer.already_written.get(name, -1):
                 self.writer.write(name, data, log_time_ns=received_ns, publish_time_ns=published_ns)
 
-        return self.create_quiet_subscription(topic, hear, raw=True)
+        return self.create_raw_subscription(topic, hear)
 
     def _announce(self, topic: Topic) -> None:
         """Enter a topic into the bag with the QoS that its publishers offer by now."""

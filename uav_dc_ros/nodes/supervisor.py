@@ -154,7 +154,7 @@ class Supervisor:
         return all(
             other.state == "active"
             for other in self.nodes
-            if other.row.rank < node.row.rank and other.row.needed
+            if other.row.rank < node.row.rank and (other.row.needed or other.row.on_request)
         )
 
     def _bury(self, node: Supervised) -> None:
@@ -186,7 +186,7 @@ class Supervisor:
         Raises:
             NodeError: no mission can be flown without it.
         """
-        if node.row.needed:
+        if node.row.needed or (node.row.on_request and not self._brought_up):
             raise NodeError(why)
         self._on_note(f"{why}; the mission goes on without it")
         if node.process is not None:

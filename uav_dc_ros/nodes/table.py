@@ -77,7 +77,6 @@ NODES: dict[str, NodeRow] = {
             parameters=(p.SCENARIO, p.RATE_HZ),
             hears_all=True,
             needed=False,
-            on_request=True,
         ),
         NodeRow(
             name="live_view",

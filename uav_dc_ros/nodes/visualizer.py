@@ -67,7 +67,7 @@ class Visualizer(MissionNode):
                 self._changed = True
             self.meter.heard(topic.name, info["received_timestamp"] - published_ns)
 
-        return self.create_quiet_subscription(topic, hear, raw=True)
+        return self.create_raw_subscription(topic, hear)
 
     def _take_pose(self, name: str, data: bytes, published_ns: int) -> None:
         self._track.pose(cdr.Pose(data), published_ns)

@@ -24,7 +24,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes import cdr, convert, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
 from uav_dc_ros.nodes.table import NODES
@@ -82,6 +82,8 @@ class World(MissionNode):
 
     def on_ready(self, payload: messages.Ready) -> None:
         """Note that a peer is ready; one that came back is told where the mission stands."""
+        if payload.node not in NODES:
+            raise MessageError("unknown_node", f"{payload.node!r}; expected some of {', '.join(NODES)}")
         self._ready_peers.add(payload.node)
         if not self._flying:
             self._start_if_all_ready()
@@ -218,7 +220,7 @@ class World(MissionNode):
         """Publish the state of this step. What the move waits for comes first."""
         position_m = self.scenario.grid.centre_m(self._cell, like=self._users_m)
         time_ns = self._time_ns()
-        pose = convert.pose(position_m, time_ns)
+        pose = cdr.pose(position_m, time_ns)
         self.publish("pose", pose)
         self.say(
             "users",

@@ -1,0 +1,211 @@
+"""A managed node: its life cycle, and its parameters from the tables."""
+
+import difflib
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from uav_dc_ros.errors import ParameterError, UavDcError
+from uav_dc_ros.nodes.parameters import EVERY, Parameter
+from uav_dc_ros.nodes.table import NODES
+
+
+class ManagedNode(LifecycleNode):
+    """A node of the table with the life cycle of ROS 2.
+
+    `configure` loads and checks, `activate` starts, `deactivate` is a safe stop, `cleanup` forgets. A
+    UavDcError in `configure` or `activate` is told, undone, and refuses the transition.
+
+    Args:
+        name: of its row.
+        overrides: values of parameters, over those of the command line.
+
+    Attributes:
+        row: its row of the node table.
+        values: values of its parameters; they are checked when it is configured.
+        failure: why the last transition was refused.
+    """
+
+    def __init__(self, name: str, overrides: Sequence[rclpy.Parameter] = ()) -> None:
+        super().__init__(name, parameter_overrides=list(overrides))
+        self.row = NODES[name]
+        self.values: dict[str, Any] = {}
+        self.failure: UavDcError | None = None
+        self._is_active = False
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._refuse_impossible
+        self._declare()
+
+    # Parameters.
+
+    def _declare(self) -> None:
+        """Declare the row's parameters.
+
+        Raises:
+            ParameterError: a value that cannot be, or a parameter that the node does not have.
+        """
+        rows = {row.name: row for row in (*EVERY, *self.row.parameters)}
+        for row in rows.values():
+            try:
+                given = self.declare_parameter(row.name, row.default, _descriptor(row)).value
+            except (InvalidParameterTypeException, InvalidParameterValueException):
+                given = self._parameter_overrides[row.name].value
+            self.values[row.name] = row.value(given)
+        self._refuse_unknown("", list(rows))
+        for peer in self.values["peers"]:
+            if peer not in NODES:
+                raise ParameterError(f"peers: {peer!r}; expected some of {', '.join(NODES)}")
+        self.add_on_set_parameters_callback(self._on_set)
+
+    def _refuse_unknown(self, kind: str, known: Sequence[str]) -> None:
+        """Refuse parameters that were given, and that the node has not declared: typing errors, mostly."""
+        for name in self._parameter_overrides:
+            if name.startswith("qos_overrides.") == bool(kind) and not self.has_parameter(name):
+                close = difflib.get_close_matches(name, known, 1)
+                meant = f"did you mean {close[0]!r}?" if close else f"expected some of {', '.join(known)}"
+                raise ParameterError(f"{name}: no such parameter of node {self.row.name}; {meant}")
+
+    def _on_set(self, given: list[Any]) -> SetParametersResult:
+        """Refuse values that make no sense, and all while the node works with what it has read."""
+        rows = {row.name: row for row in self.row.parameters}
+        for parameter in given:
+            row = rows.get(parameter.name)
+            if row is None:
+                continue
+            if self.state != "unconfigured":
+                return SetParametersResult(
+                    successful=False,
+                    reason=f"{row.name}: the node is {self.state}; expected it to be unconfigured, "
+                    "since what it has checked and loaded does not change under it",
+                )
+            try:
+                row.value(parameter.value)
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    # The life cycle.
+
+    @property
+    def state(self) -> str:
+        """State of the life cycle: `unconfigured`, `inactive`, `active` or `finalized`."""
+        return str(self._state_machine.current_state[1])
+
+    def configure(self) -> None:
+        """Load and check what the parameters name.
+
+        Raises:
+            UavDcError: it cannot be flown.
+        """
+
+    def activate(self) -> None:
+        """Start. The topics work from here on."""
+
+    def deactivate(self) -> None:
+        """Stop safely. The topics still work."""
+
+    def cleanup(self) -> None:
+        """Let go of what `configure` made."""
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition to inactive: parameters are read, everything is loaded."""
+        return self._attempt(self._configure, undo=self._cleanup)
+
+    def _configure(self) -> None:
+        for row in self.row.parameters:
+            self.values[row.name] = row.value(self.get_parameter(row.name).value)
+        self.configure()
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition to active."""
+        return self._attempt(self._activate, undo=self._fall_silent)
+
+    def _activate(self) -> None:
+        self._is_active = True
+        self.activate()
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition to inactive: a safe stop; nothing is heard any more."""
+        return self._attempt(self._deactivate)
+
+    def _deactivate(self) -> None:
+        self.deactivate()
+        self._fall_silent()
+
+    def _fall_silent(self) -> None:
+        """Undo what `_activate` did."""
+        self._is_active = False
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition to unconfigured."""
+        return self._attempt(self._cleanup)
+
+    def _cleanup(self) -> None:
+        self.cleanup()
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition to finalized, from wherever the node is."""
+        return self._attempt(self._shut_down)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After a transition that failed in a way nobody thought of: back to unconfigured."""
+        return self._attempt(self._shut_down)
+
+    def _shut_down(self) -> None:
+        if self._is_active:
+            self._deactivate()
+        self._cleanup()
+
+    def _attempt(
+        self, act: Callable[[], None], undo: Callable[[], None] = lambda: None
+    ) -> TransitionCallbackReturn:
+        """Do what a transition asks for; what goes wrong is told, undone, and refuses the transition."""
+        self.failure = None
+        try:
+            act()
+        except UavDcError as error:
+            self.failure = error
+            self.get_logger().error(str(error))
+            undo()
+            return TransitionCallbackReturn.FAILURE
+        except Exception:  # the caller would swallow it
+            self.get_logger().fatal(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+    def _refuse_impossible(self, request: Any, response: Any) -> Any:
+        """Answer a wish for a transition that this state does not have: rclpy would end the node."""
+        try:
+            return self._change_state(request, response)
+        except _rclpy.RCLError:
+            wanted = request.transition.label or request.transition.id
+            self.get_logger().warning(f"transition {wanted}: not one from the state {self.state}")
+            response.success = False
+            return response
+
+
+def _descriptor(row: Parameter) -> ParameterDescriptor:
+    """What ROS tells about a parameter, and checks itself."""
+    unit = f" [{row.unit}]" if row.unit else ""
+    descriptor = ParameterDescriptor(
+        description=f"{row.description}{unit}",
+        additional_constraints=row.expected,
+        read_only=row.read_only,
+        dynamic_typing=isinstance(row.default, str),  # `-p pace:=90` arrives as a number
+    )
+    if isinstance(row.default, float):
+        descriptor.floating_point_range = [FloatingPointRange(from_value=row.least, to_value=row.most)]
+    elif row.least is not None:
+        descriptor.integer_range = [IntegerRange(from_value=int(row.least), to_value=int(row.most or 0))]
+    return descriptor
