@@ -18,7 +18,8 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context
 
 TURN_MAX = 100  # messages of one topic before the others get their turn
-BUSY_S = 0.01  # while messages keep coming, services and clients are looked at this often
+BUSY_S = 0.003  # while messages keep coming, timers and services are looked at this often
+BUSY_NS = round(BUSY_S * 1e9)
 
 
 class DirectExecutor:
@@ -39,8 +40,10 @@ class DirectExecutor:
         self._guard = GuardCondition(callback=None, callback_group=None, context=self._context)
         self._nodes: list[Node] = []
         self._wait_set: Any = None
+        self._few: Any = None  # a wait set for subscriptions alone
+        self._subscriptions: list[Any] = []  # as of the last look at everything
         self._capacity: tuple[int, ...] = ()
-        self._looked_s = 0.0  # when services and clients were last looked at
+        self._looked_s = 0.0  # when everything was last looked at
 
     def add_node(self, node: Node) -> None:
         """Handle a node's callbacks from now on."""
@@ -72,19 +75,40 @@ class DirectExecutor:
         """Wait, and handle all that is ready; False if the time was over before anything came.
 
         Each entity in a wait costs time, and most of a node's are services that hardly anybody calls. So
-        while a node is busy they are left out, until it has been so for `BUSY_S`.
+        while messages keep coming, only subscriptions are waited for, until that has been so for `BUSY_S`.
         """
-        if time.monotonic() - self._looked_s < BUSY_S and self._wait(BUSY_S, all=False):
+        busy = self._subscriptions and time.monotonic() - self._looked_s < BUSY_S
+        if busy and self._take_what_comes():
             return True
-        handled = self._wait(timeout_s, all=True)
+        handled = self._look_at_all(timeout_s)
         self._looked_s = time.monotonic()
+        subscriptions = [entity for node in self._nodes for entity in node.subscriptions]
+        if len(subscriptions) > len(self._subscriptions):
+            self._few = _rclpy.WaitSet(len(subscriptions), 1, 0, 0, 0, 0, self._context.handle)
+        self._subscriptions = subscriptions
         return handled
 
-    def _wait(self, timeout_s: float | None, *, all: bool) -> bool:
+    def _take_what_comes(self) -> bool:
+        """Wait for messages, and handle them; False if none came within `BUSY_S`, or somebody wakes us."""
+        wait_set = self._few
+        wait_set.clear_entities()
+        for subscription in self._subscriptions:
+            wait_set.add_subscription(subscription.handle)
+        wait_set.add_guard_condition(self._guard.handle)
+        wait_set.wait(BUSY_NS)
+        ready = [
+            entity for at, entity in enumerate(self._subscriptions) if wait_set.is_ready("subscription", at)
+        ]
+        for subscription in ready:
+            self._take_messages(subscription)
+        return bool(ready) and not wait_set.is_ready("guard_condition", 0)
+
+    def _look_at_all(self, timeout_s: float | None) -> bool:
+        """Wait for anything, and handle it; False if the time was over before."""
         timers = [timer for node in self._nodes for timer in node.timers]
         subscriptions = [subscription for node in self._nodes for subscription in node.subscriptions]
-        services = [service for node in self._nodes for service in node.services if all]
-        clients = [client for node in self._nodes for client in node.clients if all]
+        services = [service for node in self._nodes for service in node.services]
+        clients = [client for node in self._nodes for client in node.clients]
         wait_set = self._emptied(len(subscriptions), 1, len(timers), len(clients), len(services))
         timer_at = [wait_set.add_timer(timer.handle) for timer in timers]
         subscription_at = [wait_set.add_subscription(entity.handle) for entity in subscriptions]
@@ -112,10 +136,10 @@ class DirectExecutor:
         return bool(ready) or woken
 
     def _take_messages(self, subscription: Any) -> None:
+        handle = subscription.handle
         with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
         for _ in range(self._at_once):
-            with subscription.handle:
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            taken = handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 return
             if with_info:
@@ -128,9 +152,8 @@ class DirectExecutor:
         if any(has < wants for has, wants in zip(self._capacity or (0,) * 5, capacity, strict=True)):
             self._capacity = capacity
             subscriptions, guards, timers, clients, services = capacity
-            self._wait_set = _rclpy.WaitSet(
-                subscriptions, guards, timers, clients, services, 0, self._context.handle
-            )
+            context = self._context.handle
+            self._wait_set = _rclpy.WaitSet(subscriptions, guards, timers, clients, services, 0, context)
         self._wait_set.clear_entities()
         return self._wait_set
 

@@ -1,5 +1,6 @@
 """Runs one node as a process: from its start to the last word."""
 
+import gc
 import os
 import select
 import signal
@@ -14,7 +15,7 @@ import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from uav_dc_ros.errors import UavDcError
+from uav_dc_ros.errors import ParameterError, UavDcError
 from uav_dc_ros.nodes import fastdds
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.mission_node import SUPERVISED, MissionNode
@@ -22,6 +23,7 @@ from uav_dc_ros.nodes.mission_node import SUPERVISED, MissionNode
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.2  # a message that was lost on the way is sent again within a tenth
 LEAVE_S = 1.0
+BACKGROUND = 5  # niceness of a node that nobody waits for
 # Exit statuses. Python's own 1 is left to what nobody thought of: only that is worth another try.
 NOT_BEGUN = 2
 GAVE_UP = 3
@@ -61,27 +63,40 @@ class Stopper:
 
 def main(make: Callable[[], MissionNode]) -> NoReturn:
     """Run one node until it is asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`."""
-    status = NOT_BEGUN
     fastdds.use_profiles()
+    status = NOT_BEGUN
     try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        node = make()
+        node = _made(make)
         executor = DirectExecutor(node.rest_s)
         executor.add_node(node)
         stopper = Stopper(executor.wake)
         if _begin(node):
+            gc.freeze()  # what is there by now stays: no need to look at it again and again
+            if node.rest_s:
+                os.nice(BACKGROUND)
             status = GAVE_UP
             status = _run(node, executor, stopper)
     except UavDcError as error:
         print(f"error: {error}", file=sys.stderr)
-    except (_rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError, _rclpy.RCLError) as error:
-        print(f"error: {error}; see the ROS arguments after --ros-args", file=sys.stderr)
     # All is said and written. The middleware has been seen to hang while several of its participants leave
     # at once; that must not turn a good ending into a killed process.
     sys.stderr.flush()
     threading.Timer(LEAVE_S, os._exit, (status,)).start()
     rclpy.try_shutdown()
     os._exit(status)
+
+
+def _made(make: Callable[[], MissionNode]) -> MissionNode:
+    """Initialise ROS and make the node.
+
+    Raises:
+        ParameterError: what stands after --ros-args makes no sense.
+    """
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        return make()
+    except (_rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError, _rclpy.RCLError) as error:
+        raise ParameterError(f"{error}; expected ROS arguments after --ros-args") from None
 
 
 def _begin(node: MissionNode) -> bool:
