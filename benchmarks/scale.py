@@ -30,7 +30,7 @@ def main() -> None:
             text = shipped.replace("users_per_cluster = 10", f"users_per_cluster = {users // CLUSTERS}")
             assert f"users_per_cluster = {users // CLUSTERS}" in text, "the scenario has changed"
             scenario.write_text(text)
-            missions = max(1, round(SECONDS_WANTED * min(500, 50_000 / users) / 60))
+            missions = max(1, round(SECONDS_WANTED * min(600, 450_000 / users) / 60))
             options = ("--scenario", scenario, "--policy", "five_clusters_dueling", "--pace", "lockstep")
             flown = fly(Path(folder), *options, "--missions", missions)
             sizes = [flown.payload_bytes[topic] / 1e3 for topic in ("users", "rates")]

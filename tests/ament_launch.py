@@ -14,6 +14,8 @@ from xml.etree import ElementTree
 
 from ruamel.yaml import YAML
 
+from uav_dc_ros.nodes.table import NODES
+
 ATTRIBUTES = {
     "launch": set(),
     "arg": {"name", "default", "description"},
@@ -70,7 +72,7 @@ def _run(parent: ElementTree.Element, variables: dict[str, str]) -> list[Launche
             started += _run(element, dict(variables))
         else:
             assert text["output"] == "screen"
-            assert text["on_exit"] == "shutdown"
+            assert (text.get("on_exit") == "shutdown") == NODES[text["name"]].needed
             started.append(
                 LaunchedNode(
                     *(_expand(text[key], variables) for key in ("pkg", "exec", "name", "namespace")),

@@ -25,20 +25,19 @@ pytestmark = pytest.mark.xdist_group("ament")
 
 LAUNCH = ROOT / "uav_dc_ros" / "share" / "launch" / "mission.launch.xml"
 PROCESSES = [name for name, row in NODES.items() if row.process]
+STARTED = [name for name in PROCESSES if not NODES[name].on_request]
+PEERS = [name for name in PROCESSES if NODES[name].needed]
 
 # Options of run_all without an argument of their name, and why.
 OTHERWISE = {
     "no_record": "record:=false",
     "summary": "run_all itself follows the missions and sums them up; under launch nobody does",
-    "live": "run_all's own server, while it is not a node",
     "help": "ros2 launch --show-args",
     "version": "in package.xml",
 }
 # Arguments without an option of their name, and why.
 OF_LAUNCH_ONLY = {
     "record": "--no-record",
-    "namespace": "run_all flies in the namespace of its network, so far",
-    "nodes": "run_all starts all of them, so far",
 }
 
 
@@ -174,19 +173,19 @@ def test_the_arguments_of_the_launch_file_are_the_options_of_run_all():
     for name in ("scenario", "seed", "missions"):
         assert arguments[name]["default"] == str(options[name].default)
     assert float(arguments["pace"]["default"]) == options["pace"].default
-    assert arguments["nodes"]["default"].split(",") == PROCESSES
+    assert arguments["nodes"]["default"].split(",") == STARTED
 
 
 @pytest.mark.parametrize(
     ("given", "started", "peers"),
     [
-        ({}, PROCESSES, PROCESSES),
+        ({}, STARTED, PEERS),
         (
             {"record": "false"},
-            [n for n in PROCESSES if n != "recorder"],
-            [n for n in PROCESSES if n != "recorder"],
+            [n for n in STARTED if n != "recorder"],
+            [n for n in PEERS if n != "recorder"],
         ),
-        ({"nodes": "policy,recorder"}, ["policy", "recorder"], PROCESSES),
+        ({"nodes": "policy,recorder"}, ["policy", "recorder"], PEERS),
     ],
     ids=["all", "no bag", "two of them"],
 )
@@ -199,6 +198,11 @@ def test_the_launch_file_starts(given, started, peers):
         assert node.parameters["scenario"] == "five_clusters"
         assert node.parameters.get("policy", "five_clusters_dueling") == "five_clusters_dueling"
         assert re.fullmatch(r"bags/[\d_-]+", node.parameters.get("bag", "bags/1"))
+
+
+def test_the_launch_file_starts_a_live_view_if_asked():
+    (view,) = (node for node in ament_launch.nodes(LAUNCH, {"live": "8765"}) if node.name == "live_view")
+    assert view.parameters == {"port": 8765}
 
 
 def test_the_launch_file_s_nodes_fly(workspace, ros):

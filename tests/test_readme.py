@@ -19,9 +19,10 @@ def test_the_topic_table_is_the_code_s() -> None:
     assert [(name, type) for name, type, _, _ in rows] == [(t.name, t.type) for t in TOPICS.values()]
     for name, _, publisher, qos in rows:
         durability = "transient local" if TOPICS[name].latched else "volatile"
-        assert qos == f"reliable, {durability}"
+        assert qos == f"{'reliable' if TOPICS[name].reliable else 'best effort'}, {durability}"
         publishers = [row.name for row in NODES.values() if name in row.publishes]
-        assert publisher == (publishers[0] if len(publishers) == 1 else "all but the world")
+        several = "every node" if len(publishers) == len(NODES) else "other nodes"
+        assert publisher == (publishers[0] if len(publishers) == 1 else several)
 
 
 def test_every_key_in_the_symbol_table_is_a_scenario_s() -> None:

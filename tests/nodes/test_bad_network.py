@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,9 @@ from uav_dc_ros.core.grid import Action
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=f"no link: {unavailable()}")
 
 STEPS = 30
-# What a mission is; the other topics tell of it, and of the nodes, a few times a second.
-RECORDED = ["pose", "users", "rates", "mission", "move", "target"]
+# What a mission is. A pose is taken best effort, as an autopilot's has to be: on a bad link a bag lacks some.
+# The other topics tell of the mission, and of the nodes, a few times a second.
+RECORDED = ["users", "rates", "mission", "move", "target"]
 LOSS = {"loss": 0.2}
 DELAY = {"delay_s": 0.1, "jitter_s": 0.02}
 PATIENCE_S = 120.0
@@ -214,11 +215,9 @@ def check_every_step_was_flown_once(flown: Flown) -> None:
     assert steps(flown.bag, "mission") == said
 
 
-def check_it_was_flown_as_undisturbed(
-    flown: Flown, mission: Mission, topics: Sequence[str] = RECORDED
-) -> None:
+def check_it_was_flown_as_undisturbed(flown: Flown, mission: Mission) -> None:
     check_every_step_was_flown_once(flown)
-    for topic in topics:
+    for topic in RECORDED:
         assert steps(flown.bag, topic) == mission.undisturbed[topic], topic
 
 
@@ -332,12 +331,10 @@ def test_lockstep_with_a_partition_after_which_the_hosts_have_forgotten_each_oth
 ) -> None:
     """Fast DDS forgets a participant that was silent for twenty seconds.
 
-    When it finds it again, latched topics are told again; of the others, what was on its way is lost: the
-    bag has a hole in `pose`. Who acts on a pose is on the vehicle's host.
+    When it finds it again, latched topics are told again; of the others, what was on its way is lost.
     """
     flown = fly(ros, mission, bad={"delay_s": 0.02}, cut_s=30.0)
-    kept = [topic for topic in RECORDED if topic != "pose"]
-    check_it_was_flown_as_undisturbed(flown, mission, kept)
+    check_it_was_flown_as_undisturbed(flown, mission)
 
 
 @pytest.mark.long

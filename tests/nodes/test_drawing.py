@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from visualization_msgs.msg import Marker, MarkerArray
 
-from tests.nodes import poses
+from tests.nodes.poses import pose as pose_message
 from uav_dc_ros import scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
@@ -182,7 +182,7 @@ def test_ten_thousand_users_are_drawn_within_milliseconds() -> None:
 
 
 def test_a_path_holds_its_poses() -> None:
-    given = [poses.pose(np.array([1.5 * i, -2.0 * i, 100.0]), i * STEP_NS + i) for i in range(4)]
+    given = [pose_message(np.array([1.5 * i, -2.0 * i, 100.0]), i * STEP_NS + i) for i in range(4)]
     for n in range(1, 5):
         poses = [cdr.Pose(serialize_message(pose)) for pose in given[:n]]
         message = deserialize_message(cdr.path(poses), PathMessage)
@@ -193,7 +193,7 @@ def test_a_path_holds_its_poses() -> None:
 
 def test_a_pose_is_read_in_either_byte_order() -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
-    little = serialize_message(poses.pose(np.array([1.0, 2.0, 3.0]), 4_000_000_005))
+    little = serialize_message(pose_message(np.array([1.0, 2.0, 3.0]), 4_000_000_005))
     message = store.deserialize_cdr(little, "geometry_msgs/msg/PoseStamped")
     big = bytes(store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped", little_endian=False))
     for data in (little, big):
@@ -212,7 +212,7 @@ def test_a_pose_in_another_frame_is_refused(frame: str) -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_pose_that_is_nowhere_is_refused(bad: float) -> None:
     with pytest.raises(MessageError, match="expected finite metres"):
-        cdr.Pose(serialize_message(poses.pose(np.array([0.0, bad, 0.0]), 0)))
+        cdr.Pose(serialize_message(pose_message(np.array([0.0, bad, 0.0]), 0)))
 
 
 class Flight:
@@ -228,7 +228,7 @@ class Flight:
     def step(self, mission: int, step: int, *, heard: tuple[str, ...] = ("pose", "users", "target")) -> Any:
         """One step; what is told in two halves comes as the executor may hand it over."""
         time_ns = (mission * 61 + step) * STEP_NS
-        pose = cdr.Pose(serialize_message(poses.pose(np.array([mission, step, 100.0]), time_ns)))
+        pose = cdr.Pose(serialize_message(pose_message(np.array([mission, step, 100.0]), time_ns)))
         at_ns = {topic: self.published_ns() for topic in ("pose", "users", "target")}
         told = {
             "pose": lambda: self.track.pose(pose, at_ns["pose"]),
@@ -261,7 +261,7 @@ def test_what_is_flown_between_two_missions_belongs_to_none() -> None:
     flight = Flight(Track(SCENARIO))
     for call in flight.step(0, 60):
         call()
-    between = cdr.Pose(serialize_message(poses.pose(np.array([9.0, 9.0, 100.0]), 61 * STEP_NS - 1)))
+    between = cdr.Pose(serialize_message(pose_message(np.array([9.0, 9.0, 100.0]), 61 * STEP_NS - 1)))
     flight.track.pose(between, flight.published_ns())
     for call in flight.step(1, 0):
         call()
