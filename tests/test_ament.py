@@ -126,7 +126,13 @@ def test_the_workspace_holds_what_ros2_looks_for(workspace):
         assert os.access(prefix / "lib" / "uav_dc_ros" / name, os.X_OK)
 
 
-@pytest.mark.parametrize("options", [[], ["--symlink-install"]], ids=["copied", "linked"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param([], id="copied"),
+        pytest.param(["--symlink-install"], id="linked", marks=pytest.mark.long),
+    ],
+)
 def test_a_workspace_flies(options, workspace, tmp_path_factory, repository_files, ros):
     prefix, environment = workspace
     if options:

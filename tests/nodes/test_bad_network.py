@@ -282,12 +282,14 @@ def test_run_all_on_two_hosts_with_loss(ros: Ros, mission: Mission) -> None:
         assert steps(bag, topic) == mission.undisturbed[topic], topic
 
 
+@pytest.mark.long
 def test_lockstep_with_delay(ros: Ros, mission: Mission) -> None:
     begun_s = time.monotonic()
     check_it_was_flown_as_undisturbed(fly(ros, mission, bad=DELAY), mission)
     assert time.monotonic() - begun_s > STEPS * 2 * (DELAY["delay_s"] - DELAY["jitter_s"])
 
 
+@pytest.mark.long
 def test_lockstep_with_a_partition(ros: Ros, mission: Mission) -> None:
     flown = fly(ros, mission, bad={"delay_s": 0.02}, cut_s=3.0)
     check_it_was_flown_as_undisturbed(flown, mission)

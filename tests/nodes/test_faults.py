@@ -18,9 +18,9 @@ FLYING = "mission: step 5/30"
 
 @pytest.fixture
 def arguments(small_scenario: Path, small_policy: Path, tmp_path: Path) -> list[object]:
-    """A mission of thirty seconds, which no test waits for."""
+    """A mission of twelve seconds, which no test waits for."""
     return [
-        *("--scenario", small_scenario, "--policy", small_policy, "--pace", 10),
+        *("--scenario", small_scenario, "--policy", small_policy, "--pace", 25),
         *("--bag", tmp_path / "bag", "--summary", tmp_path / "summary.json"),
     ]
 
@@ -45,11 +45,19 @@ def test_ctrl_c_stops_everything_and_leaves_a_readable_bag(
     assert (tmp_path / "bag" / "metadata.yaml").is_file()
 
 
-@pytest.mark.parametrize("node", ["world", "channel_monitor", "policy", "recorder"])
+@pytest.mark.parametrize(
+    "node",
+    [
+        pytest.param("world", marks=pytest.mark.long),
+        pytest.param("channel_monitor", marks=pytest.mark.long),
+        "policy",
+        "recorder",
+    ],
+)
 def test_a_node_that_is_killed_is_started_again_and_the_vehicle_hovers_meanwhile(
     ros: Ros, arguments: list[object], tmp_path: Path, node: str
 ) -> None:
-    process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", 40)  # steps of a quarter second
+    process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", 80)  # steps of an eighth of a second
     assert process.stdout is not None
     wait_for(process.stdout, FLYING)
     os.kill(ros.node(node), signal.SIGKILL)
@@ -81,6 +89,7 @@ def test_nodes_end_with_a_launcher_that_is_killed(ros: Ros, arguments: list[obje
     assert len(read_bag(tmp_path / "bag")) > 20  # the recorder closed it on its own
 
 
+@pytest.mark.long
 def test_a_second_mission_on_the_same_network_is_refused_or_unharmed(
     ros: Ros, arguments: list[object], small_scenario: Path, small_policy: Path, tmp_path: Path
 ) -> None:

@@ -53,7 +53,7 @@ def test_a_broken_message_changes_nothing(
     status, output = ros.run_all(*options, "--pace", "lockstep", "--no-record", "--summary", quiet)
     assert status == 0, output
 
-    recorded = ("--pace", 25, "--bag", tmp_path / "bag", "--summary", disturbed)
+    recorded = ("--pace", 40, "--bag", tmp_path / "bag", "--summary", disturbed)
     flight = ros.start("uav_dc_ros.run_all", *options, *recorded)
     assert flight.stdout is not None
     probe = subprocess.Popen(

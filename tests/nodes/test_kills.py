@@ -19,7 +19,7 @@ from tests.conftest import Ros, finish, read_bag
 from uav_dc_ros.nodes.table import NODES
 
 KILLED = ["world", "channel_monitor", "policy", "recorder"]
-MISSIONS = 60
+MISSIONS = 40
 PERIOD_S = 60.0 / (NODES["world"].restarts * len(KILLED))  # so that nobody has died too often within a minute
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
 from websockets.exceptions import ConnectionClosed
 
 from tests.conftest import Ros, finish, wait_for
@@ -82,6 +83,7 @@ def until_closed(viewer: FoxgloveClient) -> Iterator[Heard]:
         return
 
 
+@pytest.mark.long
 def test_topics_are_called_as_in_the_graph_and_the_server_ends_with_the_mission(
     ros: Ros, small_scenario: Path, small_policy: Path
 ) -> None:

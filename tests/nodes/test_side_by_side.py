@@ -102,7 +102,7 @@ def test_a_recorder_that_starts_late_is_told_what_it_missed(
 ) -> None:
     status, output = ros.run_all(*options, "--bag", ros.folder / "alone")
     assert status == 0, output
-    flight = ros.start("uav_dc_ros.run_all", *options, "--pace", 20, "--no-record")
+    flight = ros.start("uav_dc_ros.run_all", *options, "--pace", 30, "--no-record")
     assert flight.stdout is not None
     wait_for(flight.stdout, "mission: step 5/30")
     bag = ros.folder / "late"

@@ -98,6 +98,7 @@ def by_hand(ros: Ros, scenario: object) -> Any:
     )
 
 
+@pytest.mark.long
 def test_who_joins_late_draws_the_whole_mission(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
     bag_folder = ros.folder / "bag"
     options = ("--scenario", small_scenario, "--policy", small_policy, "--pace", 30, "--bag", bag_folder)
