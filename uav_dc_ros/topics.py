@@ -9,8 +9,9 @@ Quality of service, with reasons:
 - *Latched* (transient local): what describes the state, so that whoever joins late, or again, learns it at
   once. A pose is not latched, since an autopilot's is not; a move is not, since an old one is worth nothing.
 - *Depth*: publishers keep as much as a node that was restarted, or a reader that fell behind, may want to
-  catch up on. Payloads with an entry per user can be large, so fewer of them are kept. Who acts on messages
-  keeps the newest hundred; who must miss nothing keeps all: see `hears_all` in the node table.
+  catch up on. Payloads with an entry per user can be large: of those no more are kept than 64 MiB hold, and
+  at least ten. Who acts on messages keeps the newest hundred; who must miss nothing keeps all: see
+  `hears_all` in the node table.
 
 Every policy can be overridden for each node, the ROS way: parameters `qos_overrides./TOPIC.publisher.*` and
 `qos_overrides./TOPIC.subscription.*` with `history`, `depth`, `reliability`, `durability`.

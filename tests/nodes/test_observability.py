@@ -28,6 +28,21 @@ while time.monotonic() < end and len(told) < int(sys.argv[2]):
     rclpy.spin_once(node, timeout_sec=0.1)
 print(json.dumps(told))
 """
+CLOCK = """
+import time
+import rclpy
+from rosgraph_msgs.msg import Clock
+rclpy.init()
+node = rclpy.create_node("clock")
+publisher = node.create_publisher(Clock, "/clock", 1)
+begun = time.monotonic()
+while True:
+    now_s = 300 * (time.monotonic() - begun)
+    message = Clock()
+    message.clock.sec, message.clock.nanosec = int(now_s), int(now_s % 1 * 1e9)
+    publisher.publish(message)
+    time.sleep(0.01)
+"""
 DEMANDING = """
 import sys, time
 import rclpy
@@ -109,6 +124,31 @@ def test_the_clock_is_mission_time_and_the_nodes_go_by_it(ros: Ros, options: lis
     }
     assert max(stamps["policy"]) <= 31 * 10.0, "the policy goes by the mission's clock"
     assert min(stamps["world"]) > 1e9, "the world makes that clock, and goes by its own"
+
+
+def test_the_world_goes_by_somebody_else_s_clock(ros: Ros, small_scenario: Path) -> None:
+    """Alone, with nobody to move it: steps of ten seconds, on a clock three hundred times too fast."""
+    heard = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("probe.py")), "/mission"],
+        env=ros.environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert heard.stdout is not None
+    given = ("-p", f"scenario:={small_scenario}", "-p", "pace:=1", "-p", "peers:=[world]")
+    world = ros.start("uav_dc_ros.nodes.world", "--ros-args", *given, "-p", "use_sim_time:=true")
+    assert '\\"step\\":0' in heard.stdout.readline()
+    clock = python(ros, CLOCK)
+    said = wait_for(heard.stdout, '\\"remaining_steps\\":0').splitlines()
+    clock.kill()
+    clock.communicate()
+    world.terminate()
+    status, output = finish(world)
+    heard.communicate()
+    assert status == 0, output
+    assert [json.loads(json.loads(line)["data"])["step"] for line in said] == list(range(1, 31))
+    assert "30 steps were hovered" in output
 
 
 def is_of(topic: str, message: Any, node: str) -> bool:

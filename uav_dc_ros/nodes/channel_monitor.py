@@ -17,6 +17,7 @@ from uav_dc_ros.nodes import cdr, convert, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 
+USER_BYTES = 60  # of `rates`, for each user
 WAITING_MAX = 256  # poses without users, and users without a pose
 
 
@@ -29,6 +30,7 @@ class ChannelMonitor(MissionNode):
     def configure(self) -> None:
         """Load the world, and the books of a monitor that was killed."""
         self.scenario = scenarios.load(self.values["scenario"])
+        self.message_bytes = {"rates": USER_BYTES * self.scenario.n_users}
         self.journal = Journal(self.values["journal"])
         self._step_ns = round(self.scenario.mission.step_s * 1e9)
         self._said: messages.Rates | None = None

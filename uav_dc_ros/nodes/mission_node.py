@@ -48,6 +48,8 @@ class MissionNode(ManagedNode):
         meter: what it counts for its diagnostics.
         restarts: how often it has been started again.
         peers: the other nodes of the mission.
+        message_bytes: about how large a message is that it publishes, by topic, where that may be much;
+            to be told when it is configured.
         published_ns: when the message that is being handled was published, nanoseconds since the epoch.
     """
 
@@ -59,6 +61,7 @@ class MissionNode(ManagedNode):
         self.meter = Meter()
         self.restarts = int(os.environ.get(SUPERVISED) or 0)
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.message_bytes: dict[str, int] = {}
         self.published_ns = 0
         self.publishers_of: dict[str, Publisher] = {}
         self.subscriptions_of: dict[str, Any] = {}
@@ -77,7 +80,7 @@ class MissionNode(ManagedNode):
                 self.publishers_of[name] = self.create_publisher(
                     qos.MESSAGE_TYPES[topic.type],
                     name,
-                    qos.offered(topic),
+                    qos.offered(topic, self.message_bytes.get(name, 0)),
                     event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
                     qos_overriding_options=qos.OVERRIDES,
                 )

@@ -39,16 +39,19 @@ MESSAGE_TYPES: dict[str, type] = {
 }
 # Messages kept by a subscription that acts on them: a burst of rubbish must not push out a real one.
 NEWEST = 100
+HISTORY_BYTES = 64 * 2**20  # that a publisher keeps of one topic for those who come late
+HISTORY_LEAST = 10  # messages, however large
 UNKNOWN = "UNKNOWN_"  # in a name that the graph does not know yet
 OVERRIDES = QoSOverridingOptions(
     [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY]
 )
 
 
-def offered(topic: Topic) -> QoSProfile:
-    """The QoS that a topic's publisher offers, from its row."""
+def offered(topic: Topic, message_bytes: int = 0) -> QoSProfile:
+    """The QoS that a topic's publisher offers, from its row; of large messages it keeps fewer."""
+    fitting = HISTORY_BYTES // message_bytes if message_bytes else topic.depth
     return QoSProfile(
-        depth=topic.depth,
+        depth=min(topic.depth, max(fitting, HISTORY_LEAST)),
         reliability=ReliabilityPolicy.RELIABLE if topic.reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
     )

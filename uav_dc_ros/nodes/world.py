@@ -31,6 +31,7 @@ from uav_dc_ros.nodes.table import NODES
 
 STALL_S = 0.5  # a lockstep that stands still for so long repeats its last messages
 CLOCK_PERIOD_S = 0.05
+USER_BYTES = 40  # of `users`, for each of them
 OVERRUN_S = 0.005  # a step at a pace that starts later than this after its time
 
 
@@ -53,6 +54,7 @@ class World(MissionNode):
         self.scenario = scenarios.load(self.values["scenario"])
         self.pace: float | None = self.values["pace"]
         pace.check(self.scenario, self.pace, self.values["missions"])
+        self.message_bytes = {"users": USER_BYTES * self.scenario.n_users}
         self.journal = Journal(self.values["journal"])
 
     def activate(self) -> None:
