@@ -53,6 +53,16 @@ class Ros:
             **popen,
         )
 
+    def stranger(self, name: str, *arguments: object) -> subprocess.Popen[str]:
+        """Start a script of `tests/nodes` beside the nodes; its input and output are piped."""
+        return subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("nodes") / f"{name}.py"), *map(str, arguments)],
+            env=self.environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
     def run(self, module: str, *arguments: object, timeout_s: float = 90.0) -> tuple[int, str]:
         """Run it to its end; the exit status and what it printed."""
         process = self.start(module, *arguments)

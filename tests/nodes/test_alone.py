@@ -1,8 +1,6 @@
 """Each node alone, as on a robot: started by hand, in a namespace, with ROS parameters."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +13,7 @@ NAMESPACE = ("-r", "__ns:=/uav1")
 
 def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
     """World first, policy last: it waits for them. No recorder takes part, and a stranger listens."""
-    probe = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("probe.py")), "/uav1/mission"],
-        env=ros.environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    probe = ros.stranger("probe", "/uav1/mission")
     assert probe.stdin is not None
     assert probe.stdout is not None
     scenario, policy = f"scenario:={small_scenario}", f"policy:={small_policy}"
@@ -47,13 +39,7 @@ def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path
 def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario: Path) -> None:
     """A stranger plays the policy, and lets the vehicle wait: nothing is flown or booked twice."""
     heard = [f"/{topic}" for topic in ("mission", "rates")]
-    stranger = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("probe.py")), *heard],
-        env=ros.environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    stranger = ros.stranger("probe", *heard)
     assert stranger.stdin is not None
     assert stranger.stdout is not None
 

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 from tests.conftest import Ros, finish, wait_for
@@ -56,12 +54,7 @@ def test_a_broken_message_changes_nothing(
     recorded = ("--pace", 40, "--bag", tmp_path / "bag", "--summary", disturbed)
     flight = ros.start("uav_dc_ros.run_all", *options, *recorded)
     assert flight.stdout is not None
-    probe = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("probe.py"))],
-        env=ros.environment,
-        stdin=subprocess.PIPE,
-        text=True,
-    )
+    probe = ros.stranger("probe")
     assert probe.stdin is not None
     output = wait_for(flight.stdout, "mission: step 0/30")
     commands = [

@@ -2,9 +2,7 @@
 
 import json
 import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,13 +18,7 @@ class Asker:
     """Calls services of nodes, in a process of its own."""
 
     def __init__(self, ros: Ros) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("asker.py"))],
-            env=ros.environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self.process = ros.stranger("asker")
 
     def ask(self, **command: Any) -> dict[str, Any]:
         assert self.process.stdin is not None

@@ -128,13 +128,7 @@ def test_the_clock_is_mission_time_and_the_nodes_go_by_it(ros: Ros, options: lis
 
 def test_the_world_goes_by_somebody_else_s_clock(ros: Ros, small_scenario: Path) -> None:
     """Alone, with nobody to move it: steps of ten seconds, on a clock three hundred times too fast."""
-    heard = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("probe.py")), "/mission"],
-        env=ros.environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    heard = ros.stranger("probe", "/mission")
     assert heard.stdout is not None
     given = ("-p", f"scenario:={small_scenario}", "-p", "pace:=1", "-p", "peers:=[world]")
     world = ros.start("uav_dc_ros.nodes.world", "--ros-args", *given, "-p", "use_sim_time:=true")

@@ -5,8 +5,6 @@ run comes to its end.
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -128,12 +126,7 @@ def test_a_lie_ends_no_node_and_no_run_hangs(ros: Ros, truth: dict[str, list[Any
     topic, payload = lies(scenarios.load(ros.folder / "small.toml"))[lie]
     flight = ros.start("uav_dc_ros.run_all", *given, "--bag", ros.folder / "bag")
     assert flight.stdout is not None
-    probe = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("probe.py"))],
-        env=ros.environment,
-        stdin=subprocess.PIPE,
-        text=True,
-    )
+    probe = ros.stranger("probe")
     assert probe.stdin is not None
     output = wait_for(flight.stdout, "mission 2 of")
     hearing = sum(topic in NODES[peer].subscribes for peer in PEERS)
