@@ -18,7 +18,7 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes.table import NODES
 
-MISSIONS = 30
+MISSIONS = 120  # so many that the lie is told before they are over
 LATER = 20  # a mission that is yet to come when the lie is told
 FAR_NS = 2**62
 
