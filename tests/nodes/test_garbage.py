@@ -4,6 +4,8 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.conftest import Ros, finish, wait_for
 from uav_dc_ros.nodes.table import NODES
 
@@ -43,6 +45,7 @@ GARBAGE = {
 }
 
 
+@pytest.mark.long
 def test_a_broken_message_changes_nothing(
     ros: Ros, small_scenario: Path, small_policy: Path, tmp_path: Path
 ) -> None:

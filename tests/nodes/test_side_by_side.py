@@ -89,6 +89,7 @@ def test_a_policy_that_starts_late_flies_from_the_first_step(
     policy = ros.start(
         "uav_dc_ros.nodes.policy",
         *("--ros-args", "-p", f"policy:={small_policy}", "-p", f"scenario:={small_scenario}"),
+        *("-p", "peers:=[world, channel_monitor, recorder]"),  # with the recorder, as run_all has it
     )
     status, output = finish(flight)
     assert status == 0, output

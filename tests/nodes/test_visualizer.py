@@ -123,6 +123,7 @@ def test_who_joins_late_draws_the_whole_mission(ros: Ros, small_scenario: Path, 
     assert sum(len(marker.points) for marker in shown(soon, "users").values()) == 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", ["five_clusters"])
 def test_another_world_s_mission_is_refused(
     ros: Ros, small_scenario: Path, small_policy: Path, scenario: str
