@@ -20,7 +20,6 @@ from uav_dc_ros.nodes.table import NODES
 
 KILLED = ["world", "channel_monitor", "policy", "recorder"]
 MISSIONS = 40
-PERIOD_S = 60.0 / (NODES["world"].restarts * len(KILLED))  # so that nobody has died too often within a minute
 
 
 def flight(ros: Ros, name: str, *options: object, missions: int = MISSIONS) -> subprocess.Popen[str]:
@@ -45,13 +44,11 @@ def payloads(bag: Path, topic: str) -> dict[tuple[int, int], Any]:
 
 
 def kill_until_it_ends(ros: Ros, process: subprocess.Popen[str], rng: random.Random, kills: int) -> list[str]:
-    """Kill nodes in turn, one by one, at random moments; their names."""
+    """Kill nodes at random moments, none of them more often than it is started again; their names."""
     killed: list[str] = []
-    order: list[str] = []
     while len(killed) < kills and process.poll() is None:
         time.sleep(rng.uniform(0.0, 0.8))
-        order = order or rng.sample(KILLED, len(KILLED))
-        name = order.pop()
+        name = rng.choice([name for name in KILLED if killed.count(name) < NODES[name].restarts])
         for process_id, command in ros.processes().items():
             if f"uav_dc_ros.nodes.{name} " in command:
                 os.kill(process_id, signal.SIGKILL)
