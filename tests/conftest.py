@@ -189,6 +189,11 @@ def copy_repository(files: list[str], folder: Path) -> None:
         shutil.copy(ROOT / name, folder / name)
 
 
+def each_once(told: list[Any]) -> list[Any]:
+    """What was told, without repetitions: a lockstep that stood still for a moment says its step again."""
+    return [message for i, message in enumerate(told) if i == 0 or message != told[i - 1]]
+
+
 def read_bag(folder: Path) -> list[tuple[str, Any]]:
     """Topic and content of each message of a bag, in its order; JSON payloads decoded."""
     from rosbags.highlevel import AnyReader

@@ -1,4 +1,4 @@
-"""Payloads of the JSON topics: typed, validated on both ends, never trusted.
+"""Payloads of the JSON topics: typed, checked by whoever reads them, never trusted.
 
 `msgs_json/` holds the same contract as JSON Schemas for other languages; a test holds the two equal,
 and `python -m uav_dc_ros.messages` writes them anew.

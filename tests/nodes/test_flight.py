@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 import uav_dc_ros
-from tests.conftest import Ros, read_bag
+from tests.conftest import Ros, each_once, read_bag
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.grid import Action
@@ -36,7 +36,7 @@ class Flown:
         self.messages = read_bag(self.bag)
 
     def payloads(self, topic: str) -> list[Any]:
-        return [message for name, message in self.messages if name == f"/{topic}"]
+        return each_once([message for name, message in self.messages if name == f"/{topic}"])
 
 
 @pytest.fixture(scope="module")

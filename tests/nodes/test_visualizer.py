@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.conftest import Ros, each_once, finish, read_bag, wait_for
 from uav_dc_ros.nodes.drawing import UserState
 
 STEPS = 30  # of the small world
@@ -71,7 +71,6 @@ def test_a_mission_is_drawn_as_it_was_flown(ros: Ros, small_scenario: Path, smal
     check_is_the_end(bag)
 
 
-@pytest.mark.long  # fails where the world, kept waiting, tells its first step twice
 def test_in_lockstep_each_mission_has_its_own_path(
     ros: Ros, small_scenario: Path, small_policy: Path
 ) -> None:
@@ -82,7 +81,7 @@ def test_in_lockstep_each_mission_has_its_own_path(
     )
     assert status == 0, output
     bag = Bag(bag_folder)
-    poses = [stop(pose) for pose in bag["pose"]]
+    poses = each_once([stop(pose) for pose in bag["pose"]])
     missions = [poses[i : i + STEPS + 1] for i in range(0, len(poses), STEPS + 1)]
     assert len(missions) == 20
     for path in bag["path"]:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:  # a command line reads its pace before anything heavy is impo
 LOCKSTEP = "lockstep"
 PACE_MAX = 1e6
 TIME_MAX_S = 2.0**31  # the seconds of a ROS time are 32 bits with a sign
-PERIOD_MIN_S = 0.005  # of a step at a pace: a step in lockstep takes about four milliseconds
+PERIOD_MIN_S = 0.005  # of a step at a pace; one in lockstep takes a millisecond or two
 
 
 def parse(text: str) -> float | None:

@@ -1,19 +1,40 @@
-"""The ROS side: nodes hold no maths, and only `convert` knows both messages and the core.
+"""The ROS side: nodes hold no maths; messages become the core's arrays in `convert`, `cdr` and `drawing`.
 
-table            NODES: what each node is, what it hears and says: the only list
-runtime          what all nodes share: parameters, topics from the tables, peers, the way to the end
-pairs            what belongs to one step, brought together
-convert          messages to and from the core's arrays
+The tables, each the only list of its kind:
+
+table            NODES: what each node is, hears and says, when it starts, and how often again
+parameters       every parameter: description, unit, range
+qos              profiles of the topics of `uav_dc_ros.topics`, and the peers that do not match
+
+What all nodes are made of, the lower ones first:
+
+managed_node     the life cycle, and the parameters
+mission_node     topics from the tables, peers, diagnostics
+diagnostics      what a node counts, once a second
+journal          what a node that was killed must know again
+executor         one thread that handles what is ready
+fastdds          the middleware's settings
+runtime          one node as a process: from its start to the last word
+executable       what `ros2 run` starts: any of the nodes, by the name that it is called
+
+The nodes:
+
 world            the vehicle in simulation, and the users who walk about
 channel_monitor  SINR, rates, and the data collected
-policy           decides moves with a trained policy
+policy           decides moves with a trained policy; pairs brings together what belongs to one step
 recorder         writes the bag
-visualizer       draws path and markers; track knows which poses belong to the mission, drawing and cdr make
-                 the messages
+visualizer       draws path and markers; track knows which poses belong to the mission, drawing draws
 live_view        serves the mission to Foxglove; foxglove_server is its server
-observer         run_all's own eyes: progress and summary
-launcher         starts, watches and stops the nodes of a mission
-executable       what `ros2 run` starts: any of the nodes, by the name that it is called
+
+What run_all is made of:
+
+flight           one run: check everything, start, follow, stop, tell
+supervisor       brings nodes up in order, starts dead ones again, takes them down in reverse
+launcher         a node as a child process
+observer         run_all's own eyes: the mission so far, and its summary
+display          what the user sees of it
+
+Between them: convert (payloads and arrays), cdr (serialised messages, where speed matters).
 """
 
 import importlib.util

@@ -1,4 +1,4 @@
-"""Messages to and from the core's arrays: the only code that knows both."""
+"""Payloads and messages to and from the core's arrays."""
 
 from typing import Literal
 

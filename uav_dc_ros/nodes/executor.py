@@ -44,6 +44,7 @@ class DirectExecutor:
         self._subscriptions: list[Any] = []  # as of the last look at everything
         self._capacity: tuple[int, ...] = ()
         self._looked_s = 0.0  # when everything was last looked at
+        self._heard_s = 0.0  # when a message was last handled
 
     def add_node(self, node: Node) -> None:
         """Handle a node's callbacks from now on."""
@@ -54,14 +55,16 @@ class DirectExecutor:
         self._guard.trigger()
 
     def spin(self, stop: Callable[[], bool], quiet_s: float | None = None) -> None:
-        """Handle what comes until `stop` holds, or nothing came for `quiet_s` seconds.
+        """Handle what comes until `stop` holds, or no message came for `quiet_s` seconds.
 
         Raises:
             Exception: whatever a callback raises.
         """
+        self._heard_s = time.monotonic()
         with self._context.handle:
             while not stop():
-                if not self._turn(quiet_s):
+                self._turn(quiet_s)
+                if quiet_s is not None and time.monotonic() - self._heard_s > quiet_s:
                     return
                 if self.rest_s:
                     time.sleep(self.rest_s)
@@ -71,22 +74,21 @@ class DirectExecutor:
         with self._context.handle:
             self._turn(timeout_s)
 
-    def _turn(self, timeout_s: float | None) -> bool:
-        """Wait, and handle all that is ready; False if the time was over before anything came.
+    def _turn(self, timeout_s: float | None) -> None:
+        """Wait for what comes within `timeout_s` seconds, and handle all that is ready.
 
         Each entity in a wait costs time, and most of a node's are services that hardly anybody calls. So
         while messages keep coming, only subscriptions are waited for, until that has been so for `BUSY_S`.
         """
         busy = self._subscriptions and time.monotonic() - self._looked_s < BUSY_S
         if busy and self._take_what_comes():
-            return True
-        handled = self._look_at_all(timeout_s)
+            return
+        self._look_at_all(timeout_s)
         self._looked_s = time.monotonic()
         subscriptions = [entity for node in self._nodes for entity in node.subscriptions]
         if len(subscriptions) > len(self._subscriptions):
             self._few = _rclpy.WaitSet(len(subscriptions), 1, 0, 0, 0, 0, self._context.handle)
         self._subscriptions = subscriptions
-        return handled
 
     def _take_what_comes(self) -> bool:
         """Wait for messages, and handle them; False if none came within `BUSY_S`, or somebody wakes us."""
@@ -103,8 +105,8 @@ class DirectExecutor:
             self._take_messages(subscription)
         return bool(ready) and not wait_set.is_ready("guard_condition", 0)
 
-    def _look_at_all(self, timeout_s: float | None) -> bool:
-        """Wait for anything, and handle it; False if the time was over before."""
+    def _look_at_all(self, timeout_s: float | None) -> None:
+        """Wait for anything, and handle it."""
         timers = [timer for node in self._nodes for timer in node.timers]
         subscriptions = [subscription for node in self._nodes for subscription in node.subscriptions]
         services = [service for node in self._nodes for service in node.services]
@@ -114,7 +116,7 @@ class DirectExecutor:
         subscription_at = [wait_set.add_subscription(entity.handle) for entity in subscriptions]
         service_at = [wait_set.add_service(entity.handle) for entity in services]
         client_at = [wait_set.add_client(entity.handle) for entity in clients]
-        guard_at = wait_set.add_guard_condition(self._guard.handle)
+        wait_set.add_guard_condition(self._guard.handle)
         wait_set.wait(-1 if timeout_s is None else round(timeout_s * 1e9))
         # All that is ready is noted before any callback may change what there is.
         ready = [
@@ -127,13 +129,11 @@ class DirectExecutor:
             *((_serve, services[i]) for i, at in enumerate(service_at) if wait_set.is_ready("service", at)),
             *((_answer, clients[i]) for i, at in enumerate(client_at) if wait_set.is_ready("client", at)),
         ]
-        woken = wait_set.is_ready("guard_condition", guard_at)
         for handle, entity in ready:
             try:
                 handle(entity)
             except InvalidHandle:  # an earlier callback of this turn has destroyed it
                 continue
-        return bool(ready) or woken
 
     def _take_messages(self, subscription: Any) -> None:
         handle = subscription.handle
@@ -142,6 +142,7 @@ class DirectExecutor:
             taken = handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 return
+            self._heard_s = time.monotonic()
             if with_info:
                 subscription.callback(*taken)
             else:

@@ -5,6 +5,8 @@ there for the next process, so nothing waits for a disk.
 """
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from uav_dc_ros.errors import NodeError
@@ -29,16 +31,12 @@ class Journal:
         """
         if self._path is None:
             return []
-        try:
-            text = self._path.read_bytes()
+        with self._told("read"):
+            text = self._path.read_bytes() if self._path.exists() else b""
             whole, _, torn = text.rpartition(b"\n")
             if torn:
                 os.truncate(self._path, len(text) - len(torn))
-            return whole.split(b"\n") if whole else []
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise NodeError(f"journal {self._path} cannot be read: {error.strerror}") from None
+        return whole.split(b"\n") if whole else []
 
     def begin(self, line: bytes) -> None:
         """Forget what is there, and write a first line; at no moment is there neither.
@@ -50,11 +48,9 @@ class Journal:
             return
         self.close()
         new = self._path.with_name(f"{self._path.name}.new")
-        try:
+        with self._told("written"):
             new.write_bytes(line + b"\n")
             new.replace(self._path)
-        except OSError as error:
-            raise NodeError(f"journal {self._path} cannot be written: {error.strerror}") from None
 
     def append(self, line: bytes) -> None:
         """Write a line.
@@ -64,12 +60,17 @@ class Journal:
         """
         if self._path is None:
             return
-        try:
+        with self._told("written"):
             if self._file < 0:
                 self._file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
             os.write(self._file, line + b"\n")
+
+    @contextmanager
+    def _told(self, what: str) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
-            raise NodeError(f"journal {self._path} cannot be written: {error.strerror}") from None
+            raise NodeError(f"journal {self._path} cannot be {what}: {error.strerror}") from None
 
     def close(self) -> None:
         """Let go of the file."""

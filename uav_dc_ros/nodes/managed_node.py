@@ -141,7 +141,11 @@ class ManagedNode(LifecycleNode):
 
     def _deactivate(self) -> None:
         self.deactivate()
+        self._say_all()
         self._fall_silent()
+
+    def _say_all(self) -> None:
+        """Have the last words heard."""
 
     def _fall_silent(self) -> None:
         """Undo what `_activate` did."""

@@ -96,12 +96,11 @@ class MissionNode(ManagedNode):
         self._refuse_unknown("qos", [f"qos_overrides.{end.topic_name}" for end in given])
         self._peers_timer = self.timer(PEERS_PERIOD_S, self._look_for_peers)
 
-    def _deactivate(self) -> None:
-        self.deactivate()
+    def _say_all(self) -> None:
+        super()._say_all()
         deadline_s = time.monotonic() + ACKNOWLEDGE_S
         for publisher in self.publishers_of.values():
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline_s - time.monotonic())))
-        self._fall_silent()
 
     def _fall_silent(self) -> None:
         super()._fall_silent()

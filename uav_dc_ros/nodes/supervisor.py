@@ -135,13 +135,11 @@ class Supervisor:
         Raises:
             NodeError: a node that is needed refuses to start, gave up, or keeps dying.
         """
-        for node in [node for node in self.nodes if node.state != "active" or node.process is None]:
-            if node.process is None and time.monotonic() >= node.start_s:
-                self._start(node)
         for node in list(self.nodes):
             if node.process is None:
-                continue
-            if node.process.ended:
+                if time.monotonic() >= node.start_s:
+                    self._start(node)
+            elif node.process.ended:
                 self._bury(node)
             elif node.state != "active":
                 try:

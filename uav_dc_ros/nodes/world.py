@@ -29,7 +29,7 @@ from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
 from uav_dc_ros.nodes.table import NODES
 
-STALL_S = 0.5  # a lockstep that stands still for so long repeats its last messages
+STALL_S = 1.0  # a lockstep that stands still for so long repeats its last messages
 CLOCK_PERIOD_S = 0.05
 USER_BYTES = 40  # of `users`, for each of them
 OVERRUN_S = 0.005  # a step at a pace that starts later than this after its time
