@@ -18,7 +18,7 @@ from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import foxglove_server
+from uav_dc_ros.nodes import foxglove_server, runtime
 from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.observer import MissionSoFar, Observer, Summary, summary
@@ -68,6 +68,7 @@ class Flight:
         status = 0
         remapped = ["--ros-args", "-r", f"__ns:={self.options.namespace}", "-r", "/clock:=clock"]
         with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as journals, self.display:
+            runtime.give_way()
             rclpy.init(args=remapped, signal_handler_options=SignalHandlerOptions.NO)
             parameters = self._parameters(Path(journals))
             seed = self.options.seed if "world" in self.nodes else None

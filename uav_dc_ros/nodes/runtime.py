@@ -1,5 +1,6 @@
 """Runs one node as a process: from its start to the last word."""
 
+import contextlib
 import gc
 import os
 import select
@@ -61,9 +62,21 @@ class Stopper:
                     sources.remove(source)
 
 
+def give_way() -> None:
+    """Interrupt no other thread when a message wakes one of this process, but wait until it is done.
+
+    A mission's processes have more threads than most computers have cores, and each message wakes some of
+    them: in lockstep a step takes an eighth less time this way. To be called before ROS is initialised, since
+    the middleware's threads inherit it.
+    """
+    with contextlib.suppress(PermissionError):  # some containers forbid it
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
 def main(make: Callable[[], MissionNode]) -> NoReturn:
     """Run one node until it is asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`."""
     fastdds.use_profiles()
+    give_way()
     status = NOT_BEGUN
     try:
         node = _made(make)
