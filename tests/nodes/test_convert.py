@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from tests.conftest import outcome
 from tests.nodes import poses
 from tests.small_worlds import tiny
-from uav_dc_ros import messages
+from uav_dc_ros import messages, payloads
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes import convert
 
@@ -29,7 +29,7 @@ SCENARIO = tiny()
 @example(b"\0\1\0\0\xff\xff\xff\xff")
 @example(b"\0\0\0\0\0\0\0\2a\0")
 def test_any_bytes_are_a_text_or_malformed(data: bytes) -> None:
-    came = outcome(lambda: convert.text_in_cdr(data))
+    came = outcome(lambda: payloads.text_in_cdr(data))
     if isinstance(came, MessageError):
         assert came.reason == "malformed"
     else:
@@ -38,8 +38,8 @@ def test_any_bytes_are_a_text_or_malformed(data: bytes) -> None:
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0")))
 def test_a_text_is_serialised_as_ros_does(text: str) -> None:
-    ours, theirs = convert.cdr_of_text(text.encode()), serialize_message(String(data=text))
-    assert convert.text_in_cdr(theirs) == text.encode()
+    ours, theirs = payloads.cdr_of_text(text.encode()), serialize_message(String(data=text))
+    assert payloads.text_in_cdr(theirs) == text.encode()
     assert deserialize_message(ours, String).data == text
 
 
@@ -63,15 +63,15 @@ def test_a_stamp_keeps_its_nanoseconds(time_ns: int) -> None:
 
 
 @given(st.lists(st.integers(0, 3), max_size=6))
-@pytest.mark.parametrize("convert_it", [convert.users_m, convert.collection])
+@pytest.mark.parametrize("convert_it", [payloads.users_m, payloads.collection])
 def test_other_users_are_refused(convert_it: Callable[..., object], cluster: list[int]) -> None:
     zeros, no = [0.0] * len(cluster), [False] * len(cluster)
     users = messages.Users(mission=0, step=0, stamp_ns=0, cluster=cluster, x_m=zeros, y_m=zeros)
     numbers = {"sinr": zeros, "rate_bps": zeros, "data_bits": zeros, "served": no, "collected": no}
     rates = messages.Rates(mission=0, step=0, sum_rate_bps=0.0, **numbers)
     mine = SCENARIO.user_cluster.tolist()
-    fits = cluster == mine if convert_it is convert.users_m else len(cluster) == len(mine)
-    payload = users if convert_it is convert.users_m else rates
+    fits = cluster == mine if convert_it is payloads.users_m else len(cluster) == len(mine)
+    payload = users if convert_it is payloads.users_m else rates
     if fits:
         convert_it(payload, SCENARIO)
     else:

@@ -11,8 +11,8 @@ from websockets.exceptions import ConnectionClosed
 
 from tests.nodes.foxglove_client import FoxgloveClient, is_free
 from uav_dc_ros.errors import NodeError, ParameterError
-from uav_dc_ros.nodes.convert import cdr_of_text
 from uav_dc_ros.nodes.foxglove_server import FoxgloveServer, check
+from uav_dc_ros.payloads import cdr_of_text
 from uav_dc_ros.topics import TOPICS
 
 ROWS = {f"/{row.name}": row for row in TOPICS.values()}

@@ -13,9 +13,8 @@ from rosbags.highlevel import AnyReader
 
 from tests.conftest import Ros
 from tests.nodes import garbage
-from uav_dc_ros import messages, scenarios
+from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import convert
 from uav_dc_ros.nodes.table import NODES
 
 PEERS = ("world", "channel_monitor", "policy", "recorder", "observer")
@@ -75,7 +74,7 @@ def said_by_nodes(bag: Path) -> dict[str, list[Any]]:
             if topic not in said:
                 continue
             try:
-                text = convert.text_in_cdr(data)
+                text = payloads.text_in_cdr(data)
                 payload = messages.decode(text, messages.PAYLOADS[topic])
             except MessageError:
                 continue

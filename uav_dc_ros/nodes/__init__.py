@@ -34,7 +34,7 @@ launcher         a node as a child process
 observer         run_all's own eyes: the mission so far, and its summary
 display          what the user sees of it
 
-Between them: convert (payloads and arrays), cdr (serialised messages, where speed matters).
+Between them: convert (ROS messages and plain values), cdr (serialised messages, where speed matters).
 """
 
 import importlib.util

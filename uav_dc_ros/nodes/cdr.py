@@ -14,7 +14,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes.convert import CDR_LITTLE_ENDIAN, FRAME, position_m
+from uav_dc_ros.nodes.convert import FRAME, position_m
+from uav_dc_ros.payloads import CDR_LITTLE_ENDIAN
 
 HEAD = len(CDR_LITTLE_ENDIAN)
 FRAME_CDR = (len(FRAME) + 1).to_bytes(4, "little") + FRAME.encode() + b"\0"

@@ -9,11 +9,11 @@ from operator import attrgetter
 
 import numpy as np
 
-from uav_dc_ros import messages, scenarios
+from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import MessageError, NodeError
-from uav_dc_ros.nodes import cdr, convert, runtime
+from uav_dc_ros.nodes import cdr, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 
@@ -69,7 +69,7 @@ class ChannelMonitor(MissionNode):
             return
         try:
             self._said = messages.decode(lines[-1], messages.Rates)
-            self._data_bits, self._collected = convert.collection(self._said, self.scenario)
+            self._data_bits, self._collected = payloads.collection(self._said, self.scenario)
         except MessageError as error:
             raise NodeError(
                 f"journal {self.values['journal']}: not that of a channel monitor in scenario "
@@ -84,7 +84,7 @@ class ChannelMonitor(MissionNode):
 
     def on_users(self, payload: messages.Users) -> None:
         """Keep users until their pose is there."""
-        self._users.append((payload, convert.users_m(payload, self.scenario), self.published_ns))
+        self._users.append((payload, payloads.users_m(payload, self.scenario), self.published_ns))
         self._pair()
 
     def _pair(self) -> None:
@@ -149,7 +149,7 @@ class ChannelMonitor(MissionNode):
         link = core.measure(self.scenario, uav_m, users_m, collected)
         if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in
             data_bits, collected = core.collect(self.scenario, link, data_bits, collected)
-        rates = convert.rates(link, data_bits, collected, mission=users.mission, step=users.step)
+        rates = payloads.rates(link, data_bits, collected, mission=users.mission, step=users.step)
         text = messages.encode(rates)  # refuses what is no number, before it comes into the books
         self._said, self._data_bits, self._collected = rates, data_bits, collected
         keep = self.journal.append if users.step else self.journal.begin

@@ -13,9 +13,9 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 
-from uav_dc_ros import messages, topics
+from uav_dc_ros import messages, payloads, topics
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import cdr, convert, diagnostics, qos
+from uav_dc_ros.nodes import cdr, diagnostics, qos
 from uav_dc_ros.nodes.diagnostics import Meter
 from uav_dc_ros.nodes.managed_node import ManagedNode
 from uav_dc_ros.nodes.table import NODES
@@ -140,7 +140,7 @@ class MissionNode(ManagedNode):
                 if payload is None:
                     handle(cdr.Pose(data))
                 else:
-                    handle(messages.decode(convert.text_in_cdr(data), payload))
+                    handle(messages.decode(payloads.text_in_cdr(data), payload))
             except MessageError as error:
                 self.reject(topic.name, error)
             self.meter.heard(topic.name, time.time_ns() - self.published_ns)
@@ -167,7 +167,7 @@ class MissionNode(ManagedNode):
 
     def say_encoded(self, topic: str, text: bytes) -> None:
         """Publish a payload that was checked and encoded."""
-        self.publish(topic, convert.cdr_of_text(text))
+        self.publish(topic, payloads.cdr_of_text(text))
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish a message, or its serialised form, on any topic."""

@@ -9,11 +9,10 @@ import msgspec
 import numpy as np
 import rclpy
 
-from uav_dc_ros import messages
+from uav_dc_ros import messages, payloads
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes import convert
 from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
 from uav_dc_ros.nodes.pairs import StepPairs
 
@@ -100,7 +99,7 @@ class MissionSoFar:
         """r^t (eq. 7); 0 before the first step."""
         if self.rates is None or not self.step:
             return 0.0
-        data_bits, _ = convert.collection(self.rates, self.scenario)
+        data_bits, _ = payloads.collection(self.rates, self.scenario)
         return float(core.total_reward(self.scenario, np.asarray(self.cell), data_bits))
 
 
@@ -148,7 +147,7 @@ class Observer(MissionNode):
         Raises:
             NodeError: it flies for somebody else.
         """
-        convert.check_world(payload, self.scenario)
+        payloads.check_world(payload, self.scenario)
         if self.seed is not None and payload.seed != self.seed + payload.mission:
             raise NodeError(ANOTHER_MISSION)
         if payload.phase.is_over and payload.mission not in self._ended:
@@ -158,7 +157,7 @@ class Observer(MissionNode):
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Follow the collection."""
-        convert.collection(payload, self.scenario)
+        payloads.collection(payload, self.scenario)
         self._hear(payload)
 
     def _hear(self, payload: messages.Mission | messages.Rates) -> None:

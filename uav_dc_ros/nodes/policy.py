@@ -5,11 +5,11 @@ It is the same node in simulation and on an aircraft: it knows the vehicle by `m
 
 import numpy as np
 
-from uav_dc_ros import messages, scenarios
+from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.nodes import convert, runtime
+from uav_dc_ros.nodes import runtime
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.pairs import StepPairs
 
@@ -35,13 +35,13 @@ class Policy(MissionNode):
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Note a step that the vehicle is ready for."""
-        convert.check_world(payload, self.scenario)
+        payloads.check_world(payload, self.scenario)
         if payload.phase is messages.Phase.READY:
             self._hear(payload)
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Note what has been collected by a step."""
-        convert.collection(payload, self.scenario)  # refuse another scenario's rates before they wait
+        payloads.collection(payload, self.scenario)  # refuse another scenario's rates before they wait
         self._hear(payload)
 
     def _hear(self, payload: messages.Mission | messages.Rates) -> None:
@@ -49,7 +49,7 @@ class Policy(MissionNode):
         if pair is None:
             return
         mission, rates = pair
-        data_bits, collected = convert.collection(rates, self.scenario)
+        data_bits, collected = payloads.collection(rates, self.scenario)
         steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
         action = self._decide(mission.cell, steps_flown, data_bits, collected)
         self.say("move", messages.Move(mission=mission.mission, step=mission.step, action=action.label))

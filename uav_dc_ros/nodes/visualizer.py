@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from uav_dc_ros import messages, scenarios
+from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import cdr, convert, drawing, runtime
+from uav_dc_ros.nodes import cdr, drawing, runtime
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.track import Track
 from uav_dc_ros.topics import Topic
@@ -77,7 +77,7 @@ class Visualizer(MissionNode):
 
     def _take_users(self, name: str, data: bytes, published_ns: int) -> None:
         try:
-            heading = msgspec.json.decode(convert.text_in_cdr(data), type=_Heading)
+            heading = msgspec.json.decode(payloads.text_in_cdr(data), type=_Heading)
         except (msgspec.DecodeError, RecursionError) as error:
             raise MessageError("malformed", str(error)) from None
         began_ns = self._track.users(
@@ -95,13 +95,13 @@ class Visualizer(MissionNode):
         if topic not in self._newest:
             return None
         try:
-            payload = messages.decode(convert.text_in_cdr(self._newest[topic][1]), kind)
+            payload = messages.decode(payloads.text_in_cdr(self._newest[topic][1]), kind)
             if isinstance(payload, messages.Mission):
-                convert.check_world(payload, self.scenario)
+                payloads.check_world(payload, self.scenario)
             if isinstance(payload, messages.Rates):
-                convert.collection(payload, self.scenario)
+                payloads.collection(payload, self.scenario)
             if isinstance(payload, messages.Users):
-                convert.users_m(payload, self.scenario)
+                payloads.users_m(payload, self.scenario)
         except MessageError as error:
             self.reject(topic, error)
             del self._newest[topic]
@@ -127,7 +127,7 @@ class Visualizer(MissionNode):
         return drawing.Scene(
             time_ns=pose.stamp_ns if pose else users.stamp_ns if users else 0,
             position_m=pose.position_m if pose else None,
-            users_m=np.empty((0, 2)) if users is None else convert.users_m(users, self.scenario),
+            users_m=np.empty((0, 2)) if users is None else payloads.users_m(users, self.scenario),
             served=nobody if rates is None else np.asarray(rates.served),
             collected=nobody if rates is None else np.asarray(rates.collected),
             mission=self._payload("mission", messages.Mission),

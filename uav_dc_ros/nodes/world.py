@@ -17,7 +17,7 @@ from collections import deque
 import msgspec
 import numpy as np
 
-from uav_dc_ros import messages, scenarios
+from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
@@ -226,7 +226,7 @@ class World(MissionNode):
         self.publish("pose", pose)
         self.say(
             "users",
-            convert.users(
+            payloads.users(
                 self.scenario, self._users_m, mission=self._mission, step=self._step, time_ns=time_ns
             ),
         )

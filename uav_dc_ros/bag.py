@@ -1,0 +1,56 @@
+"""Record, play, recover, verify and explain bags.
+
+python -m uav_dc_ros.bag VERB --help
+"""
+
+import importlib
+import sys
+from typing import NoReturn
+
+from uav_dc_ros import __version__, cli
+from uav_dc_ros.errors import ParameterError
+
+PROG = "python -m uav_dc_ros.bag"
+# Module of each verb, with `add_options(parser)` and `run(options) -> exit status`, and what it does.
+VERBS = {
+    "record": ("uav_dc_ros.nodes.record", "record topics into a new bag"),
+    "play": ("uav_dc_ros.nodes.play", "publish a bag's messages again, with their timing and QoS"),
+    "info": ("uav_dc_ros.recordings.info", "tell what a bag holds, and whether it is complete"),
+    "recover": ("uav_dc_ros.bags.recover", "make a whole bag of what a killed recorder left"),
+    "verify": ("uav_dc_ros.recordings.verify", "recompute everything that a bag tells of its missions"),
+    "report": (
+        "uav_dc_ros.recordings.report",
+        "write a page about missions, or compare several bags",
+    ),
+    "export": ("uav_dc_ros.recordings.export", "write missions as tables, or as transitions to learn from"),
+}
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command, and exit."""
+    given = sys.argv[1:] if arguments is None else arguments
+    wanted = given[0] if given else "--help"
+    if wanted == "--version":
+        print(__version__)
+        sys.exit(0)
+    if wanted in ("-h", "--help"):
+        print(f"usage: {PROG} VERB ...\n\n{__doc__.splitlines()[0]}\n")
+        for verb, (_, does) in VERBS.items():
+            print(f"  {verb:<8} {does}")
+        print(f"\n{PROG} VERB --help tells its options.")
+        sys.exit(0)
+
+    def command() -> int:
+        if wanted not in VERBS:
+            raise ParameterError(f"{wanted!r}; expected a verb: {', '.join(VERBS)}")
+        module, does = VERBS[wanted]
+        verb = importlib.import_module(module)
+        parser = cli.Parser(prog=f"{PROG} {wanted}", description=does[0].upper() + does[1:] + ".")
+        verb.add_options(parser)
+        return int(verb.run(parser.parse_args(given[1:])))
+
+    cli.run(command, f"{PROG} {wanted}" if wanted in VERBS else PROG)
+
+
+if __name__ == "__main__":
+    main()

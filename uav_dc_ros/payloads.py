@@ -1,0 +1,107 @@
+"""Payloads to and from the core's arrays, and their text in a serialised std_msgs/String. Knows no ROS."""
+
+from typing import Literal
+
+import numpy as np
+
+from uav_dc_ros import messages
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import Link
+from uav_dc_ros.errors import MessageError
+
+CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # how a serialised message says how its numbers are laid out
+
+
+def cdr_of_text(text: bytes) -> bytes:
+    """A std_msgs/String, serialised: its JSON goes to the middleware, and comes from it, as bytes."""
+    return CDR_LITTLE_ENDIAN + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
+
+
+def text_in_cdr(data: bytes) -> bytes:
+    """The text in a serialised std_msgs/String.
+
+    Raises:
+        MessageError: it holds less than it says.
+    """
+    order: Literal["little", "big"] = "little" if data[1:2] == b"\1" else "big"
+    length = int.from_bytes(data[4:8], order)  # with the zero at its end
+    if len(data) < 8 + length:
+        raise MessageError("malformed", f"{len(data) - 8} bytes of text; expected {length}, as it says")
+    return data[8 : 7 + length]
+
+
+def users(scenario: Scenario, users_m: Array, *, mission: int, step: int, time_ns: int) -> messages.Users:
+    """Users' positions, metres `[U, 2]`, as a payload."""
+    return messages.Users(
+        mission=mission,
+        step=step,
+        stamp_ns=time_ns,
+        cluster=scenario.user_cluster.tolist(),
+        x_m=users_m[:, 0].tolist(),
+        y_m=users_m[:, 1].tolist(),
+    )
+
+
+def users_m(payload: messages.Users, scenario: Scenario) -> Array:
+    """Users' positions, metres, `[U, 2]`.
+
+    Raises:
+        MessageError: other users than the scenario's.
+    """
+    if payload.cluster != scenario.user_cluster.tolist():
+        raise MessageError(
+            "layout",
+            f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
+            f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
+        )
+    return np.asarray([payload.x_m, payload.y_m], dtype=np.float64).T
+
+
+def rates(link: Link, data_bits: Array, collected: Array, *, mission: int, step: int) -> messages.Rates:
+    """The channel of a step and the data after it, `[U]` each, as a payload."""
+    return messages.Rates(
+        mission=mission,
+        step=step,
+        sum_rate_bps=float(link.sum_rate_bps),
+        sinr=link.sinr.tolist(),
+        rate_bps=link.rate_bps.tolist(),
+        data_bits=data_bits.tolist(),
+        served=link.served.tolist(),
+        collected=collected.tolist(),
+    )
+
+
+def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Array]:
+    """`data_bits` and `collected`, `[U]` each.
+
+    Raises:
+        MessageError: another number of users than the scenario's.
+    """
+    if len(payload.data_bits) != scenario.n_users:
+        raise MessageError(
+            "layout",
+            f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
+        )
+    return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
+
+
+def check_world(payload: messages.Mission, scenario: Scenario) -> None:
+    """Refuse a mission in another world, or where this one has nothing.
+
+    Raises:
+        MessageError: the fingerprints differ; a cell outside the grid; more steps than the battery allows.
+    """
+    if payload.fingerprint != scenario.fingerprint:
+        raise MessageError(
+            "scenario",
+            f"the mission flies {payload.scenario!r} ({payload.fingerprint}); expected "
+            f"{scenario.name!r} ({scenario.fingerprint}): start this node with the mission's scenario",
+        )
+    beyond = any(index > last for index, last in zip(payload.cell, scenario.grid.last_cell, strict=True))
+    if beyond or payload.remaining_steps > scenario.mission.max_steps:
+        raise MessageError(
+            "layout",
+            f"cell {payload.cell}, {payload.remaining_steps} remaining steps; expected a cell up to "
+            f"{scenario.grid.last_cell} and at most {scenario.mission.max_steps} steps",
+        )
