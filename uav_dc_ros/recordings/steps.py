@@ -226,8 +226,8 @@ class Steps:
         name = "status" if topic == "mission" else topic
         before = getattr(step, name)
         if before is not None and not _ends(before, payload):
-            if payload == before:
-                self.repeated[topic] += 1
+            if payload == before or _ends(payload, before):
+                self.repeated[topic] += 1  # a vehicle that was stopped, and went on, is ready again
             else:
                 step.others.setdefault(topic, payload)
             return
