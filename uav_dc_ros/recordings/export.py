@@ -1,11 +1,12 @@
 """Export a bag: missions as tidy tables, or as transitions to learn from."""
 
 import argparse
+import io
 import json
 import os
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import groupby
 from pathlib import Path
@@ -207,9 +208,9 @@ def write_transitions(
         with zipfile.ZipFile(partial / "result", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, (kind, shape) in kinds.items():
                 with (partial / name).open("rb") as raw:
-                    _array(archive, name, np.dtype(kind), (n, *shape), lambda out, raw=raw: _copy(raw, out))
+                    _array(archive, name, np.dtype(kind), (n, *shape), raw)
             text = np.asarray(json.dumps(metadata))
-            _array(archive, "metadata", text.dtype, (), lambda out: out.write(text.tobytes()))
+            _array(archive, "metadata", text.dtype, (), io.BytesIO(text.tobytes()))
     print(
         f"{file}: {n} transitions of {d[0]} numbers ({observation!r}), reward form {scenario.reward.form!r}"
     )
@@ -219,24 +220,16 @@ def write_transitions(
         print(f"  {count} left out: {reason}")
 
 
-def _append(columns: dict[str, IO[bytes]], transition: Transition, kinds: dict[str, Any]) -> None:
+def _append(columns: Mapping[str, IO[bytes]], transition: Transition, kinds: Mapping[str, Any]) -> None:
     for name, file in columns.items():
         file.write(np.asarray(getattr(transition, name), kinds[name][0]).tobytes())
 
 
 def _array(
-    archive: zipfile.ZipFile,
-    name: str,
-    dtype: np.dtype[Any],
-    shape: tuple[int, ...],
-    write: Callable[[IO[bytes]], Any],
+    archive: zipfile.ZipFile, name: str, dtype: np.dtype[Any], shape: tuple[int, ...], content: IO[bytes]
 ) -> None:
     """An array as numpy.load finds it in an .npz file."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
         header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(out, header)
-        write(out)
-
-
-def _copy(raw: IO[bytes], out: IO[bytes]) -> None:
-    shutil.copyfileobj(raw, out, 2**20)
+        shutil.copyfileobj(content, out, 2**20)
