@@ -56,7 +56,7 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
     paid = {run.reward for run in population.runs}
     if len(paid) > 1:
         raise TrainingError(
-            f"the runs of the population are paid in {len(paid)} ways; expected one, for recorded flights, too"
+            f"the runs of the population are paid in {len(paid)} ways; expected one, for recorded flights"
         )
     scenario = msgspec.structs.replace(population.scenario, reward=paid.pop())
     missions: set[tuple[int, str, int, int]] = set()

@@ -271,9 +271,13 @@ class Steps:
             self._done, self._done_over = key, step.status is not None and step.status.phase.is_over
             self._last_log_ns = max(self._last_log_ns, *step.log_ns.values())
             if step.users is not None:
-                begun_ns = step.users.stamp_ns
-                self._poses = deque((p for p in self._poses if p.stamp_ns > begun_ns), POSES_MAX)
+                self._forget_poses(step.users.stamp_ns, max(step.log_ns.values()))
             yield step
+
+    def _forget_poses(self, begun_ns: int, received_ns: int) -> None:
+        """Drop poses up to a step's begin; one that was received after the step may be another flight's."""
+        kept = (p for p in self._poses if p.stamp_ns > begun_ns or p.log_ns > received_ns)
+        self._poses = deque(kept, POSES_MAX)
 
     def _is_whole(self, key: Key) -> bool:
         """Has a step all that it can have, and does it follow the one before."""
