@@ -221,7 +221,8 @@ def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> t
         if policy.sha256 == sha256:
             policy.check(scenario)
             return policy, ""
-        other = f"; {str(candidate)!r} is another one (sha256 {policy.sha256[:12]})"
+        if policy.name == name and not other:
+            other = f"; {str(candidate)!r} is another one (sha256 {policy.sha256[:12]})"
     return (
         None,
         f"policy {name!r} (sha256 {sha256[:12]}) is not here{other}; expected it from --policy-dir DIR",
