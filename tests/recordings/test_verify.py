@@ -373,6 +373,22 @@ def test_a_recording_that_begins_late_two_flights_and_an_abort(tmp_path, capsys)
     assert "equal to the last bit" in out
 
 
+def test_a_recorder_that_was_told_another_seed_is_no_difference(tmp_path, capsys):
+    """Nodes that were started by hand: what counts is the seed that the missions tell."""
+    first = flight(TINY, seed=3, missions=2)
+    second = flight(TINY, seed=8, begun_ns=first[-1].log_time_ns + 10**9)
+    status, out = verify(capsys, write(tmp_path / "bag", first + second, about(TINY, seed=0)))
+    assert status == 0
+    assert "world: 27 of 27 steps recomputed, equal to the last bit" in out
+    assert "flown with seed 3, 8, though the bag is said to be of seed 0" in out
+    false = [changing("mission", 1, 0, higher("seed"))(message) for message in first]
+    status, out = verify(capsys, write(tmp_path / "false", false, about(TINY, seed=3)))
+    assert (status, "mission 1, step 0, seed: recorded 5, recomputed 4" in out) == (1, True)
+    false = [changing("mission", 0, 0, higher("seed"))(message) for message in first]
+    status, out = verify(capsys, write(tmp_path / "start", false, about(TINY, seed=3)))
+    assert (status, "users: mission 0, step 0, user 0, x_m" in out) == (1, True)
+
+
 def test_a_paced_flight_may_hover_where_a_move_came_too_late(tmp_path, capsys):
     """In lockstep no move comes too late: there the same is a difference."""
     told = flight(TINY, act=lambda mission, step: 6)

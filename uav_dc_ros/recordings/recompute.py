@@ -134,19 +134,22 @@ class World(Book):
     """The world's work done again: where the vehicle is, how the mission stands, where the users are.
 
     Args:
-        seed: of mission 0, when our own world flew: then poses, users and times follow from it.
+        simulated: did our own world fly? Then poses, users and times follow from the seed, and the seeds of
+            a flight's missions from that of its first one.
         lockstep: was every move awaited? Without it, a vehicle that gets no move in time hovers.
 
     Attributes:
         hovered: steps with a move that was not flown.
+        seeds: of mission 0, by flight.
     """
 
     def __init__(
-        self, scenario: Scenario, *, seed: int | None, lockstep: bool, tolerance: float = 0.0
+        self, scenario: Scenario, *, simulated: bool, lockstep: bool, tolerance: float = 0.0
     ) -> None:
         super().__init__(tolerance=tolerance)
         self.hovered = 0
-        self._scenario, self._seed, self._lockstep = scenario, seed, lockstep
+        self.seeds: dict[int, int] = {}
+        self._scenario, self._simulated, self._lockstep = scenario, simulated, lockstep
         self._before: RecordedStep | None = None
         self._walk: tuple[int, int, np.random.Generator, Array] | None = None  # seed, step, users
 
@@ -163,7 +166,7 @@ class World(Book):
         else:
             told, reason = self._status(step, step.status, before)
             found += told
-            if self._seed is not None:
+            if self._simulated:
                 found += self._simulation(step, step.status)
         if found or not reason:
             self.enter(found)
@@ -212,9 +215,9 @@ class World(Book):
 
     def _simulation(self, step: RecordedStep, status: messages.Mission) -> list[Difference]:
         """What our own world tells beyond what any vehicle does."""
-        assert self._seed is not None, "asked for with a seed only"
         scenario, mission = self._scenario, self._scenario.mission
-        found = self.column(step, "mission", "seed", status.seed, self._seed + step.mission)
+        first = self.seeds.setdefault(step.flight, status.seed - step.mission)
+        found = self.column(step, "mission", "seed", status.seed, first + step.mission)
         steps = step.mission * (mission.max_steps + 1) + step.step
         time_ns = round(steps * mission.step_s * 1e9)
         centre_m = scenario.grid.centre_m(np.asarray(status.cell), like=np.zeros(3))
@@ -223,7 +226,7 @@ class World(Book):
             for i, axis in enumerate(("x_m", "y_m", "z_m")):
                 found += self.column(step, "pose", axis, float(pose.position_m[i]), float(centre_m[i]))
         if step.users is not None:
-            users_m = self._users_m(self._seed + step.mission, step.step)
+            users_m = self._users_m(max(first, 0) + step.mission, step.step)
             users = payloads.users(scenario, users_m, mission=step.mission, step=step.step, time_ns=time_ns)
             for name in ("stamp_ns", "cluster", "x_m", "y_m"):
                 found += self.column(step, "users", name, getattr(step.users, name), getattr(users, name))

@@ -24,7 +24,7 @@ from uav_dc_ros.recordings.steps import RecordedStep, Steps
 
 NEEDED = ("pose", "users", "rates", "mission")  # topics without which nothing can be recomputed
 SHOWN = 5  # decisions of another policy that are shown with their Q-values
-LISTED = 100  # lines about another policy
+LISTED = 100  # missions in which it decides otherwise
 DIFFERS = 1  # exit status
 
 EPILOG = """\
@@ -131,14 +131,14 @@ def verify(
     """
     about = reader.about
     lockstep = about.get("pace") == pace.LOCKSTEP
-    seed = int(about["seed"]) if about.get("seed", "").isdecimal() else None
+    simulated = "seed" in about  # our recorder tells it, of our world
     policy, without = _policy(about, scenario, policy_dir)
     channel = Channel(scenario, tolerance)
-    world = World(scenario, seed=seed, lockstep=lockstep, tolerance=tolerance)
+    world = World(scenario, simulated=simulated, lockstep=lockstep, tolerance=tolerance)
     decisions = Decisions(scenario, policy) if policy else None
     recorded = Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
     otherwise: list[str] = []
-    n_missions = n_steps = 0
+    n_missions = n_steps = n_missions_other = 0
     for _, mission in groupby(recorded, lambda step: (step.flight, step.mission)):
         n_missions += 1
         n_other, n_before = 0, other.compared if other else 0
@@ -153,6 +153,8 @@ def verify(
                 if other.differing <= SHOWN:
                     otherwise.append(f"  {step.name}: {_told(step, q_values)}")
         if other and n_other:
+            n_missions_other += 1
+        if other and n_other and n_missions_other <= LISTED:
             otherwise.append(
                 f"  {step.name.partition(',')[0]}: {n_other} of {other.compared - n_before} moves"
             )
@@ -165,7 +167,10 @@ def verify(
     lines = [*_lines("channel", channel), *_channel_notes(channel), *_lines("world", world)]
     if world.hovered:
         lines.append(f"  {world.hovered} moves were not flown: they came too late, and the vehicle hovered")
-    if seed is None:
+    if simulated and any(str(seed) != about["seed"] for seed in world.seeds.values()):
+        seeds = ", ".join(map(str, world.seeds.values()))
+        lines.append(f"  flown with seed {seeds}, though the bag is said to be of seed {about['seed']}")
+    if not simulated:
         lines.append("  not flown by our own world, as far as the bag tells: poses and users are as recorded")
     lines += _lines("decisions", decisions) if decisions else [f"decisions: not verified: {without}"]
     unread = recorded.rejected + recorded.orphans
@@ -176,14 +181,15 @@ def verify(
     if other:
         name, of = other.policy.name, f"{other.differing} of {other.compared} steps"
         lines.append(f"{name!r} would have decided otherwise in {of}")
-        lines += otherwise[:LISTED]
-        lines += [f"  and in {len(otherwise) - LISTED} missions more"] if len(otherwise) > LISTED else []
+        lines += otherwise
+        if n_missions_other > LISTED:
+            lines.append(f"  and in {n_missions_other - LISTED} missions more")
     books: list[Book] = [channel, world, *([decisions] if decisions else [])]
     return Verification(
         flown,
         lines,
         differs=any(book.differing for book in books),
-        gaps=any(book.skipped for book in books) or decisions is None or bool(unread) or seed is None,
+        gaps=any(book.skipped for book in books) or decisions is None or bool(unread) or not simulated,
     )
 
 
