@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.conftest import Ros, finish
+from tests.conftest import Ros, finish, wait_for
 from tests.recordings.made import about, changing, copy, flight, nudged, pose, said, write
 from tests.small_worlds import saved, tiny
 from uav_dc_ros import bag as command
-from uav_dc_ros import messages, payloads, resources
+from uav_dc_ros import messages, payloads, resources, scenarios
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import world
 from uav_dc_ros.messages import Phase
@@ -307,8 +307,18 @@ def test_a_bag_of_another_recorder(tmp_path, capsys):
     bag = write(tmp_path / "bag", flight(TINY, missions=2), namespace="/uav2")
     status, err = verify(capsys, bag)
     assert (status, "expected --scenario NAME|FILE" in err) == (2, True)
-    other = write(tmp_path / "shipped", flight(tiny(), steps=2))
-    assert verify(capsys, other, "--scenario", "five_clusters")[0] == 1, "another world"
+    assert verify(capsys, bag, "--scenario", "five_clusters")[0] == 1, "another world"
+    shipped = flight(scenarios.load("three_clusters"), missions=2)
+    bag = write(tmp_path / "shipped", shipped, namespace="/uav2")
+    status, out = verify(capsys, bag, "--namespace", "uav2")
+    assert status == 0
+    n_steps = len([message for message in shipped if message.topic == "/users"])
+    assert f"channel: {n_steps} of {n_steps} steps recomputed, equal to the last bit" in out
+    assert "not flown by our own world, as far as the bag tells: poses and users are as recorded" in out
+    assert "decisions: not verified: the bag does not tell which policy flew; --policy NAME|DIR" in out
+    assert out.splitlines()[-1] == "verified in part"
+    status, out = verify(capsys, bag, "--policy", "three_clusters_dueling")
+    assert (status, "would have decided otherwise in" in out) == (0, True)
 
 
 def test_where_rates_are_missing_both_pasts_are_possible(tmp_path, capsys):
@@ -402,6 +412,7 @@ def test_a_paced_flight_may_hover_where_a_move_came_too_late(tmp_path, capsys):
     assert "mission: mission 0, step 3, cell: recorded [0, 0, 0], recomputed [1, 0, 0]" in out
 
 
+@pytest.mark.long
 def test_missions_whose_nodes_were_killed_verify(ros: Ros, capsys):
     """What a monitor that was killed booked is in its journal; a world flies again what it had flown."""
     bag = ros.folder / "bag"
@@ -415,3 +426,37 @@ def test_missions_whose_nodes_were_killed_verify(ros: Ros, capsys):
     status, out = verify(capsys, bag)
     assert status == 0, out
     assert "channel: 1525 of 1525 steps recomputed, equal to the last bit" in out
+
+
+def test_a_monitor_that_outlives_a_flight_takes_no_pose_of_it_for_the_next(ros: Ros, capsys):
+    """Mission time begins again with each flight: the last pose of one has a stamp that comes again.
+
+    The first world hovers at the start, since no policy is there; the second one leaves it at once.
+    """
+    bag = ros.folder / "bag"
+
+    def start(node, *parameters):
+        given = [part for parameter in parameters for part in ("-p", parameter)]
+        return ros.start(f"uav_dc_ros.nodes.{node}", "--ros-args", "-p", "scenario:=five_clusters", *given)
+
+    def stop(node):
+        node.terminate()
+        status, output = finish(node)
+        assert status == 0, output
+
+    probe = ros.stranger("probe", "/mission")
+    others = [start("channel_monitor"), start("recorder", f"bag:={bag}", 'peers:=["channel_monitor"]')]
+    first = start("world", "pace:='100'", 'peers:=["channel_monitor", "recorder"]')
+    wait_for(probe.stdout, '\\"step\\":7')
+    stop(first)
+    others.append(start("policy", f"policy:={POLICY}"))
+    second = start("world", 'peers:=["channel_monitor", "recorder", "policy"]')
+    wait_for(probe.stdout, '\\"remaining_steps\\":0')
+    for node in (second, *others):
+        stop(node)
+    probe.stdin.close()
+    probe.wait(10)
+    probe.stdout.close()
+    status, out = verify(capsys, bag)
+    assert status == 0, out
+    assert "2 missions, " in out

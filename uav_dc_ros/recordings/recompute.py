@@ -206,7 +206,8 @@ class World(Book):
         wrong = self._cell(step, status, reached)
         if not wrong and reached[0] != cell.tolist() and before.move:
             self.hovered += 1
-        return found + wrong, "" if before.move else "the move before it is not recorded"
+        hovers = not self._lockstep and list(before.status.cell) == cell.tolist()  # as without a move in time
+        return found + wrong, "" if before.move or hovers else "the move before it is not recorded"
 
     def _cell(self, step: RecordedStep, status: messages.Mission, reached: Any) -> list[Difference]:
         if list(status.cell) in [list(one) for one in reached]:
