@@ -4,6 +4,7 @@ from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate import COLUMNS, TEST_SEEDS, evaluate, rows
+from uav_dc_ros.experiments.from_bags import Remembered
 
 _ALGORITHMS = {"dqn": "DQN", "dueling_dqn": "Dueling DQN"}
 _LIMITS = {
@@ -15,7 +16,15 @@ greedy mission is one fixed path, and where it stays for one step it stays for g
 }
 
 
-def card(policy: Policy, scenario: Scenario, command: str, n_runs: int, seconds: float, score: float) -> str:
+def card(
+    policy: Policy,
+    scenario: Scenario,
+    command: str,
+    n_runs: int,
+    seconds: float,
+    score: float,
+    remembered: Remembered | None = None,
+) -> str:
     """Text of a policy's README.md.
 
     Args:
@@ -25,12 +34,14 @@ def card(policy: Policy, scenario: Scenario, command: str, n_runs: int, seconds:
         n_runs: runs that were trained side by side.
         seconds: wall time of the training.
         score: its score on the validation missions.
+        remembered: recorded flights that its replay buffer began with.
     """
     config, values = policy.config, policy.config.hyperparameters
     hidden = " and ".join(map(str, config.hidden))
     first, last = TEST_SEEDS[0], TEST_SEEDS[-1]
     algorithm, n_users = _ALGORITHMS[config.algorithm], scenario.n_users
     lines = (COLUMNS, ["---"] * len(COLUMNS), *rows(evaluate(policy, scenario)))
+    began = "" if remembered is None else f"\n- the replay buffer began with {remembered}"
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"""# {config.name}
 
@@ -49,7 +60,7 @@ hidden layers of {hidden} units and {len(config.actions)} actions.
   seed {config.seed} after episode {config.episode}, which brought {score:.2f} of {n_users} users home
 - gamma {values.gamma:g}, epsilon {values.epsilon:g} (probability of the greedy action)
 - batches of {values.batch_size}, learning rate {values.learning_rate:g}
-- target network copied every {values.target_every} iterations, replay buffer of {values.buffer_size}
+- target network copied every {values.target_every} iterations, replay buffer of {values.buffer_size}{began}
 - the reward it learnt from: {_reward(policy.scenario)}
 
 ## How it does

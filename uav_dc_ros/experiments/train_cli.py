@@ -22,6 +22,7 @@ from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.card import card, checkpoint_card
 from uav_dc_ros.experiments.evaluate import TEST_SEEDS, save_mission_picture, steer
+from uav_dc_ros.experiments.from_bags import Remembered, check_remembered, remember
 from uav_dc_ros.experiments.progress import Display, Report
 from uav_dc_ros.experiments.runs import Population, Run
 
@@ -71,6 +72,7 @@ def options_parser() -> cli.Parser:
     add("--runs", default=1, help="runs side by side, of which the best is kept", **count)
     add("--checkpoint-every", default=100, help="episodes between validations and checkpoints", **count)
     add("--resume", action="store_true", help="go on from the last checkpoint of the same command, if any")
+    add("--from-bags", type=Path, nargs="+", metavar="BAG", help="recorded flights to start the replay with")
     add("--tensorboard", type=Path, metavar="DIR", help="write scalars of every run for TensorBoard")
     add("--threads", default=1, help="of torch: equal numbers give equal results", **count)
     add("--device", default="cpu", help="where torch computes, such as cpu or cuda")
@@ -113,6 +115,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
         "run": 0,
         "best": None,
         "seconds": 0.0,
+        "remembered": None,
     }
     if options.resume and saved.is_file():
         progress = checkpoint.restore(saved, training)
@@ -121,7 +124,12 @@ def _train(options: argparse.Namespace, command: str) -> int:
                 f"{saved} is the state of a training with checkpoint_every = {progress['every']}; "
                 f"expected {every}, as in this command"
             )
+        check_remembered(saved, progress.setdefault("remembered", None), options.from_bags)
         policy.load(folder / progress["best"])  # the result of what follows, unless there is a better one
+    elif options.from_bags:
+        remembered = remember(training, options.from_bags)
+        print(f"replay starts with {remembered}")
+        progress["remembered"] = msgspec.to_builtins(remembered)
     _reserve(folder, options.resume, training.n_flown)
     started = time.monotonic() - progress["seconds"]
     try:
@@ -158,7 +166,15 @@ def _train(options: argparse.Namespace, command: str) -> int:
         options.out,
         best.config,
         best.parameters,
-        lambda loaded: card(loaded, shipped, command, options.runs, progress["seconds"], progress["score"]),
+        lambda loaded: card(
+            loaded,
+            shipped,
+            command,
+            options.runs,
+            progress["seconds"],
+            progress["score"],
+            progress["remembered"] and msgspec.convert(progress["remembered"], Remembered),
+        ),
         lambda loaded, made: _draw(made, loaded, shipped, training),
     )
     shutil.rmtree(folder)

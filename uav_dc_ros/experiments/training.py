@@ -22,6 +22,7 @@ from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.env.batch import BatchWorld
 from uav_dc_ros.experiments.books import CURVES, Books
 from uav_dc_ros.experiments.runs import Population, Run, architecture, layout
+from uav_dc_ros.recordings.transitions import Transition
 
 # Makes a run's stream another one than that of the mission with the same seed.
 _TRAINING_STREAM = 1
@@ -80,6 +81,26 @@ class Training:
     def curves(self) -> dict[str, Array]:
         """Figures of every episode flown, float32 `[n_flown, N]` each; see `books.CURVES`."""
         return {name: self._curves[: self.n_flown, i] for i, name in enumerate(CURVES)}
+
+    @property
+    def n_remembered(self) -> int:
+        """Transitions in the replay buffer of each run."""
+        return len(self._buffer)
+
+    def remember(self, transition: Transition) -> None:
+        """Puts a recorded transition into the replay buffer of every run."""
+        n_runs = len(self.population.runs)
+        numbers = torch.tensor([transition.action, transition.reward, transition.terminated])
+        action, reward, terminated = numbers.to(self.device)[:, None].expand(-1, n_runs)
+
+        def seen(observation: np.ndarray) -> Tensor:
+            return torch.from_numpy(observation).to(self.device).expand(n_runs, -1)
+
+        self._buffer.add(
+            Transitions(
+                seen(transition.observation), action, reward, seen(transition.next_observation), terminated
+            )
+        )
 
     @torch.inference_mode()  # the gradient is written out, so torch need not keep books for its own
     def fly_episode(self) -> None:

@@ -45,7 +45,7 @@ class ChannelMonitor(MissionNode):
 
     def activate(self) -> None:
         """Begin with empty hands, and the books as they are."""
-        self._poses: deque[cdr.Pose] = deque(maxlen=WAITING_MAX)
+        self._poses: deque[tuple[cdr.Pose, int]] = deque(maxlen=WAITING_MAX)  # and when it was published
         self._users: deque[tuple[messages.Users, Array, int]] = deque(maxlen=WAITING_MAX)
         self._heard_ns = 0  # when the users measured last were published
 
@@ -79,7 +79,7 @@ class ChannelMonitor(MissionNode):
 
     def on_pose(self, pose: cdr.Pose) -> None:
         """Keep a pose; users may have waited for it."""
-        self._poses.append(pose)
+        self._poses.append((pose, self.published_ns))
         self._pair()
 
     def on_users(self, payload: messages.Users) -> None:
@@ -95,13 +95,13 @@ class ChannelMonitor(MissionNode):
         for waiting in tuple(self._users):
             users, users_m, published_ns = waiting
             begun_ns = users.stamp_ns
-            poses = [pose for pose in self._poses if 0 <= pose.stamp_ns - begun_ns < self._step_ns]
+            poses = [pose for pose, _ in self._poses if 0 <= pose.stamp_ns - begun_ns < self._step_ns]
             if not poses:
                 continue
             while (passed := self._users.popleft()) is not waiting:
                 self.reject("users", self._no_pose(passed[0]))
-            for pose in [pose for pose in self._poses if pose.stamp_ns < begun_ns]:
-                self._poses.remove(pose)  # older than any users to come
+            for heard in [heard for heard in self._poses if heard[0].stamp_ns < begun_ns]:
+                self._poses.remove(heard)  # older than any users to come
             found = min(poses, key=attrgetter("stamp_ns"))
             try:
                 self._measure(users, users_m, np.asarray(found.position_m), published_ns)
@@ -127,7 +127,7 @@ class ChannelMonitor(MissionNode):
                 f"mission, step {now} after {before}: a middleware that lost its peer for a while, and found "
                 "it again, repeats what it had said",
             )
-        self._heard_ns = published_ns
+        heard_ns, self._heard_ns = self._heard_ns, published_ns
         if now < before or users.mission != before[0]:
             if users.step > 0:
                 raise MessageError(
@@ -136,6 +136,9 @@ class ChannelMonitor(MissionNode):
                     "collected before is not known; expected a mission from its step 0",
                 )
             self._forget()
+            if now < before:  # another flight: its time begins again, and meets stamps of the one before
+                of_this_flight = (heard for heard in self._poses if heard[1] > heard_ns)
+                self._poses = deque(of_this_flight, maxlen=WAITING_MAX)
         elif users.step != before[1] + 1:
             self.reject(
                 "users",

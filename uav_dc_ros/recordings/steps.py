@@ -4,11 +4,12 @@ Messages of a step lie in a bag in any order, some are repeated (a lockstep that
 missing (a pose that was lost on the way). Each step is handed out once, with what there is of it.
 """
 
-from collections import Counter
+from bisect import insort
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -22,7 +23,23 @@ from uav_dc_ros.errors import BagError, MessageError, ScenarioError
 
 FRAME = "map"
 STEP_TOPICS = ("pose", "users", "rates", "mission", "move")
-OPEN_MAX = 3  # newest steps that may still get messages; older ones are handed out
+NEWER_MIN = 3  # newest steps: they may still get messages, whole or not
+OPEN_MAX = 256  # steps that are held while the oldest lacks something
+OPEN_BYTES_MAX = 64 * 2**20  # of their messages
+RECENT_MAX = 1000  # steps handed out, of which is known what they had: as many as a latched topic repeats
+POSES_MAX = 10_000  # poses whose users have not come
+POSES_KEPT = 64  # of a step
+
+Key: TypeAlias = tuple[int, int, int]  # flight, mission, step
+
+
+class RecordedPose(NamedTuple):
+    """A pose: its stamp, x, y, altitude in metres `[3]`, and when it was received and published (ns)."""
+
+    stamp_ns: int
+    position_m: Array
+    log_ns: int
+    publish_ns: int
 
 
 @dataclass(kw_only=True)
@@ -30,12 +47,15 @@ class RecordedStep:
     """One step of a mission; None for what the bag does not have.
 
     Attributes:
-        flight: counts from 0, one up whenever mission 0 begins again: two runs in one bag.
+        flight: counts from 0, one up whenever the vehicle begins again: two runs in one bag.
         mission, step: index of the mission in its flight, steps flown.
         position_m: x, y, altitude of the first pose of the step's own time, metres, `[3]`.
-        users, rates, status, move: the payloads; of repeated ones the first.
+        users, rates, status, move: the payloads; of repeated ones the first, but a status that ends the
+            mission takes the place of one that was ready for a move (an abort comes at the same step).
         log_ns: when each was received, nanoseconds since the epoch, by topic.
         publish_ns: when each was published, by topic.
+        poses: the first poses of the step's own time, by stamp: at most `POSES_KEPT`.
+        others: by topic the first payload that was said again for this step, and differently.
     """
 
     flight: int
@@ -48,6 +68,8 @@ class RecordedStep:
     move: messages.Move | None = None
     log_ns: dict[str, int] = field(default_factory=dict)
     publish_ns: dict[str, int] = field(default_factory=dict)
+    poses: list[RecordedPose] = field(default_factory=list)
+    others: dict[str, messages.Stepped] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -118,6 +140,9 @@ def scenario(reader: BagReader, name: str, wanted: str | Path | None = None) -> 
 class Steps:
     """Iterates over the steps of all missions in a namespace, in order; a few are in memory at a time.
 
+    A step is handed out when it is whole and newer ones have come. One that lacks something waits for it,
+    since a message that was lost and sent again comes late, but not for ever: see `OPEN_MAX`.
+
     Args:
         reader: of the bag.
         namespace: as `namespace` gives it.
@@ -125,90 +150,158 @@ class Steps:
 
     Attributes:
         rejected: messages that could not be read, by topic and reason.
-        orphans: messages that came when their step was handed out already, by topic.
+        orphans: messages that came when their step was handed out without them, by topic.
+        repeated: messages that said once more what was said before, by topic. Poses are not counted.
     """
 
     def __init__(self, reader: BagReader, namespace: str, step_ns: int = 2**63) -> None:
         self.rejected: Counter[tuple[str, str]] = Counter()
         self.orphans: Counter[str] = Counter()
+        self.repeated: Counter[str] = Counter()
         self._reader = reader
         self._step_ns = step_ns
-        self._topics = {f"{namespace}/{name}": name for name in STEP_TOPICS}
-        self._open: dict[tuple[int, int, int], RecordedStep] = {}
-        self._poses: list[tuple[int, Array, BagMessage]] = []  # stamp, position
+        self._topics = {
+            topic.name: name
+            for name in STEP_TOPICS
+            if (topic := reader.topics.get(f"{namespace}/{name}")) and topic.type == topics.TOPICS[name].type
+        }
+        self._awaited = [name for full, name in self._topics.items() if reader.topics[full].count]
+        self._open: dict[Key, RecordedStep] = {}
+        self._bytes: dict[Key, int] = {}  # of the messages of open steps
+        self._recent: dict[Key, frozenset[str]] = {}  # what the steps handed out last had
+        self._poses: deque[RecordedPose] = deque(maxlen=POSES_MAX)
         self._flight = 0
-        self._done = (-1, -1, -1)  # the step handed out last
-        self._last_log_ns = 0  # when its latest message was received
+        self._newest: dict[str, tuple[Key, int, messages.Stepped]] = {}  # by topic: key, publish time
+        self._done: Key = (-1, -1, -1)  # the step handed out last
+        self._done_over = True
+        self._last_log_ns = 0  # when the latest message of those handed out was received
 
     def __iter__(self) -> Iterator[RecordedStep]:
         """Start at the beginning of the bag; once."""
-        for message in self._reader.messages([name for name in self._topics if name in self._reader.topics]):
+        for message in self._reader.messages(list(self._topics)):
             topic = self._topics[message.topic]
             try:
                 if topic == "pose":
-                    position = _pose(message)
-                    self._poses.append((*position, message))
+                    self._hear_pose(_pose(message))
                     continue
                 payload = messages.decode(payloads.text_in_cdr(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
                 self.rejected[topic, error.reason] += 1
                 continue
             assert isinstance(payload, messages.Stepped), "the topics of steps"
-            if self._begins_again(payload, message):
-                yield from self._hand_out(keep=0)
-                self._poses = [pose for pose in self._poses if pose[2].log_time_ns > self._last_log_ns]
+            if self._begins_again(topic, payload, message.publish_time_ns):
+                yield from self._hand_out(wait=False)
+                late = [pose for pose in self._poses if pose.log_ns > self._last_log_ns]
+                self._poses = deque(late, POSES_MAX)
                 self._flight += 1
             key = (self._flight, payload.mission, payload.step)
+            if topic not in self._newest or key >= self._newest[topic][0]:
+                self._newest[topic] = key, message.publish_time_ns, payload
             if key <= self._done:
-                self.orphans[topic] += 1
+                known = topic in self._recent.get(key, ())
+                (self.repeated if known else self.orphans)[topic] += 1
                 continue
-            self._enter(self._step(key), topic, payload, message)
-            yield from self._hand_out(keep=OPEN_MAX)
-        yield from self._hand_out(keep=0)
+            self._enter(key, topic, payload, message)
+            yield from self._hand_out(wait=True)
+        yield from self._hand_out(wait=False)
 
-    def _step(self, key: tuple[int, int, int]) -> RecordedStep:
-        if key not in self._open:
-            flight, mission, step = key
-            self._open[key] = RecordedStep(flight=flight, mission=mission, step=step)
-        return self._open[key]
+    def _begins_again(self, topic: str, payload: messages.Stepped, publish_ns: int) -> bool:
+        """Whether it is the first word of another flight.
 
-    def _enter(self, step: RecordedStep, topic: str, payload: Any, message: BagMessage) -> None:
+        Who tells steps goes forward. A start that is told after later steps, and was published later, is that
+        of another flight; one that was published earlier is what a middleware repeats that lost its peer for
+        a while. A policy may answer such a repetition, so moves tell nothing.
+        """
+        if topic == "move" or topic not in self._newest or (payload.mission, payload.step) != (0, 0):
+            return False
+        (flight, *last), published_ns, before = self._newest[topic]
+        if flight < self._flight or publish_ns <= published_ns:
+            return False
+        return last > [0, 0] or (topic != "rates" and _start(payload) != _start(before))
+
+    def _enter(self, key: Key, topic: str, payload: messages.Stepped, message: BagMessage) -> None:
+        flight, mission, number = key
+        step = self._open.setdefault(key, RecordedStep(flight=flight, mission=mission, step=number))
+        self._bytes[key] = self._bytes.get(key, 0) + len(message.data)
         name = "status" if topic == "mission" else topic
-        if getattr(step, name) is None:
-            setattr(step, name, payload)
-            step.log_ns[topic] = message.log_time_ns
-            step.publish_ns[topic] = message.publish_time_ns
+        before = getattr(step, name)
+        if before is not None and not _ends(before, payload):
+            if payload == before or _ends(payload, before):
+                self.repeated[topic] += 1  # a vehicle that was stopped, and went on, is ready again
+            else:
+                step.others.setdefault(topic, payload)
+            return
+        setattr(step, name, payload)
+        step.log_ns[topic], step.publish_ns[topic] = message.log_time_ns, message.publish_time_ns
+        if topic == "users":
+            for pose in self._poses:
+                self._offer(step, pose)
 
-    def _begins_again(self, payload: messages.Stepped, message: BagMessage) -> bool:
-        """Is it the first word of another flight: the vehicle is at the start, and had been further."""
-        newest = max([*self._open, self._done])
-        begins = isinstance(payload, messages.Users) and (payload.mission, payload.step) == (0, 0)
-        return begins and newest[0] == self._flight and newest[1:] > (0, OPEN_MAX)
+    def _hear_pose(self, pose: RecordedPose) -> None:
+        self._poses.append(pose)
+        for step in self._open.values():
+            self._offer(step, pose)
 
-    def _hand_out(self, keep: int) -> Iterator[RecordedStep]:
-        for key in sorted(self._open)[: max(0, len(self._open) - keep)]:
+    def _offer(self, step: RecordedStep, pose: RecordedPose) -> None:
+        """Give a pose to a step, if it is of the step's own time, as the monitor has it."""
+        if step.users is None or not 0 <= pose.stamp_ns - step.users.stamp_ns < self._step_ns:
+            return
+        if any(p.stamp_ns == pose.stamp_ns and (p.position_m == pose.position_m).all() for p in step.poses):
+            return
+        insort(step.poses, pose, key=lambda one: one.stamp_ns)
+        del step.poses[POSES_KEPT:]
+        first = step.poses[0]
+        step.position_m = first.position_m
+        step.log_ns["pose"], step.publish_ns["pose"] = first.log_ns, first.publish_ns
+
+    def _hand_out(self, *, wait: bool) -> Iterator[RecordedStep]:
+        while self._open:
+            key = min(self._open)
+            if wait:
+                if len(self._open) <= NEWER_MIN:
+                    return
+                full = len(self._open) > OPEN_MAX or sum(self._bytes.values()) > OPEN_BYTES_MAX
+                if not full and not self._is_whole(key):
+                    return
             step = self._open.pop(key)
-            self._place(step)
-            self._done = key
-            self._last_log_ns = max(step.log_ns.values())
+            del self._bytes[key]
+            self._recent[key] = frozenset(step.log_ns)
+            if len(self._recent) > RECENT_MAX:
+                del self._recent[next(iter(self._recent))]
+            self._done, self._done_over = key, step.status is not None and step.status.phase.is_over
+            self._last_log_ns = max(self._last_log_ns, *step.log_ns.values())
+            if step.users is not None:
+                self._forget_poses(step.users.stamp_ns, max(step.log_ns.values()))
             yield step
 
-    def _place(self, step: RecordedStep) -> None:
-        """Find the pose of a step: the first one that is not older than its users, as the monitor does."""
-        if step.users is None:
-            return
-        begun_ns = step.users.stamp_ns
-        fitting = [pose for pose in self._poses if 0 <= pose[0] - begun_ns < self._step_ns]
-        if not fitting:
-            return
-        _, position_m, message = min(fitting, key=lambda pose: pose[0])
-        step.position_m = position_m
-        step.log_ns["pose"], step.publish_ns["pose"] = message.log_time_ns, message.publish_time_ns
-        self._poses = [pose for pose in self._poses if pose[0] > begun_ns]
+    def _forget_poses(self, begun_ns: int, received_ns: int) -> None:
+        """Drop poses up to a step's begin; one that was received after the step may be another flight's."""
+        kept = (p for p in self._poses if p.stamp_ns > begun_ns or p.log_ns > received_ns)
+        self._poses = deque(kept, POSES_MAX)
+
+    def _is_whole(self, key: Key) -> bool:
+        """Has a step all that it can have, and does it follow the one before."""
+        flight, mission, number = self._done
+        follows = key[0] != flight or key == (flight, mission, number + 1) or self._done_over
+        step = self._open[key]
+        over = step.status is not None and step.status.phase.is_over
+        return follows and all(name in step.log_ns or (name == "move" and over) for name in self._awaited)
 
 
-def _pose(message: BagMessage) -> tuple[int, Array]:
-    """Stamp and position of a pose.
+def _start(payload: messages.Stepped) -> object:
+    """What stays the same when a flight tells its start again."""
+    return payload.seed if isinstance(payload, messages.Mission) else payload
+
+
+def _ends(before: messages.Stepped, now: messages.Stepped) -> bool:
+    """Whether it is the end of the mission, after a status that was ready."""
+    if not isinstance(before, messages.Mission) or not isinstance(now, messages.Mission):
+        return False
+    return not before.phase.is_over and now == msgspec.structs.replace(before, phase=now.phase) != before
+
+
+def _pose(message: BagMessage) -> RecordedPose:
+    """The pose in a message.
 
     Raises:
         MessageError: no pose, or none in the frame `map`.
@@ -223,4 +316,5 @@ def _pose(message: BagMessage) -> tuple[int, Array]:
     position_m = np.asarray([point.x, point.y, point.z], dtype=np.float64)
     if not np.isfinite(position_m).all():
         raise MessageError("not_finite", f"position {position_m.tolist()}; expected finite metres")
-    return header.stamp.sec * 10**9 + header.stamp.nanosec, position_m
+    stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
+    return RecordedPose(stamp_ns, position_m, message.log_time_ns, message.publish_time_ns)

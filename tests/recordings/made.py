@@ -1,0 +1,175 @@
+"""Bags of missions, made without nodes: what they say, in their words, and copies with something changed."""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from tests.bags.made import TYPES
+from uav_dc_ros import __version__, messages, payloads, topics
+from uav_dc_ros.bags.read import BagMessage, BagReader
+from uav_dc_ros.bags.write import BagWriter
+from uav_dc_ros.core import world
+from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.scenario import Scenario
+
+BEGUN_NS = 1_700_000_000 * 10**9
+APART_NS = 10_000  # one message after the other
+
+
+def pose(position_m: Sequence[float], stamp_ns: int, frame: str = "map") -> bytes:
+    """A geometry_msgs/PoseStamped, serialised by rosbags."""
+    types, (x, y, z) = TYPES.types, (float(one) for one in position_m)
+    stamp = types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
+    made = types[topics.POSE](
+        types["std_msgs/msg/Header"](stamp, frame),
+        types["geometry_msgs/msg/Pose"](
+            types["geometry_msgs/msg/Point"](x, y, z),
+            types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        ),
+    )
+    return bytes(TYPES.serialize_cdr(made, topics.POSE))
+
+
+def said(topic: str, payload: messages.Payload | bytes, time_ns: int) -> BagMessage:
+    """A message that was received when it was published; bytes are a pose."""
+    data = payload if isinstance(payload, bytes) else payloads.cdr_of_text(messages.encode(payload))
+    return BagMessage(f"/{topic}", topics.TOPICS[topic].type, data, time_ns, time_ns)
+
+
+def flight(
+    scenario: Scenario,
+    *,
+    act: Callable[[int, int], int] = lambda mission, step: (mission + 3 * step) % 7,
+    seed: int = 0,
+    missions: int = 1,
+    begun_ns: int = BEGUN_NS,
+    steps: int | None = None,
+) -> list[BagMessage]:
+    """What the nodes say in a lockstep flight: pose, users, mission, rates and move of each step.
+
+    Args:
+        scenario: the world.
+        act: the action of a step of a mission.
+        seed: of mission 0.
+        missions: how many.
+        begun_ns: when.
+        steps: after which the last mission is aborted.
+    """
+    told: list[BagMessage] = []
+
+    def say(topic: str, payload: messages.Payload | bytes) -> None:
+        told.append(said(topic, payload, begun_ns + APART_NS * len(told)))
+
+    max_steps = scenario.mission.max_steps
+    for mission in range(missions):
+        rng = np.random.default_rng(seed + mission)
+        state = world.initial(scenario, rng.random((scenario.n_users, 2)))
+        phase, link = messages.Phase.READY, None
+        while True:
+            step = int(state.step)
+            time_ns = round((mission * (max_steps + 1) + step) * scenario.mission.step_s * 1e9)
+            uav_m = scenario.grid.centre_m(state.cell, like=state.users_m)
+            if link is None:
+                link = world.measure(scenario, uav_m, state.users_m, state.collected)
+            say("pose", pose(uav_m.tolist(), time_ns))
+            at = {"mission": mission, "step": step}
+            say("users", payloads.users(scenario, state.users_m, time_ns=time_ns, **at))
+            status = messages.Mission(
+                **at,
+                phase=phase,
+                cell=tuple(state.cell.tolist()),
+                remaining_steps=max_steps - step,
+                seed=seed + mission,
+                scenario=scenario.name,
+                fingerprint=scenario.fingerprint,
+            )
+            say("mission", status)
+            say("rates", payloads.rates(link, state.data_bits, state.collected, **at))
+            if phase.is_over:
+                break
+            if mission == missions - 1 and step == steps:
+                say("mission", msgspec.structs.replace(status, phase=messages.Phase.ABORTED))
+                break
+            action = act(mission, step)
+            say("move", messages.Move(**at, action=ACTION_LABELS[action]))
+            state, outcome = world.step(
+                scenario, state, np.asarray(action), rng.random((scenario.n_users, 2))
+            )
+            link = outcome.link
+            if outcome.terminated or outcome.truncated:
+                phase = messages.Phase.LANDED if outcome.landed else messages.Phase.TIMEOUT
+    return told
+
+
+def about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, str]:
+    """What the recorder writes about a bag."""
+    return {
+        "version": __version__,
+        "scenario": scenario.name,
+        "scenario_fingerprint": scenario.fingerprint,
+        "scenario_values": json.dumps(msgspec.to_builtins(scenario)),
+        "seed": str(seed),
+        "pace": "lockstep",
+        **values,
+    }
+
+
+def write(
+    folder: Path, told: Iterable[BagMessage], about: dict[str, str] | None = None, namespace: str = ""
+) -> Path:
+    """A bag with messages, in their order; its folder."""
+    with BagWriter(folder, about or {}) as writer:
+        known = set()
+        for message in told:
+            topic = namespace + message.topic
+            if topic not in known:
+                writer.add_topic(topic, message.type)
+                known.add(topic)
+            writer.write(
+                topic,
+                message.data,
+                log_time_ns=message.log_time_ns,
+                publish_time_ns=message.publish_time_ns,
+            )
+    return folder
+
+
+Change = Callable[[BagMessage], BagMessage | None]
+
+
+def copy(bag: Path, folder: Path, change: Change) -> Path:
+    """A copy of a bag, with every message as `change` makes it; None leaves it out."""
+    with BagReader(bag) as reader:
+        kept = (made for message in reader.messages() if (made := change(message)) is not None)
+        return write(folder, kept, reader.about)
+
+
+def changing(
+    topic: str, mission: int, step: int, change: Callable[[messages.Stepped], messages.Stepped | None]
+) -> Change:
+    """Changes the payload of one step on a topic; None leaves it out."""
+
+    def apply(message: BagMessage) -> BagMessage | None:
+        if message.topic != f"/{topic}":
+            return message
+        payload = messages.decode(payloads.text_in_cdr(message.data), messages.PAYLOADS[topic])
+        if (payload.mission, payload.step) != (mission, step):
+            return message
+        made = change(payload)
+        return None if made is None else message._replace(data=said(topic, made, 0).data)
+
+    return apply
+
+
+def nudged(column: str, user: int) -> Callable[[messages.Stepped], messages.Stepped]:
+    """Changes one number of a column in its last bit."""
+
+    def apply(payload: messages.Stepped) -> messages.Stepped:
+        values = list(getattr(payload, column))
+        values[user] = float(np.nextafter(values[user], np.inf))
+        return msgspec.structs.replace(payload, **{column: values})
+
+    return apply

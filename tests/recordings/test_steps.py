@@ -1,0 +1,317 @@
+"""The steps of recorded missions, whatever order, repetition and loss their messages were recorded in."""
+
+import random
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.bags.made import text
+from tests.recordings.made import APART_NS, BEGUN_NS, flight, pose, said, write
+from tests.small_worlds import tiny
+from uav_dc_ros import messages
+from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
+from uav_dc_ros.errors import BagError
+from uav_dc_ros.messages import Phase
+from uav_dc_ros.recordings import steps
+from uav_dc_ros.recordings.steps import OPEN_MAX, Steps
+
+SCENARIO = tiny()
+STEP_NS = round(SCENARIO.mission.step_s * 1e9)
+LAST = SCENARIO.mission.max_steps
+FLIGHT = flight(SCENARIO, missions=3)
+PER_STEP = 5
+LATER_NS = BEGUN_NS + 3600 * 10**9
+
+
+class InMemory:
+    """A reader of messages that lie in no file."""
+
+    def __init__(self, told: list[BagMessage]) -> None:
+        self.path, self.about = "memory", {}
+        self._told = sorted(told, key=lambda message: message.log_time_ns)
+        self.topics: dict[str, RecordedTopic] = {}
+        for message in told:
+            row = RecordedTopic(name=message.topic, type=message.type)
+            self.topics.setdefault(message.topic, row).count += 1
+
+    def messages(self, names):
+        return (message for message in self._told if message.topic in names)
+
+
+def read(told, namespace="", step_ns=STEP_NS):
+    stream = Steps(InMemory(told), namespace, step_ns)
+    return list(stream), stream
+
+
+def plain(step):
+    """What a step tells, without times."""
+    position = None if step.position_m is None else tuple(step.position_m)
+    return (step.flight, step.mission, step.step), position, step.users, step.rates, step.status, step.move
+
+
+WHOLE = [plain(step) for step in read(FLIGHT)[0]]
+
+
+def test_a_flight_in_order():
+    found, stream = read(FLIGHT)
+    assert [(s.mission, s.step) for s in found] == [(m, s) for m in range(3) for s in range(LAST + 1)]
+    for step in found:
+        over = step.step == LAST
+        assert (step.move is None) == over
+        assert step.status.phase.is_over == over
+        assert step.users.step == step.rates.step == step.status.step == step.step
+        assert step.position_m.tolist() == [100.0 * step.status.cell[0], 100.0 * step.status.cell[1], 100.0]
+        assert set(step.log_ns) == set(steps.STEP_TOPICS) - ({"move"} if over else set())
+        assert step.log_ns == step.publish_ns
+        assert not step.others
+    assert not stream.orphans + stream.repeated + stream.rejected
+
+
+def shuffled(told, rng, reach, topics_in_order=False):
+    """As received: each message by up to `reach` messages late, if told those of a topic in their order."""
+    latest = {}
+    late = []
+    for message in told:
+        log_ns = message.log_time_ns + APART_NS * rng.randint(0, reach)
+        if topics_in_order:
+            log_ns = max(log_ns, latest.get(message.topic, 0))
+        latest[message.topic] = log_ns
+        late.append(message._replace(log_time_ns=log_ns))
+    return sorted(late, key=lambda message: message.log_time_ns)
+
+
+@given(st.integers(0, 2**32), st.integers(0, 3 * PER_STEP))
+@settings(max_examples=30, deadline=None)
+def test_any_order_within_a_few_steps_gives_the_same_steps(seed, reach):
+    found, stream = read(shuffled(FLIGHT, random.Random(seed), reach))
+    assert [plain(step) for step in found] == WHOLE
+    assert not stream.orphans
+
+
+@given(st.data())
+@settings(max_examples=30, deadline=None)
+def test_repetitions_change_nothing_and_are_counted(data):
+    """A lockstep that stands still says its step again; a middleware repeats what it said, as of then."""
+    rng = random.Random(data.draw(st.integers(0, 2**32)))
+    told = list(FLIGHT)
+    n = 0
+    for _ in range(data.draw(st.integers(1, 5))):
+        i = rng.randrange(len(FLIGHT))
+        one = FLIGHT[i]
+        if one.topic == "/pose":
+            continue
+        if rng.random() < 0.5:  # said again at once, and published anew
+            again_ns = one.log_time_ns + rng.randrange(1, APART_NS)
+            told.append(one._replace(log_time_ns=again_ns, publish_time_ns=again_ns))
+        else:  # repeated at any time later
+            told.append(one._replace(log_time_ns=one.log_time_ns + rng.randrange(1, APART_NS * len(FLIGHT))))
+        n += 1
+    found, stream = read(told)
+    assert [plain(step) for step in found] == WHOLE
+    assert (stream.repeated.total(), stream.orphans.total()) == (n, 0)
+
+
+def test_a_latched_history_that_comes_again_whole_is_no_new_flight():
+    history = [
+        message._replace(log_time_ns=FLIGHT[-1].log_time_ns + i)
+        for i, message in enumerate(m for m in FLIGHT if m.topic in ("/users", "/mission", "/rates"))
+    ]
+    found, stream = read(FLIGHT + history)
+    assert [plain(step) for step in found] == WHOLE
+    assert stream.repeated.total() == len(history)
+    assert not stream.orphans
+
+
+@given(st.sets(st.integers(0, len(FLIGHT) - 1), min_size=1, max_size=40))
+@settings(max_examples=30, deadline=None)
+def test_what_is_missing_is_none_and_nothing_else_changes(lost):
+    """Whatever is lost, every step has what is left of it, and only that."""
+    kept = [message for i, message in enumerate(FLIGHT) if i not in lost]
+    found = {(step.mission, step.step): step for step in read(kept)[0]}
+    begins = [i for i, message in enumerate(FLIGHT) if message.topic == "/pose"]
+    for first, (key, position, *told) in zip(begins, WHOLE, strict=True):
+        names = ("users", "rates", "status", "move")
+        at = dict(zip(("pose", "users", "status", "rates", "move"), range(first, first + 5), strict=True))
+        step = found.get(key[1:])
+        expected = {
+            name: None if at[name] in lost else value for name, value in zip(names, told, strict=True)
+        }
+        if step is None:
+            assert not any(expected.values())
+            continue
+        assert {name: getattr(step, name) for name in names} == expected
+        has_pose = at["pose"] not in lost and at["users"] not in lost
+        assert (None if step.position_m is None else tuple(step.position_m)) == (
+            position if has_pose else None
+        )
+
+
+@pytest.mark.parametrize("topic", ["users", "rates", "mission", "move", "pose"])
+def test_a_message_that_was_lost_and_sent_again_much_later_finds_its_step(topic):
+    scenario = tiny(mission={"max_steps": 300})
+    told = flight(scenario)
+    i = next(i for i, m in enumerate(told) if m.topic == f"/{topic}" and i > 50)
+    told[i] = told[i]._replace(log_time_ns=told[i].log_time_ns + 200 * PER_STEP * APART_NS)
+    found, stream = read(told)
+    assert [plain(step) for step in found] == [plain(step) for step in read(flight(scenario))[0]]
+    assert not stream.orphans
+
+
+def test_one_that_comes_too_late_is_an_orphan_and_few_steps_are_held():
+    told = flight(tiny(mission={"max_steps": 3 * OPEN_MAX}))
+    i = next(i for i, m in enumerate(told) if m.topic == "/rates" and i > 50)
+    told[i] = told[i]._replace(log_time_ns=told[i].log_time_ns + (OPEN_MAX + 10) * PER_STEP * APART_NS)
+    stream = Steps(InMemory(told), "", STEP_NS)
+    most = 0
+    for _ in stream:
+        most = max(most, len(stream._open))
+    assert stream.orphans == {"rates": 1}
+    assert most <= OPEN_MAX
+
+
+def test_steps_in_memory_are_few_where_nothing_is_missing():
+    stream = Steps(InMemory(flight(tiny(mission={"max_steps": 500}))), "", STEP_NS)
+    assert max(len(stream._open) + len(stream._poses) for _ in stream) < 12
+
+
+@pytest.mark.parametrize(
+    ("steps_of_first", "same_seed"),
+    # Not (0, True): of a flight that never moved, and one that begins the same, nothing tells two.
+    [(0, False), (1, False), (1, True), (2, True), (5, True), (None, True), (None, False)],
+)
+def test_two_flights_in_one_bag(steps_of_first, same_seed):
+    first = flight(SCENARIO, steps=steps_of_first)
+    second = flight(SCENARIO, missions=2, seed=0 if same_seed else 9, begun_ns=LATER_NS)
+    found, stream = read(first + second)
+    one, two = ([plain(s)[1:] for s in read(told)[0]] for told in (first, second))
+    assert [plain(s)[1:] for s in found if s.flight == 0] == one
+    assert [plain(s)[1:] for s in found if s.flight == 1] == two
+    assert not stream.orphans + stream.repeated
+    assert not any(step.others for step in found)
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=20, deadline=None)
+def test_two_flights_of_which_topics_are_late(seed):
+    """Each writer's messages come in its order: by that a start that comes again is known."""
+    rng = random.Random(seed)
+    second = flight(SCENARIO, seed=4, begun_ns=LATER_NS)
+    found, stream = read([m for told in (FLIGHT, second) for m in shuffled(told, rng, 2 * PER_STEP, True)])
+    assert [plain(step) for step in found if step.flight == 0] == WHOLE
+    assert len([step for step in found if step.flight == 1]) == LAST + 1 == len(found) - len(WHOLE)
+    assert all(None not in plain(step)[1:-1] for step in found)
+    assert not stream.orphans
+
+
+def test_an_abort_ends_the_step_that_was_ready():
+    found, _ = read(flight(SCENARIO, steps=3))
+    assert [step.status.phase for step in found] == [Phase.READY] * 3 + [Phase.ABORTED]
+    assert not found[-1].others
+
+
+def test_a_vehicle_that_was_stopped_and_goes_on_is_ready_again():
+    told = flight(SCENARIO)
+    i, ready = next((i, m) for i, m in enumerate(told) if m.topic == "/mission" and i > 10)
+    status = next(s.status for s in read(told)[0] if s.publish_ns["mission"] == ready.publish_time_ns)
+    aborted = msgspec.structs.replace(status, phase=Phase.ABORTED)
+    told.insert(i + 1, said("mission", aborted, ready.log_time_ns + 1))
+    told.insert(i + 2, said("mission", status, ready.log_time_ns + 2))
+    found, stream = read(told)
+    assert not any(step.others for step in found)
+    assert stream.repeated == {"mission": 1}
+    assert found[-1].status.phase is not Phase.ABORTED
+
+
+def test_what_is_said_again_differently_is_kept_beside_the_first():
+    i, one = next((i, m) for i, m in enumerate(FLIGHT) if m.topic == "/move")
+    other = messages.Move(mission=0, step=0, action="hover")
+    told = [*FLIGHT, said("move", other, one.log_time_ns + 1)]
+    found, _ = read(told)
+    assert found[0].move.action == "left"
+    assert found[0].others == {"move": other}
+    assert [plain(step) for step in found] == WHOLE
+    assert i < PER_STEP
+
+
+def test_the_first_pose_of_the_steps_own_time_is_its_position():
+    """An aircraft tells many; stamps of another time, true or not, are none of the step's."""
+    users = next(m for m in FLIGHT if m.topic == "/users")
+    now_ns = users.log_time_ns
+    told = [
+        said("pose", pose((9, 9, 9), 10 * STEP_NS), now_ns - 3),  # of the future
+        users,
+        said("pose", pose((3, 3, 3), 700), now_ns + 3),
+        said("pose", pose((1, 1, 1), 500), now_ns + 4),  # overtaken on its way
+        said("pose", pose((1, 1, 1), 500), now_ns + 5),
+        said("pose", pose((2, 2, 2), 500), now_ns + 6),
+        said("pose", pose((4, 4, 4), STEP_NS), now_ns + 7),  # of the next step
+        said("pose", pose((5, 5, 5), 100, frame="odom"), now_ns + 8),
+        said("pose", pose((float("nan"), 5, 5), 100), now_ns + 9),
+        said("pose", pose((5, 5, 5), 100)[:40], now_ns + 10),
+    ]
+    (step,), stream = read(told)
+    assert step.position_m.tolist() == [1.0, 1.0, 1.0]
+    assert [p.position_m[0] for p in step.poses] == [1.0, 2.0, 3.0]
+    assert (step.log_ns["pose"], step.publish_ns["pose"]) == (now_ns + 4, now_ns + 4)
+    assert stream.rejected == {("pose", "frame"): 1, ("pose", "not_finite"): 1, ("pose", "malformed"): 1}
+
+
+def test_poses_without_users_do_not_fill_the_memory():
+    told = [said("pose", pose((0, 0, 100), i * 10**6), BEGUN_NS + i) for i in range(steps.POSES_MAX + 50)]
+    stream = Steps(InMemory(told), "")
+    assert list(stream) == []
+    assert len(stream._poses) == steps.POSES_MAX
+
+
+def test_what_cannot_be_read_is_counted(tmp_path):
+    garbage = [
+        BagMessage("/move", "std_msgs/msg/String", text("{"), BEGUN_NS + 1, 0),
+        BagMessage("/move", "std_msgs/msg/String", text("{}"), BEGUN_NS + 2, 0),
+        BagMessage("/rates", "std_msgs/msg/String", b"\0\1\0\0\xff\0\0\0", BEGUN_NS + 3, 0),
+    ]
+    found, stream = read(FLIGHT + garbage)
+    assert [plain(step) for step in found] == WHOLE
+    assert stream.rejected == {("move", "malformed"): 1, ("move", "invalid"): 1, ("rates", "malformed"): 1}
+
+
+def test_namespaces(tmp_path):
+    """Each namespace has its own missions; topics of another type are somebody else's."""
+    second = [m._replace(topic=f"/uav2{m.topic}") for m in flight(SCENARIO, seed=5)]
+    stranger = BagMessage("/uav3/mission", "std_msgs/msg/Bool", b"\0\1\0\0\1", BEGUN_NS, BEGUN_NS)
+    told = sorted([*FLIGHT, *second], key=lambda message: message.log_time_ns)
+    bag = write(tmp_path / "bag", [stranger, *told])
+    with BagReader(bag) as reader:
+        assert steps.namespaces(reader) == ["", "/uav2"]
+        with pytest.raises(BagError, match=r"holds missions in /, /uav2; expected one of them"):
+            steps.namespace(reader)
+        with pytest.raises(BagError, match=r"no mission in namespace 'uav3'; expected /, /uav2"):
+            steps.namespace(reader, "uav3")
+        assert [plain(s) for s in Steps(reader, steps.namespace(reader, "/"), STEP_NS)] == WHOLE
+        other = list(Steps(reader, steps.namespace(reader, "uav2"), STEP_NS))
+    assert {step.status.seed for step in other} == {5}
+    assert len(other) == LAST + 1
+
+
+def test_a_topic_of_another_type_is_not_read(tmp_path):
+    odometry = [m._replace(type="nav_msgs/msg/Odometry") if m.topic == "/pose" else m for m in FLIGHT]
+    found, stream = read(odometry)
+    assert all(step.position_m is None and step.users is not None for step in found)
+    assert not stream.rejected
+
+
+def test_the_scenario_of_a_bag(tmp_path):
+    from uav_dc_ros import scenarios
+
+    shipped = scenarios.load("three_clusters")
+    bag = write(tmp_path / "foreign", flight(shipped, steps=1))
+    with BagReader(bag) as reader:
+        assert steps.scenario(reader, "") == shipped, "by the fingerprint that its missions tell"
+        assert steps.scenario(reader, "", "five_clusters").name == "five_clusters"
+    bag = write(tmp_path / "unknown", flight(SCENARIO, steps=1))
+    with (
+        BagReader(bag) as reader,
+        pytest.raises(BagError, match=r"fly 'tiny' \([0-9a-f]{12}\); expected --sc"),
+    ):
+        steps.scenario(reader, "")

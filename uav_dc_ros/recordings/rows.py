@@ -1,0 +1,196 @@
+"""Recorded missions as rows of tidy tables: one observation a row, units in the names of columns."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from uav_dc_ros import payloads
+from uav_dc_ros.core import reward as core_reward
+from uav_dc_ros.core import world
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import BagError, MessageError
+from uav_dc_ros.recordings.steps import RecordedStep
+from uav_dc_ros.recordings.tables import Columns
+
+_WHICH: Columns = {"flight": "int", "mission": "int", "step": "int"}
+# Of each table its columns. What is recorded per step holds at its end; `action` is decided there.
+TABLES: dict[str, Columns] = {
+    "steps": {
+        **_WHICH,
+        "time_s": "float",  # of the users, ROS time; in simulation mission time
+        "received_ns": "int",  # the first of its messages, since the epoch
+        "x_m": "float",
+        "y_m": "float",
+        "altitude_m": "float",
+        "cell_x": "int",
+        "cell_y": "int",
+        "cell_z": "int",
+        "phase": "text",
+        "remaining_steps": "int",
+        "action": "text",
+        "sum_rate_bps": "float",
+        "users_served": "int",
+        "users_collected": "int",
+        "data_bits": "float",  # of all users
+        "total_reward": "float",  # r^t (eq. 7)
+        "reward": "float",  # what the step paid
+    },
+    "users": {
+        **_WHICH,
+        "user": "int",
+        "cluster": "int",
+        "x_m": "float",
+        "y_m": "float",
+        "sinr": "float",  # linear
+        "rate_bps": "float",
+        "data_bits": "float",
+        "served": "bool",
+        "collected": "bool",
+    },
+    "missions": {
+        "flight": "int",
+        "mission": "int",
+        "seed": "int",
+        "scenario": "text",
+        "scenario_fingerprint": "text",
+        "policy": "text",
+        "policy_sha256": "text",
+        "outcome": "text",  # landed, timeout, aborted; unfinished: the bag does not hold the end
+        "steps_flown": "int",
+        "steps_recorded": "int",
+        "first_received_ns": "int",
+        "last_received_ns": "int",
+        "users_total": "int",
+        "users_collected": "int",
+        "data_bits": "float",
+        "mean_sum_rate_bps": "float",  # over the steps flown that have one
+        "total_reward": "float",
+    },
+}
+Rows = Mapping[str, Sequence[Any]]
+
+
+class Mission:
+    """Rows of one mission, which is handed over step by step.
+
+    Args:
+        scenario: the world, and how its agents are paid.
+        about: what the recorder wrote about the bag.
+    """
+
+    def __init__(self, scenario: Scenario, about: Mapping[str, str]) -> None:
+        self._scenario, self._about = scenario, about
+        self._total: tuple[int, float] | None = None  # step, and r^t there
+        self._last: RecordedStep | None = None
+        self._status = self._rates = None  # type: Any  # the latest that are recorded
+        self._recorded = 0
+        self._sum_rates: list[float] = []
+        self._first_ns = 2**63 - 1
+        self._last_ns = 0
+
+    def add(self, step: RecordedStep) -> dict[str, Rows]:
+        """The rows of a step: of `steps` one, of `users` one per user.
+
+        Raises:
+            BagError: it is of another world.
+        """
+        try:
+            if step.status is not None:
+                payloads.check_world(step.status, self._scenario)
+            if step.users is not None:
+                payloads.users_m(step.users, self._scenario)
+            if step.rates is not None:
+                payloads.collection(step.rates, self._scenario)
+        except MessageError as error:
+            raise BagError(f"{step.name}: {error}") from None
+        self._recorded += 1
+        self._last, self._status = step, step.status or self._status
+        self._rates = step.rates or self._rates
+        self._first_ns = min(self._first_ns, *step.log_ns.values())
+        self._last_ns = max(self._last_ns, *step.log_ns.values())
+        if step.rates is not None and step.step > 0:
+            self._sum_rates.append(step.rates.sum_rate_bps)
+        return {"steps": self._step(step), "users": self._users(step)}
+
+    def _step(self, step: RecordedStep) -> Rows:
+        users, rates, status, position_m = step.users, step.rates, step.status, step.position_m
+        total, reward = self._paid(step)
+        row = {
+            **_which(step),
+            "time_s": None if users is None else users.stamp_ns / 1e9,
+            "received_ns": min(step.log_ns.values()),
+            **_spread(("x_m", "y_m", "altitude_m"), None if position_m is None else position_m.tolist()),
+            **_spread(("cell_x", "cell_y", "cell_z"), status and status.cell),
+            "phase": status and status.phase.value,
+            "remaining_steps": status and status.remaining_steps,
+            "action": step.move and step.move.action,
+            "sum_rate_bps": rates and rates.sum_rate_bps,
+            "users_served": rates and sum(rates.served),
+            "users_collected": rates and sum(rates.collected),
+            "data_bits": rates and float(np.sum(rates.data_bits)),
+            "total_reward": total,
+            "reward": reward,
+        }
+        return {name: [value] for name, value in row.items()}
+
+    def _paid(self, step: RecordedStep) -> tuple[float | None, float | None]:
+        """r^t, and what the step paid; None where it is not known. A mission starts from r = 0."""
+        before, self._total = self._total, None
+        total = 0.0
+        if step.step > 0:
+            if step.rates is None or step.status is None:
+                return None, None
+            cell = np.asarray(step.status.cell)
+            total = float(world.total_reward(self._scenario, cell, np.asarray(step.rates.data_bits)))
+        self._total = step.step, total
+        if before is None or before[0] != step.step - 1:
+            return total, None
+        return total, float(core_reward.earned(total, before[1], self._scenario.reward.form))
+
+    def _users(self, step: RecordedStep) -> Rows:
+        if step.users is None and step.rates is None:
+            return {name: [] for name in TABLES["users"]}
+        n = self._scenario.n_users
+        nothing = [None] * n
+        rows: dict[str, Sequence[Any]] = {name: [value] * n for name, value in _which(step).items()}
+        rows |= {"user": range(n), "cluster": self._scenario.user_cluster.tolist()}
+        for name in ("x_m", "y_m"):
+            rows[name] = getattr(step.users, name) if step.users else nothing
+        for name in ("sinr", "rate_bps", "data_bits", "served", "collected"):
+            rows[name] = getattr(step.rates, name) if step.rates else nothing
+        return rows
+
+    def summary(self) -> Rows:
+        """The row of the mission, after its last step."""
+        last, status, rates = self._last, self._status, self._rates
+        assert last is not None, "a mission has a step"
+        over = status is not None and status.phase.is_over
+        row = {
+            "flight": last.flight,
+            "mission": last.mission,
+            "seed": status and status.seed,
+            "scenario": self._scenario.name,
+            "scenario_fingerprint": self._scenario.fingerprint,
+            "policy": self._about.get("policy"),
+            "policy_sha256": self._about.get("policy_sha256"),
+            "outcome": status.phase.value if over else "unfinished",
+            "steps_flown": last.step,
+            "steps_recorded": self._recorded,
+            "first_received_ns": self._first_ns,
+            "last_received_ns": self._last_ns,
+            "users_total": self._scenario.n_users,
+            "users_collected": rates and sum(rates.collected),
+            "data_bits": rates and float(np.sum(rates.data_bits)),
+            "mean_sum_rate_bps": float(np.mean(self._sum_rates)) if self._sum_rates else None,
+            "total_reward": self._total and self._total[1],
+        }
+        return {name: [value] for name, value in row.items()}
+
+
+def _which(step: RecordedStep) -> dict[str, Any]:
+    return {"flight": step.flight, "mission": step.mission, "step": step.step}
+
+
+def _spread(names: tuple[str, ...], values: Any) -> dict[str, Any]:
+    return dict.fromkeys(names) if values is None else dict(zip(names, values, strict=True))
