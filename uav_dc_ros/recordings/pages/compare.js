@@ -1,0 +1,107 @@
+// Missions or policies side by side.
+
+const METRICS = [
+  ["landed", "landed", (v) => `${fixed(100 * v)} %`], ["users_collected", "users collected", (v) => fixed(v, 1)],
+  ["data_bits", "data", (v) => si(v, "bit")], ["sum_rate_bps", "mean sum-rate", (v) => si(v, "bit/s")],
+  ["distance_m", "distance flown", (v) => si(v, "m")], ["steps", "steps", (v) => fixed(v, 1)], ["reward", "reward", (v) => fixed(v, 3)],
+];
+// Okabe and Ito's, yellow left out: it cannot be seen on paper. Dashes tell groups apart without colour.
+const SHADES = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c7853", "#7f7f9f"];
+const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "5px,2px", "2px,6px"];
+
+open(async (page, data) => {
+  const { groups, world } = data;
+  const one = groups.every((group) => group.missions === 1);
+  const policies = [...new Set(groups.map((group) => group.policy))];
+  page.querySelector("header").prepend(make("div", {}, page.querySelector("h1"),
+    make("p", { class: "sub" }, policies.length === 1 ? `policy ${policies[0]}` : `policies ${policies.join(", ")}`)));
+  const warnings = [
+    data.worlds_differ ? "These groups flew in different worlds: their figures are not of the same task." : "",
+    data.rewards_differ ? "These groups were paid by different rewards: their rewards cannot be compared." : "",
+  ].filter(Boolean);
+  const key = (i) => {
+    const drawn = make("span", { "aria-hidden": "true" });
+    const dash = { solid: "", dash: "6 3", dot: "2 3", dashdot: "6 3 2 3", longdash: "9 3", longdashdot: "9 3 2 3" }[DASHES[i]] ?? DASHES[i].replaceAll("px", "").replaceAll(",", " ");
+    drawn.innerHTML = `<svg width="30" height="10"><line x1="0" y1="5" x2="30" y2="5" stroke="${SHADES[i]}" stroke-width="3" stroke-dasharray="${dash}"/></svg> `; // our own text only
+    return drawn;
+  };
+  const name = (i) => make("span", {}, key(i), groups[i].label);
+  const legend = () => make("ul", { class: "legend" }, ...groups.map((_, i) => make("li", {}, name(i))));
+
+  const range = (told, format, sign = "") => [
+    `${sign && told.mean > 0 ? sign : ""}${format(told.mean)}`,
+    told.low === null ? null : make("div", { class: "range" }, `${format(told.low)} … ${format(told.high)}`),
+  ];
+  const cell = (...parts) => make("span", {}, ...parts.flat().filter((part) => part !== null));
+  const columns = [
+    { name: one ? "mission" : "bag", text: (row) => name(groups.indexOf(row)), value: (row) => row.label },
+    { name: "policy", text: (row) => row.policy, value: (row) => row.policy },
+    { name: "seeds", text: (row) => row.seeds || NONE },
+    { name: "missions", text: (row) => String(row.missions), value: (row) => row.missions },
+  ];
+  const figures = METRICS.map(([metric, words, format]) => ({
+    name: words, text: (row) => cell(range(row.metrics[metric], format)), value: (row) => row.metrics[metric].mean,
+  }));
+  const paired = groups.filter((group) => group.paired);
+  page.append(
+    make("section", { "aria-labelledby": "summary" }, make("h2", { id: "summary" }, "In numbers"),
+      make("p", { class: "note" }, one ? "One mission each: figures without intervals." : "Means over the missions, and below them their 95% bootstrap intervals."),
+      ...warnings.map((words) => make("p", { class: "warning" }, words)),
+      make("div", { class: "grid" }, card(null, table([...columns, ...figures], groups, { label: "Summary" })),
+        paired.length ? card(`Difference to ${groups[0].label}, seed by seed`, table([
+          { name: "bag", text: (row) => name(groups.indexOf(row)), value: (row) => row.label },
+          { name: "seeds in common", text: (row) => String(row.paired.seeds), value: (row) => row.paired.seeds },
+          ...METRICS.map(([metric, words, format]) => ({
+            name: words, text: (row) => cell(range(row.paired.differences[metric], signed(format), "+")), value: (row) => row.paired.differences[metric].mean,
+          })),
+        ], paired, { label: "Paired differences", caption: "Same seed, same users at the same places. An interval without zero in it is a difference that chance does not explain." })) : null)),
+    make("section", { "aria-labelledby": "flights" }, make("h2", { id: "flights" }, "Flights"),
+      make("div", { class: "grid wide-left" },
+        make("div", { class: "card" },
+          make("div", { class: "card-head" }, make("h3", {}, "Trajectories"), viewSwitch(drawScene)),
+          make("div", { class: "scene", id: "scene", role: "img", "aria-label": "Paths of the missions in space" }), legend()),
+        make("div", { class: "stack" },
+          card("Users collected", make("div", { class: "chart", id: "n_collected" })),
+          card("Sum-rate of the users served", make("div", { class: "chart", id: "sum_rate_bps" })),
+          card("Reward so far, r of eq. 7", make("div", { class: "chart", id: "reward" }))))),
+    make("footer", {}, `A mission that is over stays as it ended, at no rate. ${one ? "" : "Bands are 95% bootstrap intervals of the mean. "}At most 20 paths of a bag are drawn. World ${world.name} ${world.fingerprint} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`));
+
+  function signed(format) { return (value) => (value < 0 ? `−${format(-value)}` : format(value)); }
+
+  function drawScene() {
+    Plotly.purge("scene");
+    const paths = groups.map((group, i) => {
+      const alone = group.tracks.length === 1;
+      const join = (axis) => group.tracks.flatMap((track) => [...track[axis], null]);
+      return space.trace({
+        name: plain(group.label), mode: "lines", x: join(0), y: join(1), z: join(2), opacity: alone ? 1 : 0.62, hoverinfo: "name",
+        line: { color: SHADES[i], width: (space.flat ? 1.6 : 4) * (alone ? 1.5 : 1), dash: DASHES[i] === "solid" ? "solid" : DASHES[i].includes("px") ? "dot" : DASHES[i] },
+      });
+    });
+    Plotly.newPlot("scene", [...space.world(world), ...paths], space.layout(world), CONFIG);
+  }
+
+  function drawCharts() {
+    const chart = (id, title, last, divide = 1) => {
+      const traces = groups.flatMap((group, i) => {
+        const told = Object.fromEntries(Object.entries(group.curves[id]).map(([key, values]) => [key, values.map((value) => value / divide)]));
+        const edge = { type: "scatter", mode: "lines", x: data.steps, line: { width: 0, shape: "hv" }, hoverinfo: "skip", showlegend: false };
+        return [
+          ...(group.missions > 1 ? [{ ...edge, y: told.low }, { ...edge, y: told.high, fill: "tonexty", fillcolor: `${SHADES[i]}38` }] : []),
+          { type: "scatter", mode: "lines", name: plain(group.label), x: data.steps, y: told.mean, line: { color: SHADES[i], width: 2, dash: DASHES[i], shape: "hv" }, hovertemplate: "%{y:.3~f}" },
+        ];
+      });
+      Plotly.react(id, traces, layout({ xaxis: axis({ zeroline: false, title: last ? `step, ${world.step_s} s each` : "" }), yaxis: axis({ rangemode: "tozero", title, nticks: 5 }) }), CONFIG);
+    };
+    const [scale, prefix] = siScale(Math.max(1, ...groups.flatMap((group) => group.curves.sum_rate_bps.high)));
+    chart("n_collected", "", false);
+    chart("sum_rate_bps", `${prefix}bit/s`, false, scale);
+    chart("reward", "", true);
+  }
+
+  function draw() { drawScene(); drawCharts(); }
+
+  await loadPlotly();
+  draw();
+  whenColoursChange(draw);
+});
