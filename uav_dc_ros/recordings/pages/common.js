@@ -69,7 +69,7 @@ function axis(more = {}) {
   return {
     gridcolor: colour("rule"), zerolinecolor: colour("faint"), linecolor: colour("faint"), automargin: true,
     fixedrange: true, ...more,
-    title: { text: more.title ?? "", font: { size: 12, color: colour("muted") }, standoff: 6 },
+    title: more.title ? { text: more.title, font: { size: 12, color: colour("muted") }, standoff: 6 } : undefined,
   };
 }
 
@@ -130,7 +130,7 @@ function tiles(values) {
       make("dd", { class: cls }, value, unit ? make("small", {}, ` ${unit}`) : ""))));
 }
 
-// Three points to see a circle by are too few; a ring is closed.
+// A circle as a closed line.
 function ring([x, y], radius) {
   const turns = Array.from({ length: 49 }, (_, i) => (2 * Math.PI * i) / 48);
   return { x: turns.map((a) => x + radius * Math.cos(a)), y: turns.map((a) => y + radius * Math.sin(a)) };
@@ -161,9 +161,10 @@ const space = {
       color: fill, hoverinfo: "skip", lighting: { ambient: 1, diffuse: 0, specular: 0 }, opacity: 1, flatshading: true,
     };
   },
-  layout(world) {
-    const pad = 0.6 * world.cell_m;
+  layout(world, element) {
     const [wide, deep] = [(world.n_x - 1) * world.cell_m, (world.n_y - 1) * world.cell_m];
+    // Room for whom the UAV reaches from a corner; in a large world that is next to nothing.
+    const pad = Math.max(0.6 * world.cell_m, Math.min(world.reach_m, 0.22 * Math.max(wide, deep)));
     const range = { x: [-pad, wide + pad], y: [-pad, deep + pad] };
     if (this.flat) {
       return layout({
@@ -177,14 +178,17 @@ const space = {
       gridcolor: colour("faint"), zerolinecolor: colour("faint"), showbackground: false, showspikes: false, ...more,
     });
     const most = Math.max(wide, deep) + 2 * pad;
+    // A narrow figure is looked at from further away, and more from above: it has height to fill.
+    const narrow = Math.min(1.6, Math.max(1, (1.3 * element.clientHeight) / element.clientWidth));
+    const eye = { x: -0.8 * narrow, y: -1.18 * narrow, z: 1.05 * narrow ** 2 };
     return layout({
       margin: { l: 0, r: 0, t: 0, b: 0 }, hovermode: "closest", uirevision: "camera",
       scene: {
         xaxis: side("east, m", { range: range.x }), yaxis: side("north, m", { range: range.y }),
         zaxis: side("altitude, m", { range: [0, 1.15 * world.top_m], nticks: 4 }),
         aspectmode: "manual",
-        aspectratio: { x: 1.25 * (wide + 2 * pad) / most, y: 1.25 * (deep + 2 * pad) / most, z: 0.42 },
-        camera: { eye: { x: -0.85, y: -1.25, z: 0.95 }, center: { x: 0, y: 0, z: -0.16 } },
+        aspectratio: { x: 1.4 * (wide + 2 * pad) / most, y: 1.4 * (deep + 2 * pad) / most, z: 0.42 },
+        camera: { eye, center: { x: 0, y: 0, z: -0.16 } },
       },
     });
   },

@@ -1,9 +1,10 @@
 // Missions or policies side by side.
 
+// Key, words, unit, digits; with a null for digits: three significant ones, and an SI prefix.
 const METRICS = [
-  ["landed", "landed", (v) => `${fixed(100 * v)} %`], ["users_collected", "users collected", (v) => fixed(v, 1)],
-  ["data_bits", "data", (v) => si(v, "bit")], ["sum_rate_bps", "mean sum-rate", (v) => si(v, "bit/s")],
-  ["distance_m", "distance flown", (v) => si(v, "m")], ["steps", "steps", (v) => fixed(v, 1)], ["reward", "reward", (v) => fixed(v, 3)],
+  ["landed", "landed", "%", 0], ["users_collected", "users collected", "", 1], ["data_bits", "data", "bit", null],
+  ["sum_rate_bps", "mean sum-rate", "bit/s", null], ["distance_m", "distance flown", "m", null], ["steps", "steps", "", 1],
+  ["reward", "reward", "", 3],
 ];
 // Okabe and Ito's, yellow left out: it cannot be seen on paper. Dashes tell groups apart without colour.
 const SHADES = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c7853", "#7f7f9f"];
@@ -28,19 +29,26 @@ open(async (page, data) => {
   const name = (i) => make("span", {}, key(i), groups[i].label);
   const legend = () => make("ul", { class: "legend" }, ...groups.map((_, i) => make("li", {}, name(i))));
 
-  const range = (told, format, sign = "") => [
-    `${sign && told.mean > 0 ? sign : ""}${format(told.mean)}`,
-    told.low === null ? null : make("div", { class: "range" }, `${format(told.low)} … ${format(told.high)}`),
-  ];
-  const cell = (...parts) => make("span", {}, ...parts.flat().filter((part) => part !== null));
+  // A mean, and below it its interval in the same unit.
+  function range(told, unit, digits, sign = "") {
+    const [scale, prefix] = digits === null ? siScale(Math.abs(told.mean)) : [unit === "%" ? 0.01 : 1, ""];
+    const number = (value) => {
+      const scaled = Math.abs(value / scale);
+      const text = digits === null ? Number(scaled.toPrecision(3)).toLocaleString("en") : fixed(scaled, digits);
+      return (value < 0 ? "−" : value > 0 ? sign : "") + text;
+    };
+    return make("span", {}, `${number(told.mean)} ${prefix}${unit}`.trim(),
+      told.low === null ? null : make("div", { class: "range" }, `${number(told.low)} … ${number(told.high)}`));
+  }
+
+  const cell = (...parts) => make("span", {}, ...parts);
   const columns = [
     { name: one ? "mission" : "bag", text: (row) => name(groups.indexOf(row)), value: (row) => row.label },
     { name: "policy", text: (row) => row.policy, value: (row) => row.policy },
-    { name: "seeds", text: (row) => row.seeds || NONE },
-    { name: "missions", text: (row) => String(row.missions), value: (row) => row.missions },
+    { name: "missions", text: (row) => cell(String(row.missions), make("div", { class: "range" }, row.seeds && `seed ${row.seeds}`)), value: (row) => row.missions },
   ];
-  const figures = METRICS.map(([metric, words, format]) => ({
-    name: words, text: (row) => cell(range(row.metrics[metric], format)), value: (row) => row.metrics[metric].mean,
+  const figures = METRICS.map(([metric, words, unit, digits]) => ({
+    name: words, text: (row) => range(row.metrics[metric], unit, digits), value: (row) => row.metrics[metric].mean,
   }));
   const paired = groups.filter((group) => group.paired);
   page.append(
@@ -51,13 +59,13 @@ open(async (page, data) => {
         paired.length ? card(`Difference to ${groups[0].label}, seed by seed`, table([
           { name: "bag", text: (row) => name(groups.indexOf(row)), value: (row) => row.label },
           { name: "seeds in common", text: (row) => String(row.paired.seeds), value: (row) => row.paired.seeds },
-          ...METRICS.map(([metric, words, format]) => ({
-            name: words, text: (row) => cell(range(row.paired.differences[metric], signed(format), "+")), value: (row) => row.paired.differences[metric].mean,
+          ...METRICS.map(([metric, words, unit, digits]) => ({
+            name: words, text: (row) => range(row.paired.differences[metric], unit, digits, "+"), value: (row) => row.paired.differences[metric].mean,
           })),
         ], paired, { label: "Paired differences", caption: "Same seed, same users at the same places. An interval without zero in it is a difference that chance does not explain." })) : null)),
     make("section", { "aria-labelledby": "flights" }, make("h2", { id: "flights" }, "Flights"),
       make("div", { class: "grid wide-left" },
-        make("div", { class: "card" },
+        make("div", { class: "card flight" },
           make("div", { class: "card-head" }, make("h3", {}, "Trajectories"), viewSwitch(drawScene)),
           make("div", { class: "scene", id: "scene", role: "img", "aria-label": "Paths of the missions in space" }), legend()),
         make("div", { class: "stack" },
@@ -65,8 +73,6 @@ open(async (page, data) => {
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum_rate_bps" })),
           card("Reward so far, r of eq. 7", make("div", { class: "chart", id: "reward" }))))),
     make("footer", {}, `A mission that is over stays as it ended, at no rate. ${one ? "" : "Bands are 95% bootstrap intervals of the mean. "}At most 20 paths of a bag are drawn. World ${world.name} ${world.fingerprint} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`));
-
-  function signed(format) { return (value) => (value < 0 ? `−${format(-value)}` : format(value)); }
 
   function drawScene() {
     Plotly.purge("scene");
@@ -78,7 +84,7 @@ open(async (page, data) => {
         line: { color: SHADES[i], width: (space.flat ? 1.6 : 4) * (alone ? 1.5 : 1), dash: DASHES[i] === "solid" ? "solid" : DASHES[i].includes("px") ? "dot" : DASHES[i] },
       });
     });
-    Plotly.newPlot("scene", [...space.world(world), ...paths], space.layout(world), CONFIG);
+    Plotly.newPlot("scene", [...space.world(world), ...paths], space.layout(world, document.getElementById("scene")), CONFIG);
   }
 
   function drawCharts() {

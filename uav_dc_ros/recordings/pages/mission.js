@@ -29,7 +29,7 @@ open(async (page, data) => {
     make("section", { "aria-labelledby": "flight-title" },
       make("h2", { id: "flight-title" }, "Flight"),
       make("div", { class: "grid wide-left" },
-        make("div", { class: "card" },
+        make("div", { class: "card flight" },
           make("div", { class: "card-head" }, make("h3", {}, "Trajectory"), viewSwitch(drawScene)),
           make("div", { class: "scene", id: "scene", role: "img", "aria-label": "The UAV, its path and the users in space" }),
           make("ul", { class: "legend" }, ...STATES.map(([name, words, shape], i) => make("li", {}, symbol(shape, name), `${words} `, counts[i])),
@@ -45,7 +45,7 @@ open(async (page, data) => {
       make("div", { class: "card transport" }, play, make("div", { class: "slide" }, make("label", { for: "step" }, "Step"), slider), told)),
     make("section", { "aria-labelledby": "users-title" },
       make("h2", { id: "users-title" }, "Users"), make("p", { class: "note", id: "users-note" }),
-      make("div", { class: "grid halves" },
+      make("div", { class: "grid wide-right" },
         card("Data of each user over the steps", make("div", { class: "chart tall", id: "data" })),
         make("div", { class: "card", id: "users" }))),
     system(data.health),
@@ -86,14 +86,14 @@ open(async (page, data) => {
       space.trace({ name: "height", mode: "lines", x: [], y: [], z: [], line: { color: colour("uav"), width: space.flat ? 0 : 3 }, hoverinfo: "skip" }),
       ...users,
       space.trace({ name: "chosen", mode: "markers", x: [], y: [], z: [], hoverinfo: "skip", marker: { symbol: "circle-open", size: space.flat ? 20 : 16, color: colour("ink"), line: { color: colour("ink"), width: 3 } } }),
-      space.trace({ name: "UAV", mode: "markers", x: [], y: [], z: [], text: [""], hovertemplate: "%{text}<extra></extra>", marker: { symbol: "cross", size: space.flat ? 17 : 9, color: colour("uav"), line: { color: colour("ink"), width: 1.5 } } }),
+      space.trace({ name: "UAV", mode: "markers", x: [], y: [], z: [], text: [""], hovertemplate: "%{text}<extra></extra>", marker: { symbol: "cross", size: space.flat ? 18 : 13, color: colour("uav"), line: { color: colour("ink"), width: 2 } } }),
     ];
     const still = [
       ...space.world(world),
       space.trace({ name: "path", mode: "lines", x: column(0), y: column(1), z: column(2), line: { color: colour("ahead"), width: space.flat ? 1.5 : 2.5 }, hoverinfo: "skip" }),
     ];
     state.moving = moving.map((_, i) => still.length + i);
-    Plotly.newPlot(scene, [...still, ...moving], space.layout(world), CONFIG);
+    Plotly.newPlot(scene, [...still, ...moving], space.layout(world, scene), CONFIG);
     moveScene();
   }
 
@@ -254,7 +254,7 @@ open(async (page, data) => {
       { name: "user", text: (row) => String(row.user), value: by("user") },
       { name: "cluster", text: (row) => String(row.cluster), value: by("cluster") },
       { name: "data", text: (row) => si(row.data_bits, "bit"), value: by("data_bits") },
-      { name: "collected at step", text: (row) => (row.collected_at === null ? NONE : `■ ${row.collected_at}`), value: by("collected_at") },
+      { name: "collected at", help: "step", text: (row) => (row.collected_at === null ? NONE : `■ ${row.collected_at}`), value: by("collected_at") },
       { name: "steps served", text: (row) => String(row.served_steps), value: by("served_steps") },
       { name: "SINR, dB", text: (row) => fixed(row.sinr_db, 1), value: by("sinr_db") },
       { name: "rate", text: (row) => si(row.rate_bps, "bit/s"), value: by("rate_bps") },

@@ -1,7 +1,8 @@
 """A page: template, style, scripts, data and Plotly in one file that needs no network.
 
 Plotly's JavaScript comes from the installed Python package and is compressed, as is all data: a browser
-unpacks it while it opens the page. Base64 holds no `<`, so nothing that a bag says can end its script element.
+unpacks it while it opens the page. Base64 holds no `<`, so nothing that a bag says can end its script
+element.
 """
 
 import base64

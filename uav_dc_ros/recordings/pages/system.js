@@ -22,7 +22,7 @@ function system(health) {
         ...latency,
         { name: "longest gap, ms", text: ms("longest_gap_ms", 1), value: by("longest_gap_ms"), help: "between two messages" },
       ], health.topics, { label: "Topics" }))),
-    make("div", { class: "grid halves" },
+    make("div", { class: "grid" },
       card("Nodes", nodes.length ? table([
         { name: "node", text: by("name"), value: by("name") },
         { name: "last state", text: by("state"), cls: "text" },
@@ -32,12 +32,12 @@ function system(health) {
         { name: "max", text: (row) => fixed(row.cpu_max, 0), value: by("cpu_max") },
         { name: "hears: median (worst 99th pct), ms", cls: "text", text: (row) => row.heard.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
         { name: "counted", cls: "text", text: (row) => Object.entries(row.counters).map(([name, value]) => `${name} ${value}`).join(", ") || NONE },
-      ], nodes, { label: "Nodes" }) : make("p", { class: "note" }, "No node told diagnostics in this bag.")),
-      card("CPU of each node", nodes.some((node) => node.cpu.length > 1) ? make("div", { class: "chart", id: "cpu", style: "height: 300px" }) : make("p", { class: "note" }, "Too short a recording for a curve: nodes tell once a second."))),
-    make("div", { class: "grid" },
+      ], nodes, { label: "Nodes" }) : make("p", { class: "note" }, "No node told diagnostics in this bag."))),
+    make("div", { class: "grid halves" },
+      card("CPU of each node", nodes.some((node) => node.cpu.length > 1) ? make("div", { class: "chart", id: "cpu", style: "height: 300px" }) : make("p", { class: "note" }, "Too short a recording for a curve: nodes tell once a second.")),
       card("Faults", health.faults.length ? table([
         { name: "at, s", text: (row) => fixed(row.s, 2), value: by("s") },
-        { name: "who", cls: "text", text: by("who"), value: by("who") },
+        { name: "who", text: by("who"), value: by("who") },
         { name: "what", cls: "text", text: by("what") },
       ], health.faults, { label: "Faults", caption: health.faults_total > health.faults.length ? `${health.faults.length} of ${health.faults_total}` : "" })
         : make("p", { class: "good", id: "no-faults" }, "✓ None: every step has its messages, no node was restarted, nothing was rejected."))));

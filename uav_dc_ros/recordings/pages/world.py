@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from uav_dc_ros.core import radio
 from uav_dc_ros.core.scenario import Scenario
 
 
@@ -23,6 +24,7 @@ def world(scenario: Scenario) -> dict[str, Any]:
         "step_s": mission.step_s,
         "max_steps": mission.max_steps,
         "d_cons_m": mission.d_cons_m,
+        "reach_m": radio.ground_reach_m(mission.d_cons_m, grid.altitude_min_m),
         "r_min_bits": mission.r_min_bits,
         "beta": reward.beta,
         "zeta": reward.zeta,
