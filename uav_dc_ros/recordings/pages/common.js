@@ -179,7 +179,7 @@ const space = {
     });
     const most = Math.max(wide, deep) + 2 * pad;
     // A narrow figure is looked at from further away, and more from above: it has height to fill.
-    const narrow = Math.min(1.6, Math.max(1, (1.3 * element.clientHeight) / element.clientWidth));
+    const narrow = Math.min(1.4, Math.max(1, (1.3 * element.clientHeight) / element.clientWidth));
     const eye = { x: -0.8 * narrow, y: -1.18 * narrow, z: 1.05 * narrow ** 2 };
     return layout({
       margin: { l: 0, r: 0, t: 0, b: 0 }, hovermode: "closest", uirevision: "camera",

@@ -12,7 +12,7 @@ open(async (page, data) => {
   // The skeleton. What depends on the mission is filled in by `show`.
   const sub = make("p", { class: "sub", id: "about" });
   page.querySelector("header").append(data.held.length > 1 ? make("label", {}, "Mission ", make("select", {
-    id: "missions", onchange: (event) => show(event.target.value),
+    id: "missions", "aria-label": "Mission", onchange: (event) => show(event.target.value),
   }, ...data.held.map((key) => {
     const one = data.missions[key];
     return make("option", { value: key }, `${missionName(one)} · seed ${one.seed ?? "?"} · ${one.outcome} · ${one.users_collected}/${one.users_total}`);
