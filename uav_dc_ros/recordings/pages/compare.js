@@ -7,7 +7,7 @@ const METRICS = [
   ["reward", "reward", "", 3],
 ];
 // Okabe and Ito's, yellow left out: it cannot be seen on paper. Dashes tell groups apart without colour.
-const SHADES = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#8c7853", "#7f7f9f"];
+const SHADES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c7853", "#7f7f9f"];
 const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "5px,2px", "2px,6px"];
 
 open(async (page, data) => {
@@ -44,8 +44,9 @@ open(async (page, data) => {
   const cell = (...parts) => make("span", {}, ...parts);
   const columns = [
     { name: one ? "mission" : "bag", text: (row) => name(groups.indexOf(row)), value: (row) => row.label },
-    { name: "policy", text: (row) => row.policy, value: (row) => row.policy },
-    { name: "missions", text: (row) => cell(String(row.missions), make("div", { class: "range" }, row.seeds && `seed ${row.seeds}`)), value: (row) => row.missions },
+    ...(policies.length > 1 ? [{ name: "policy", text: (row) => row.policy, value: (row) => row.policy }] : []),
+    one ? { name: "seed", text: (row) => row.seeds || NONE, value: (row) => Number(row.seeds) }
+      : { name: "missions", text: (row) => cell(String(row.missions), make("div", { class: "range" }, row.seeds && `seed ${row.seeds}`)), value: (row) => row.missions },
   ];
   const figures = METRICS.map(([metric, words, unit, digits]) => ({
     name: words, text: (row) => range(row.metrics[metric], unit, digits), value: (row) => row.metrics[metric].mean,
