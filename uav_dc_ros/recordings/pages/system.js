@@ -4,16 +4,16 @@ function system(health) {
   const ms = (name, digits = 2) => (row) => fixed(row[name], digits);
   const by = (name) => (row) => row[name];
   const latency = [
-    { name: "median, ms", text: ms("p50_ms"), value: by("p50_ms") },
-    { name: "99th pct, ms", text: ms("p99_ms"), value: by("p99_ms") },
+    { name: "p50, ms", text: ms("p50_ms"), value: by("p50_ms") },
+    { name: "p99, ms", text: ms("p99_ms"), value: by("p99_ms") },
     { name: "max, ms", text: ms("max_ms"), value: by("max_ms") },
   ];
   const nodes = health.nodes;
   return make("section", { "aria-labelledby": "system-title" },
     make("h2", { id: "system-title" }, "System"),
-    make("p", { class: "note" }, `${clock(health.duration_s)} recorded. A latency is the time from publishing a message to the recorder's receiving it; the time within a step is between two publications.`),
+    make("p", { class: "note" }, `${clock(health.duration_s)} recorded. A latency is the time from publishing a message to the recorder's receiving it, its p99 the one that a hundredth of them exceed; times within a step are between two publications.`),
     make("div", { class: "grid halves" },
-      card("Latency by topic: median to 99th percentile, and maximum", make("div", { class: "chart", id: "latency", style: `height: ${70 + 24 * health.topics.length}px` }),
+      card("Latency by topic: p50 to p99, and maximum", make("div", { class: "chart", id: "latency", style: `height: ${70 + 24 * health.topics.length}px` }),
         table([{ name: "within a step", text: by("name") }, { name: "steps", text: (row) => fixed(row.count), value: by("count") }, ...latency], health.chain, { label: "Times within a step" })),
       card("Topics", table([
         { name: "topic", text: by("name"), value: by("name") },
@@ -30,7 +30,7 @@ function system(health) {
         { name: "warnings", text: (row) => fixed(row.warnings), value: by("warnings") },
         { name: "CPU, %", text: (row) => fixed(row.cpu_median, 0), value: by("cpu_median"), help: "median" },
         { name: "max", text: (row) => fixed(row.cpu_max, 0), value: by("cpu_max") },
-        { name: "hears: median (worst 99th pct), ms", cls: "text", text: (row) => row.heard.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
+        { name: "hears: p50 (worst p99), ms", cls: "text", text: (row) => row.heard.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
         { name: "counted", cls: "text", text: (row) => Object.entries(row.counters).map(([name, value]) => `${name} ${value}`).join(", ") || NONE },
       ], nodes, { label: "Nodes" }) : make("p", { class: "note" }, "No node told diagnostics in this bag."))),
     make("div", { class: "grid halves" },
