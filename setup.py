@@ -71,6 +71,7 @@ setup(
     package_data={
         NAME: ["py.typed", "resource/*", "share/*/*"],
         f"{NAME}.nodes": ["*.xml"],
+        f"{NAME}.recordings.pages": ["*.html", "*.css", "*.js"],
         f"{NAME}.scenarios": ["*.toml"],
         f"{NAME}.policies": ["*/*"],
         f"{NAME}.msgs_json": ["*.json"],

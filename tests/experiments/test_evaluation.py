@@ -13,9 +13,9 @@ import pytest
 from tests.small_worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
+from uav_dc_ros.core.bootstrap import interval
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.experiments import evaluate_cli
-from uav_dc_ros.experiments.bootstrap import interval
 from uav_dc_ros.experiments.evaluate import (
     Evaluation,
     Figure,

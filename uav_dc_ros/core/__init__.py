@@ -12,4 +12,5 @@ a node and thousands of worlds on a GPU. Random draws are arguments.
     reward     R_plus, the reward, its immediate and its episode form
     pace       lockstep, or a multiple of real time
     world      State, initial(), step(): the composition of the above
+    bootstrap  intervals of means
 """

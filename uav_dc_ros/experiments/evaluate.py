@@ -11,10 +11,10 @@ import numpy as np
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.bootstrap import interval
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.batch import observe
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments.bootstrap import interval
 from uav_dc_ros.experiments.fly import Act, Missions, fly
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.experiments.bootstrap import interval
+from uav_dc_ros.core.bootstrap import interval
 from uav_dc_ros.experiments.paper.evidence import (
     Evidence,
     Weighed,

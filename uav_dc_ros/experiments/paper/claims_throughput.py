@@ -1,7 +1,7 @@
 """The paper's claims on the throughput: C10 to C17."""
 
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.experiments.bootstrap import interval
+from uav_dc_ros.core.bootstrap import interval
 from uav_dc_ros.experiments.paper.evidence import (
     Evidence,
     Part,

@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.bootstrap import interval
 from uav_dc_ros.env.render import PATH_COLOURS, Track, picture
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.bootstrap import interval
 from uav_dc_ros.experiments.paper import style
 from uav_dc_ros.experiments.paper.evidence import SMOOTHING, Evidence, name, smooth
 from uav_dc_ros.experiments.paper.plan import FIGURES, FigurePlan, Panel

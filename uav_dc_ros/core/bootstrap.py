@@ -8,6 +8,7 @@ import numpy as np
 from uav_dc_ros.core.arrays import Array
 
 _RESAMPLES = 10_000
+_BAND_RESAMPLES = 2_000  # of whole curves: an interval's ends for each of many points
 _BLOCK = 1_000_000  # values resampled at a time
 
 
@@ -42,3 +43,22 @@ def interval(
     ]
     low, high = np.quantile(statistic(np.concatenate(means)), [(1 - level) / 2, (1 + level) / 2])
     return Interval(float(statistic(values.mean(axis=0)[None])[0]), float(low), float(high))
+
+
+def band(curves: Array, level: float = 0.95) -> tuple[Array, Array, Array]:
+    """The mean of curves, and its percentile-bootstrap interval at each point.
+
+    Whole curves are resampled, with a seed, since the points of one belong together.
+
+    Args:
+        curves: finite numbers, a curve for each independent unit, `[n, T]` with n >= 1.
+        level: probability that the interval is meant to cover at a point.
+
+    Returns:
+        Mean, low and high end, `[T]` each.
+    """
+    curves = np.asarray(curves, np.float64)
+    n = len(curves)
+    drawn = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), _BAND_RESAMPLES)
+    low, high = np.quantile(drawn / n @ curves, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return curves.mean(axis=0), low, high

@@ -1,0 +1,248 @@
+"""The missions of a bag as a page shows them: numbers of the whole mission, and what happened step by step.
+
+A mission of any length is kept in bounded memory: a long one is thinned out while it is read, to every second
+step, every fourth, and so on. Its numbers (data, distance, rates) are always those of all steps.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from uav_dc_ros import messages, payloads
+from uav_dc_ros.core import mission, radio, reward, world
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import MessageError
+from uav_dc_ros.recordings.steps import RecordedStep
+
+STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart
+VALUES_MAX = 60_000  # steps times users: what a page can draw, and hold
+USERS_MAX = 2_000  # shown
+NO_END = "no end"  # outcome of a mission whose end is not in the bag
+WAITING, SERVED, COLLECTED = "012"  # a user's state, as a page knows it
+
+
+class Flown:
+    """A mission that is brought together step by step.
+
+    Args:
+        scenario: the world that was flown.
+        flight, index: which mission it is, see `RecordedStep`.
+
+    Attributes:
+        seed: of its users; None where the bag does not tell.
+        outcome: how it ended.
+        steps: steps flown.
+        data_bits, collected: of each user at the end, `[U]`.
+        distance_m: length of the path flown, metres.
+        faults: what is missing or cannot be true, counted in words.
+        stride: every how many steps one is kept.
+        last_ns: when the last message of it was received.
+    """
+
+    def __init__(self, scenario: Scenario, flight: int, index: int) -> None:
+        n_users = scenario.n_users
+        self.scenario = scenario
+        self.flight, self.index = flight, index
+        self.seed: int | None = None
+        self.outcome: str = NO_END
+        self.steps = 0
+        self.data_bits: Array = np.zeros(n_users)
+        self.collected: Array = np.zeros(n_users, dtype=bool)
+        self.distance_m = 0.0
+        self.faults: Counter[str] = Counter()
+        self.stride = 1
+        self.last_ns = 0
+        self.shown_users = _spread(n_users, USERS_MAX)
+        self._kept: list[dict[str, Any]] = []
+        self._last: dict[str, Any] | None = None  # the newest step, kept or not
+        self._kept_max = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
+        self._position_m: Array | None = None
+        self._cell: Array | None = None
+        self._expected = 0
+        self._sum_rates_bps: list[float] = [0.0, 0.0]  # sum over the steps, and how many
+        self._served_steps: Array = np.zeros(n_users, dtype=np.int64)
+        self._served_sums: Array = np.zeros((2, n_users))  # of SINR (linear) and rate (bit/s) while served
+        self._collected_at: Array = np.full(n_users, -1, dtype=np.int64)
+
+    def add(self, step: RecordedStep) -> None:
+        """The next step; what of it is for another world is counted, and left out."""
+        if step.step > self._expected:
+            self.faults["steps that are not in the bag"] += step.step - self._expected
+        self._expected = step.step + 1
+        self.steps = max(self.steps, step.step)
+        self.last_ns = max(step.log_ns.values(), default=self.last_ns)
+        status = self._fitting(step.status, lambda it: payloads.check_world(it, self.scenario))
+        rates = self._fitting(step.rates, lambda it: payloads.collection(it, self.scenario))
+        users = self._fitting(step.users, lambda it: payloads.users_m(it, self.scenario))
+        for name, there in (
+            ("mission", status),
+            ("users", users),
+            ("rates", rates),
+            ("pose", step.position_m is not None),
+        ):
+            if not there:
+                self.faults[f"steps without {name}"] += 1
+        if status is not None:
+            self.seed = status.seed
+            self._cell = np.asarray(status.cell)
+            if status.phase.is_over:
+                self.outcome = status.phase.value
+        if rates is not None:
+            self._book(step.step, rates)
+        self._keep(step, self._fly(step.position_m, status), users, rates)
+
+    def summary(self) -> dict[str, Any]:
+        """The mission in numbers, as run_all's `--summary` has them."""
+        total, n = self._sum_rates_bps
+        return {
+            "flight": self.flight,
+            "mission": self.index,
+            "seed": self.seed,
+            "outcome": self.outcome,
+            "steps": self.steps,
+            "users_collected": int(self.collected.sum()),
+            "users_total": self.scenario.n_users,
+            "data_bits": float(self.data_bits.sum()),
+            "sum_rate_bps": total / max(n, 1),
+            "distance_m": self.distance_m,
+            "reward": self.rewards(self._cell, self.data_bits)[2] if self.steps else 0.0,
+        }
+
+    def rewards(self, cell: Array | None, data_bits: Array) -> tuple[float, float, float]:
+        """The terms of r^t (eq. 7), the data's and `zeta R_plus`, and r^t itself; NaN where it is unknown."""
+        if cell is None:
+            return math.nan, math.nan, math.nan
+        paid = self.scenario.reward
+        distance = mission.dock_distance_cells(cell, self.scenario.dock_cell, like=data_bits)
+        trajectory = paid.zeta * reward.r_plus(distance, paid.r_plus)
+        data = reward.total(data_bits, np.zeros(()), paid.beta, paid.zeta, paid.data_scale_bits)
+        return float(data), float(trajectory), float(world.total_reward(self.scenario, cell, data_bits))
+
+    def course(self) -> list[dict[str, Any]]:
+        """The steps that are shown, in their order; the last one is always among them."""
+        kept = self._kept
+        return kept if self._last is None or self._last is kept[-1] else [*kept, self._last]
+
+    def table(self) -> dict[str, list[Any]]:
+        """Columns, an entry per user shown; SINR and rate are means over the steps in which it was served."""
+        shown = self.shown_users
+        served = self._served_steps[shown]
+        sinr, rate_bps = (sums[shown] / np.maximum(served, 1) for sums in self._served_sums)
+        with np.errstate(divide="ignore"):
+            sinr_db = np.where(served > 0, 10 * np.log10(sinr), math.nan)
+        return {
+            "user": shown.tolist(),
+            "cluster": self.scenario.user_cluster[shown].tolist(),
+            "data_bits": self.data_bits[shown].tolist(),
+            "collected_at": [step if step >= 0 else None for step in self._collected_at[shown].tolist()],
+            "served_steps": served.tolist(),
+            "sinr_db": _finite(np.round(sinr_db, 2)),
+            "rate_bps": _finite(np.where(served > 0, rate_bps, math.nan)),
+        }
+
+    def _fitting(self, payload: Any, check: Callable[[Any], object]) -> Any:
+        if payload is None:
+            return None
+        try:
+            check(payload)
+        except MessageError as error:
+            kind = type(payload).__name__.lower()
+            self.faults[f"{kind} messages of another world ({error.reason})"] += 1
+            return None
+        return payload
+
+    def _book(self, step: int, rates: messages.Rates) -> None:
+        data_bits, collected = payloads.collection(rates, self.scenario)
+        if (data_bits < self.data_bits).any() or (self.collected & ~collected).any():
+            self.faults["steps that took back what was collected"] += 1
+        self._collected_at[collected & (self._collected_at < 0)] = step
+        self.data_bits, self.collected = data_bits, collected
+        if step == 0:
+            return  # the moment of the start: no time has passed to collect in
+        self._sum_rates_bps[0] += rates.sum_rate_bps
+        self._sum_rates_bps[1] += 1
+        served = np.asarray(rates.served, dtype=bool)
+        self._served_steps += served
+        self._served_sums += served * np.asarray([rates.sinr, rates.rate_bps])
+
+    def _fly(self, position_m: Array | None, status: messages.Mission | None) -> Array | None:
+        """Where the UAV was: its pose, or else the centre of its cell; metres `[3]`, or None."""
+        if position_m is None and status is not None:
+            position_m = self.scenario.grid.centre_m(np.asarray(status.cell), like=np.zeros(1))
+        if position_m is not None:
+            if self._position_m is not None:
+                self.distance_m += math.dist(position_m, self._position_m)
+            self._position_m = position_m
+        return position_m
+
+    def _keep(
+        self,
+        step: RecordedStep,
+        position_m: Array | None,
+        users: messages.Users | None,
+        rates: messages.Rates | None,
+    ) -> None:
+        shown = self.shown_users
+        served = np.asarray(rates.served, dtype=bool) if rates else np.zeros(len(self.collected), dtype=bool)
+        state = np.where(self.collected, COLLECTED, np.where(served, SERVED, WAITING))[shown]
+        reach_m = 0.0
+        if position_m is not None:
+            reach_m = radio.ground_reach_m(self.scenario.mission.d_cons_m, max(float(position_m[2]), 0.0))
+        self._last = {
+            "step": step.step,
+            "uav_m": None if position_m is None else np.round(position_m, 2).tolist(),
+            "reach_m": round(reach_m, 1),
+            "action": step.move.action if step.move else None,
+            "users_m": None if users is None else _users_m(users, shown),
+            "data_bits": None if rates is None else significant(self.data_bits[shown]),
+            "state": "".join(state.tolist()),
+            "n_collected": int(self.collected.sum()),
+            "sum_rate_bps": rates.sum_rate_bps if rates and step.step else None,
+            "reward": _finite(np.asarray(self.rewards(self._cell, self.data_bits))),
+        }
+        # The first step heard, whatever its number: a mission that was joined late begins there.
+        if not self._kept or step.step % self.stride == 0:
+            self._kept.append(self._last)
+        if len(self._kept) > self._kept_max:
+            self.stride *= 2
+            self._kept = self._kept[:1] + [it for it in self._kept[1:] if it["step"] % self.stride == 0]
+
+
+def flown(steps: Iterator[RecordedStep], scenario: Scenario) -> Iterator[Flown]:
+    """The missions of a bag, one after the other; those steps alone are in memory that are shown."""
+    now: Flown | None = None
+    for step in steps:
+        if now is None or (now.flight, now.index) != (step.flight, step.mission):
+            if now is not None:
+                yield now
+            now = Flown(scenario, step.flight, step.mission)
+        now.add(step)
+    if now is not None:
+        yield now
+
+
+def significant(values: Array, digits: int = 4) -> list[float]:
+    """Values rounded to a few significant digits: more of them nobody sees in a picture."""
+    values = np.asarray(values, np.float64)
+    with np.errstate(divide="ignore"):
+        magnitude = np.where(values == 0, 0, np.floor(np.log10(np.abs(values))))
+    scale = 10.0 ** (digits - 1 - magnitude)
+    rounded: list[float] = (np.round(values * scale) / scale).tolist()
+    return rounded
+
+
+def _users_m(users: messages.Users, shown: Array) -> list[list[float]]:
+    return np.round(np.asarray([users.x_m, users.y_m])[:, shown], 1).tolist()
+
+
+def _finite(values: Array) -> list[float | None]:
+    return [value if math.isfinite(value) else None for value in values.tolist()]
+
+
+def _spread(n: int, most: int) -> Array:
+    """Indices of at most `most` of `n`, evenly spread, the first and the last among them."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
