@@ -30,8 +30,8 @@ class BagReader:
 
     Args:
         path: the bag's folder, or one of its MCAP files.
-        torn: read files that lack their end, or are damaged, as far as they go. They are read once to
-            know what they hold, and messages come as they lie in them.
+        torn: read files that lack their end, or are damaged, as far as they go. They are read once more,
+            to know what they hold.
 
     Attributes:
         parts: its storage files, in their order.

@@ -97,6 +97,7 @@ class Scan:
         path: the file's.
         part: what was read until now.
         library: what wrote the file, in its own words.
+        lag_ns: how much earlier than one before it a message was until now, nanoseconds.
         damages: what could not be used until now, as it lies in the file.
         size: of the file when it was opened, bytes; what is appended later is not read.
         magic: its first bytes.
@@ -111,6 +112,7 @@ class Scan:
         self.damages: list[Damage] = []
         self.path = path
         self.library = ""
+        self.lag_ns = 0
         self._file = file
         self._frames = Frames(file)
         self.size = self._frames.size
@@ -255,6 +257,7 @@ class Scan:
                 self._lose(self._at, FRAME.size + len(content), "messages of a topic that is lost")
                 return
             self.part.count(self._channels[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+            self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
             self._last_ns = log_time_ns
             for damage in reversed(self.damages):
                 if damage.before_ns is not None:

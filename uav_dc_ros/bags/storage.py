@@ -1,5 +1,6 @@
 """The storage files of a bag: MCAP through mcap, rosbag2's SQLite through rosbags."""
 
+import heapq
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ from uav_dc_ros.errors import BagError, UavDcError
 
 SQLITE = "*.db3"
 COMPRESSED = "*.mcap.zstd"  # files that rosbag2 compressed as a whole
+WAITING_BYTES = 64 * 2**20  # of messages that wait for earlier ones; a clock that jumped is not waited for
+MESSAGE_BYTES = 400  # that a message takes beside its data
 RECOVER = "python -m uav_dc_ros.bag recover"
 
 
@@ -220,7 +223,7 @@ def _open_torn(path: Path, file: IO[bytes]) -> Storage:
         topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[BagMessage]:
         with _damage(path):
-            yield from _scanned(Scan(path, file), topics, start_ns, end_ns)
+            yield from _scanned(Scan(path, file), scan.lag_ns, topics, start_ns, end_ns)
 
     schemas: dict[int, Schema] = {}
     topics: dict[str, RecordedTopic] = {}
@@ -264,12 +267,20 @@ def _message(topic: str, type: str, message: Message) -> BagMessage:
 
 
 def _scanned(
-    scan: Scan, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    scan: Scan, lag_ns: int, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
 ) -> Iterator[BagMessage]:
-    """Messages of a file that has no index to read it by, as they lie in it."""
+    """Messages of a file that has no index to read it by, in the order of their log times.
+
+    Args:
+        scan: of the file, new.
+        lag_ns: how much earlier than one before it a message may be, nanoseconds.
+        topics, start_ns, end_ns: which messages.
+    """
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
-    for record in scan:
+    waiting: list[tuple[int, int, BagMessage]] = []  # log time, number in the file
+    waiting_bytes = newest_ns = 0
+    for n, record in enumerate(scan):
         if isinstance(record, Schema):
             schemas[record.id] = record.name
         elif isinstance(record, Channel):
@@ -278,8 +289,16 @@ def _scanned(
             topic, type = channels[record.channel_id]
             early = start_ns is not None and record.log_time < start_ns
             late = end_ns is not None and record.log_time >= end_ns
+            newest_ns = max(newest_ns, record.log_time)
             if not early and not late and (topics is None or topic in topics):
-                yield _message(topic, type, record)
+                heapq.heappush(waiting, (record.log_time, n, _message(topic, type, record)))
+                waiting_bytes += len(record.data) + MESSAGE_BYTES
+            while waiting and (waiting[0][0] <= newest_ns - lag_ns or waiting_bytes > WAITING_BYTES):
+                *_, message = heapq.heappop(waiting)
+                waiting_bytes -= len(message.data) + MESSAGE_BYTES
+                yield message
+    while waiting:
+        yield heapq.heappop(waiting)[2]
 
 
 def open_sqlite(folder: Path, closing: ExitStack) -> Storage:

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import messages, payloads, scenarios, topics
-from uav_dc_ros.bags.definitions import TYPESTORE
-from uav_dc_ros.bags.read import BagMessage, BagReader
+from uav_dc_ros.bags.definitions import TYPESTORE, is_defined_so
+from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import BagError, MessageError, ScenarioError
@@ -123,6 +123,9 @@ class Steps:
         namespace: as `namespace` gives it.
         step_ns: duration of a step: a pose that is later than its step is none of it.
 
+    Raises:
+        BagError: a topic of that name is of another type.
+
     Attributes:
         rejected: messages that could not be read, by topic and reason.
         orphans: messages that came when their step was handed out already, by topic.
@@ -134,6 +137,9 @@ class Steps:
         self._reader = reader
         self._step_ns = step_ns
         self._topics = {f"{namespace}/{name}": name for name in STEP_TOPICS}
+        for full, name in self._topics.items():
+            if full in reader.topics:
+                _expect(reader, reader.topics[full], topics.TOPICS[name].type)
         self._open: dict[tuple[int, int, int], RecordedStep] = {}
         self._poses: list[tuple[int, Array, BagMessage]] = []  # stamp, position
         self._flight = 0
@@ -205,6 +211,20 @@ class Steps:
         step.position_m = position_m
         step.log_ns["pose"], step.publish_ns["pose"] = message.log_time_ns, message.publish_time_ns
         self._poses = [pose for pose in self._poses if pose[0] > begun_ns]
+
+
+def _expect(reader: BagReader, topic: RecordedTopic, type: str) -> None:
+    """Raises BagError for a topic that is not of our type, as ROS 2 Jazzy defines it."""
+    if (topic.type, topic.serialization) != (type, "cdr"):
+        raise BagError(
+            f"bag {reader.path}: topic {topic.name} is of type {topic.type or '(none)'} "
+            f"({topic.serialization or 'no encoding'}); expected {type} (cdr)"
+        )
+    if not is_defined_so(type, topic.encoding, topic.definition):
+        raise BagError(
+            f"bag {reader.path}: topic {topic.name}: its definition of {type} is another one than that of "
+            "ROS 2 Jazzy"
+        )
 
 
 def _pose(message: BagMessage) -> tuple[int, Array]:
