@@ -16,6 +16,7 @@ from uav_dc_ros.cli import write_whole
 from uav_dc_ros.errors import BagError, UavDcError
 
 METADATA_NAME = "uav_dc_ros"  # of our record inside an MCAP file: what the bag is about
+LOST = "lost_bytes"  # its key for what recovering a part could not use
 FILE_NAME = "metadata.yaml"
 
 

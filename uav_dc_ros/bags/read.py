@@ -12,11 +12,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from uav_dc_ros.bags.mcap_storage import open_mcap
 from uav_dc_ros.bags.storage import (
     BagMessage,
     RecordedTopic,
     Storage,
-    open_mcap,
     open_sqlite,
     storage_files,
 )

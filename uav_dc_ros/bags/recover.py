@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from uav_dc_ros.bags.mend import copy
-from uav_dc_ros.bags.metadata import Part, total, write_metadata
+from uav_dc_ros.bags.metadata import LOST, METADATA_NAME, Part, total, write_metadata
 from uav_dc_ros.bags.part import PartWriter
 from uav_dc_ros.bags.scan import Damage, Scan, has_end
 from uav_dc_ros.bags.storage import mcap_files
@@ -129,6 +129,8 @@ def _recover_part(source: Path, path: Path) -> RecoveredPart:
                 return RecoveredPart(
                     source=source, why=f"{scan.size} bytes without a topic", damages=scan.damages
                 )
+            if scan.lost_bytes:
+                writer.add_metadata(METADATA_NAME, {LOST: str(scan.lost_bytes)})
             writer.finish()
         finally:
             writer.abandon()

@@ -13,7 +13,8 @@ from rich.text import Text
 
 from uav_dc_ros import cli
 from uav_dc_ros.bags.storage import RECOVER
-from uav_dc_ros.recordings.survey import MissionSurvey, Survey, TopicSurvey, start_text, survey
+from uav_dc_ros.recordings.missions import MissionSurvey
+from uav_dc_ros.recordings.survey import Survey, TopicSurvey, start_text, survey
 
 WIDTH = 80  # where there is no terminal
 MISSIONS_MAX = 30  # that are told one by one
