@@ -11,12 +11,12 @@ import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from io import BytesIO
-from typing import IO
+from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile
+from mcap.exceptions import EndOfFile, UnsupportedCompressionError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -127,24 +127,56 @@ class ChunkHead:
 
 
 def inflate(compression: str, data: bytes) -> bytes:
-    """The data of a whole chunk, decompressed; ValueError if it is damaged."""
+    """The data of a whole chunk, decompressed; ValueError if it is damaged, or not of this length."""
+    if not compression:
+        return data
     try:
-        if compression == "zstd":
-            whole = zstandard.ZstdDecompressor().decompressobj()
-            return whole.decompress(data) if data else b""
-        return lz4.frame.decompress(data) if compression == "lz4" else data
+        stream = _decompressor(compression)
+        plain: bytes = stream.decompress(data)
     except Exception as error:  # of zstandard, lz4; out of memory by a size that is none
         raise ValueError(str(error)) from None
+    if not stream.eof or stream.unused_data:
+        raise ValueError(f"{compression} of another length")
+    return plain
+
+
+def _decompressor(compression: str) -> Any:
+    return (
+        zstandard.ZstdDecompressor().decompressobj()
+        if compression == "zstd"
+        else lz4.frame.LZ4FrameDecompressor()
+    )
+
+
+def unpack(head: ChunkHead, data: bytes) -> bytes | None:
+    """The data of a whole chunk, decompressed and checked; None if it is damaged.
+
+    Raises:
+        UnsupportedCompressionError: it is compressed in another way.
+    """
+    known = head.compression in COMPRESSIONS
+    for compression in (head.compression,) if known else COMPRESSIONS:
+        try:
+            plain = inflate(compression, data)
+        except ValueError:
+            continue
+        # Without a CRC, its size must do.
+        if zlib.crc32(plain) == head.crc if head.crc else known and len(plain) == head.size:
+            return plain  # the CRC also tells when it is but the name that is damaged
+    if not known:
+        raise UnsupportedCompressionError(head.compression)
+    return None
 
 
 def inflate_torn(compression: str, data: bytes) -> bytes:
     """The beginning of a chunk of which only a beginning is there, block by block until the cut."""
     try:
-        if compression == "zstd":
-            return zstandard.ZstdDecompressor().decompressobj().decompress(data)
-        return lz4.frame.LZ4FrameDecompressor().decompress(data) if compression == "lz4" else data
+        plain: bytes = (
+            _decompressor(compression).decompress(data) if compression in COMPRESSIONS[1:] else data
+        )
     except Exception:  # of zstandard, lz4
         return b""
+    return plain
 
 
 class Frames:
@@ -197,9 +229,11 @@ class Frames:
             data_bytes = content_bytes - head.data_at
             if head.crc == 0 or not 0 <= data_bytes <= head.size + head.size // 64 + 1024:
                 continue
+            if at + FRAME.size + content_bytes > self.size:
+                continue
             data = self.read(at + FRAME.size + head.data_at, data_bytes)
             try:
-                told = len(data) == data_bytes and zlib.crc32(inflate(head.compression, data)) == head.crc
+                told = zlib.crc32(inflate(head.compression, data)) == head.crc
             except ValueError:
                 told = False
             if told:
@@ -235,7 +269,9 @@ class Frames:
         elif opcode in _FIXED:
             believed = length == _FIXED[Opcode(opcode)]
         else:
-            believed = opcode >= PRIVATE or parse(opcode, content, exact=True) is not None
+            # A chunk whose opcode is damaged looks like an application's record.
+            private = opcode >= PRIVATE and self.chunk(at) is None
+            believed = private or parse(opcode, content, exact=True) is not None
         return (opcode, content, end) if believed else None
 
     def _begins(self, at: int) -> bool:

@@ -7,6 +7,7 @@ frames of the records are read here, and only what lies inside a whole frame goe
 
 import os
 import zlib
+from bisect import bisect_left
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO
 
+from mcap.exceptions import UnsupportedCompressionError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metadata, Schema
@@ -28,14 +30,15 @@ from uav_dc_ros.bags.frames import (
     ChunkHead,
     Frames,
     frames,
-    inflate,
     inflate_torn,
     parse,
+    unpack,
 )
 from uav_dc_ros.bags.metadata import METADATA_NAME, Part
 from uav_dc_ros.errors import BagError
 
 _END_BYTES = FRAME.size + FOOTER_BYTES + len(MAGIC)
+DAMAGES_MAX = 10_000  # places that are told apart; the last one takes in what follows
 _KEPT = (Schema, Channel, Metadata, Attachment)  # the rest is an index: it is made anew
 
 
@@ -189,37 +192,36 @@ class Scan:
         self._lose(0, len(self.magic), "torn at the end" if torn else "damaged")
         return not torn
 
+    @cached_property
+    def _known(self) -> list[int]:
+        """Where records begin that the end of the file tells of."""
+        if self.summary is None:
+            return []
+        known = [index.chunk_start_offset for index in self.summary.chunk_indexes]
+        known += [index.offset for index in self.summary.metadata_indexes]
+        known += [index.offset for index in self.summary.attachment_indexes]
+        return sorted(known)
+
     def _resume(self, at: int) -> int:
         """Where reading goes on after damage; the end of the file, if nowhere."""
-        size = self.size
-        if self.summary is not None:
-            known = [index.chunk_start_offset for index in self.summary.chunk_indexes]
-            known += [index.offset for index in self.summary.metadata_indexes]
-            known += [index.offset for index in self.summary.attachment_indexes]
-            following = min((offset for offset in known if offset >= at), default=size)
-            if known and following < size:
-                return following
-        found = self._frames.next_chunk(at)
-        if found is None and not self._chunked:
+        number = bisect_left(self._known, at)
+        if number < len(self._known):
+            return self._known[number]
+        found = None
+        if self._channels and not self._chunked:  # messages inside of a damaged chunk are not to be believed
             found = self._frames.next_message(at, self._channels)
-        return size if found is None else found
+        if found is None:
+            found = self._frames.next_chunk(at)
+        return self.size if found is None else found
 
     def _chunk(self, head: ChunkHead, end: int) -> Iterator[McapRecord]:
-        if head.compression not in COMPRESSIONS:
-            # Left out, its messages would be gone once the file is written anew.
-            raise BagError(
-                f"{self.path}: unsupported compression type {head.compression}; expected one of "
-                f"{COMPRESSIONS} at hand"
-            )
         try:
-            data = inflate(head.compression, self._frames.read(end - head.data_bytes, head.data_bytes))
-        except ValueError:
-            data = None
-        if data is None or (head.crc and zlib.crc32(data) != head.crc):
+            data = unpack(head, self._frames.read(end - head.data_bytes, head.data_bytes))
+        except UnsupportedCompressionError as error:
+            # Left out, its messages would be gone once the file is written anew.
+            raise BagError(f"{self.path}: {error}; expected one of {COMPRESSIONS} at hand") from None
+        if data is None:
             self._lose(self._at, end - self._at, "a chunk whose content is damaged")
-            return
-        if len(data) != head.size and not head.crc:
-            self._lose(self._at, end - self._at, "a chunk that lacks a part")
             return
         rest = yield from self._inside(data)
         if rest:
@@ -304,10 +306,13 @@ class Scan:
 
     def _lose(self, at: int, n_bytes: int, why: str) -> None:
         """Enter bytes that could not be used; those that follow each other are one place."""
-        last = self.damages[-1] if self.damages else None
         if n_bytes <= 0:
             return
-        if last is not None and last.before_ns is None and (last.at + last.n_bytes == at or last.why == why):
+        last = self.damages[-1] if self.damages else None
+        if last is not None and (
+            len(self.damages) >= DAMAGES_MAX
+            or (last.before_ns is None and (last.at + last.n_bytes == at or last.why == why))
+        ):
             last.n_bytes += n_bytes
             return
         self.damages.append(Damage(at, n_bytes, why, after_ns=self._last_ns))
