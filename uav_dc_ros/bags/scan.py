@@ -237,7 +237,7 @@ class Scan:
         kept = self.part.message_count - before
         # Which compressed bytes the lost records were in, nobody can tell.
         n_bytes = end - at if head.compression else rest
-        told = f"; its first {kept} messages are whole" if kept else ""
+        told = f"; messages of it that are whole: {kept}" if kept else ""
         if n_bytes:
             self._lose(end - n_bytes, n_bytes, f"a chunk torn at the end{told}")
 
