@@ -199,6 +199,7 @@ def test_a_flipped_bit_costs_its_chunk_at_most_and_never_lies(
     flips = [(at, chance.randrange(8)) for at in chance.sample(range(8, len(file)), n_flips)]
     for start, *_ in starts_ends[1:2]:  # all that a chunk says of itself
         flips += [(at, bit) for at in range(start, start + 53) for bit in (0, 7)]
+    flips.append((starts_ends[1][1], 1))  # a message index becomes a message
     bag = folder_of(in_memory / "bag", [flipped(file, *flip) for flip in flips])
     recovered = recover(bag, in_memory / "out")
     n_lost = 0

@@ -151,7 +151,8 @@ class Scan:
         while at < size:
             self._at = at
             record = self._frames.record(at)
-            if record is not None:
+            # No writer puts messages beside chunks: it would be an index whose opcode is damaged.
+            if record is not None and not (self._chunked and record[0] == Opcode.MESSAGE):
                 opcode, content, at = record
                 if opcode == Opcode.FOOTER:
                     self._lose(at + len(MAGIC), size - at - len(MAGIC), "bytes after the file's end")
