@@ -317,6 +317,7 @@ def test_a_file_that_is_no_mcap_file_is_refused_and_kept(tmp_path: Path, other: 
 
 def test_a_compression_that_cannot_be_read_loses_no_message(tmp_path: Path) -> None:
     file = made("zstd", finished=False).replace(b"\x04\0\0\0zstd", b"\x04\0\0\0fast")
+    file = file.replace(b"\x28\xb5\x2f\xfd", b"fast")  # zstd's magic: else its CRC tells that it is zstd
     bag = folder_of(tmp_path / "bag", file)
     with pytest.raises(BagError, match="unsupported compression type fast"):
         mend(bag)

@@ -294,11 +294,10 @@ def test_namespaces(tmp_path):
     assert len(other) == LAST + 1
 
 
-def test_a_topic_of_another_type_is_not_read(tmp_path):
+def test_a_topic_of_another_type_is_told():
     odometry = [m._replace(type="nav_msgs/msg/Odometry") if m.topic == "/pose" else m for m in FLIGHT]
-    found, stream = read(odometry)
-    assert all(step.position_m is None and step.users is not None for step in found)
-    assert not stream.rejected
+    with pytest.raises(BagError, match=r"topic /pose is of type nav_msgs/msg/Odometry \(cdr\); expected geom"):
+        read(odometry)
 
 
 def test_the_scenario_of_a_bag(tmp_path):

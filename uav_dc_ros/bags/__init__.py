@@ -1,8 +1,10 @@
 """MCAP bags without a ROS installation.
 
-read         messages of a whole bag, of any recorder, as a stream; storage opens its files
+read         messages of a bag, of any recorder, as a stream; storage and mcap_storage open its files
 write        a rosbag2 folder from serialised messages; part is one of its files
-mend         a whole bag, in place, of what a killed recorder left; scan reads a torn file
+mend         a whole bag, in place, of what a killed recorder left
+recover      a whole bag, in a new folder, of a torn or damaged one
+scan         reads a torn or damaged file as far as it goes; frames are its records
 metadata     metadata.yaml
 definitions  message types as text
 """

@@ -110,7 +110,7 @@ def _rewrite(scan: Scan, path: Path) -> Part:
     try:
         writer = PartWriter(temporary, name=path.name)
         try:
-            _copy(scan, writer)
+            copy(scan, writer)
             writer.finish()
         finally:
             writer.abandon()
@@ -126,7 +126,8 @@ def _rewrite(scan: Scan, path: Path) -> Part:
     return writer.part
 
 
-def _copy(scan: Scan, writer: PartWriter) -> None:
+def copy(scan: Scan, writer: PartWriter) -> None:
+    """Write what can be read of a part into another one; its indexes are made anew."""
     schemas = {0: 0}  # a channel without a schema stays one
     channels: dict[int, int] = {}
     for record in scan:

@@ -16,6 +16,7 @@ from uav_dc_ros.cli import write_whole
 from uav_dc_ros.errors import BagError, UavDcError
 
 METADATA_NAME = "uav_dc_ros"  # of our record inside an MCAP file: what the bag is about
+LOST = "lost_bytes"  # its key for what recovering a part could not use
 FILE_NAME = "metadata.yaml"
 
 
@@ -147,16 +148,27 @@ def write_metadata(folder: Path, parts: Sequence[Part]) -> None:
         raise BagError(str(error)) from None
 
 
-def is_told(folder: Path, parts: Sequence[Part]) -> bool:
-    """Whether metadata.yaml tells these parts, and as many messages of each topic."""
+def read_metadata(folder: Path) -> dict[str, Any] | None:
+    """What metadata.yaml says; None if it is missing, or says nothing of a bag."""
     try:
         told = YAML(typ="safe").load(folder / FILE_NAME)["rosbag2_bagfile_information"]
+    except (OSError, ValueError, YAMLError, KeyError, TypeError, RecursionError):
+        return None
+    return told if isinstance(told, dict) else None
+
+
+def is_told(folder: Path, parts: Sequence[Part]) -> bool:
+    """Whether metadata.yaml tells these parts, and as many messages of each topic."""
+    told = read_metadata(folder)
+    if told is None:
+        return False  # it is to be written
+    try:
         counts = {
             row["topic_metadata"]["name"]: row["message_count"] for row in told["topics_with_message_count"]
         }
         names = told["relative_file_paths"]
-    except (OSError, UnicodeDecodeError, YAMLError, KeyError, TypeError):
-        return False  # missing, or no metadata.yaml: it is to be written
+    except (KeyError, TypeError):
+        return False
     return names == [part.name for part in parts] and counts == total(parts).counts
 
 

@@ -12,11 +12,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from uav_dc_ros.bags.mcap_storage import open_mcap
 from uav_dc_ros.bags.storage import (
     BagMessage,
     RecordedTopic,
     Storage,
-    open_mcap,
     open_sqlite,
     storage_files,
 )
@@ -30,9 +30,12 @@ class BagReader:
 
     Args:
         path: the bag's folder, or one of its MCAP files.
+        torn: read files that lack their end, or are damaged, as far as they go. They are read once more,
+            to know what they hold.
 
     Attributes:
         parts: its storage files, in their order.
+        storages: what each of them holds.
         topics: by name.
         about: what our recorder wrote about it, text by key; empty for a bag of another one.
         first_ns, last_ns: log times of its first and last message, nanoseconds since the epoch; 0 without.
@@ -42,22 +45,22 @@ class BagReader:
             that cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, torn: bool = False) -> None:
         self.path = path
         self.topics: dict[str, RecordedTopic] = {}
         self.about: dict[str, str] = {}
         self._closing = ExitStack()
         try:
-            self._parts = [self._open(part) for part in storage_files(path)]
+            self.storages = [self._open(part, torn) for part in storage_files(path)]
         except BaseException:
             self._closing.close()
             raise
-        self.parts = tuple(part.path for part in self._parts)
-        for part in self._parts:
+        self.parts = tuple(part.path for part in self.storages)
+        for part in self.storages:
             self.about = part.about | self.about  # what was said first stays
             for topic in part.topics:
                 self._enter(topic)
-        with_messages = [part for part in self._parts if any(topic.count for topic in part.topics)]
+        with_messages = [part for part in self.storages if any(topic.count for topic in part.topics)]
         self.first_ns = min((part.first_ns for part in with_messages), default=0)
         self.last_ns = max((part.last_ns for part in with_messages), default=0)
 
@@ -93,13 +96,13 @@ class BagReader:
         Raises:
             BagError: the bag is damaged there.
         """
-        streams = [part.messages(topics, start_ns, end_ns) for part in self._parts]
+        streams = [part.messages(topics, start_ns, end_ns) for part in self.storages]
         # Parts follow each other; only where their times overlap do they have to be merged.
         while streams:
             together = 1
-            end = self._parts[-len(streams)].last_ns
-            while together < len(streams) and self._parts[together - len(streams)].first_ns <= end:
-                end = max(end, self._parts[together - len(streams)].last_ns)
+            end = self.storages[-len(streams)].last_ns
+            while together < len(streams) and self.storages[together - len(streams)].first_ns <= end:
+                end = max(end, self.storages[together - len(streams)].last_ns)
                 together += 1
             yield from heapq.merge(*streams[:together], key=attrgetter("log_time_ns"))
             del streams[:together]
@@ -115,8 +118,7 @@ class BagReader:
             known.offered_qos = topic.offered_qos
         known.count += topic.count
 
-    def _open(self, path: Path) -> Storage:
+    def _open(self, path: Path, torn: bool) -> Storage:
         if path.is_dir():
             return open_sqlite(path, self._closing)
-        file = self._closing.enter_context(path.open("rb"))
-        return open_mcap(path, file)
+        return open_mcap(path, self._closing, torn=torn)

@@ -1,4 +1,4 @@
-"""Read an MCAP file as far as it goes: whole, or cut at any byte.
+"""Read an MCAP file as far as it goes: whole, cut at any byte, or damaged anywhere.
 
 mcap's StreamReader stops a torn file with EndOfFile, struct.error, ZstdError, UnicodeDecodeError or
 CRCValidationError, as the cut falls, and hands out a message that is cut short as if it were whole. So the
@@ -6,35 +6,40 @@ frames of the records are read here, and only what lies inside a whole frame goe
 """
 
 import os
-import struct
 import zlib
-from collections.abc import Iterator
+from bisect import bisect_left
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import IO
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError, UnsupportedCompressionError
+from mcap.exceptions import UnsupportedCompressionError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metadata, Schema
+from mcap.summary import Summary
 
+from uav_dc_ros.bags.frames import (
+    COMPRESSIONS,
+    FOOTER_BYTES,
+    FRAME,
+    MAGIC,
+    MESSAGE,
+    ChunkHead,
+    Frames,
+    frames,
+    inflate_torn,
+    parse,
+    unpack,
+)
 from uav_dc_ros.bags.metadata import METADATA_NAME, Part
 from uav_dc_ros.errors import BagError
 
-MAGIC = b"\x89MCAP0\r\n"
-_FRAME = struct.Struct("<BQ")  # opcode, length of what follows
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size and CRC, length of the compression's name
-_FOOTER = struct.Struct("<QQI")  # start of the summary, of its offsets, its CRC
-_END_BYTES = _FRAME.size + _FOOTER.size + len(MAGIC)
-_COMPRESSIONS = ("", "zstd", "lz4")
-_READERS = {
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.METADATA: Metadata.read,
-    Opcode.ATTACHMENT: Attachment.read,
-}
+_END_BYTES = FRAME.size + FOOTER_BYTES + len(MAGIC)
+DAMAGES_MAX = 10_000  # places that are told apart; the last one takes in what follows
+_KEPT = (Schema, Channel, Metadata, Attachment)  # the rest is an index: it is made anew
 
 
 def has_end(file: IO[bytes]) -> bool:
@@ -48,10 +53,11 @@ def has_end(file: IO[bytes]) -> bool:
         return False
     file.seek(size - _END_BYTES)
     end = file.read(_END_BYTES)
-    opcode, length = _FRAME.unpack_from(end)
-    if end[-len(MAGIC) :] != MAGIC or (opcode, length) != (Opcode.FOOTER, _FOOTER.size):
+    opcode, length = FRAME.unpack_from(end)
+    if end[-len(MAGIC) :] != MAGIC or (opcode, length) != (Opcode.FOOTER, FOOTER_BYTES):
         return False
-    start, _, crc = _FOOTER.unpack_from(end, _FRAME.size)
+    start = int.from_bytes(end[FRAME.size : FRAME.size + 8], "little")
+    crc = int.from_bytes(end[-len(MAGIC) - 4 : -len(MAGIC)], "little")
     if not len(MAGIC) <= start < size - _END_BYTES:
         return False
     if crc == 0:  # MCAP's way to say that there is none
@@ -61,16 +67,43 @@ def has_end(file: IO[bytes]) -> bool:
     return zlib.crc32(file.read(size - start - len(MAGIC) - 4)) == crc
 
 
+@dataclass
+class Damage:
+    """A place in a file that could not be used.
+
+    Attributes:
+        at: where it begins, bytes.
+        n_bytes: its length as it lies in the file.
+        why: what it is.
+        after_ns: log time of the message read last before it, nanoseconds since the epoch; None for none.
+        before_ns: log time of the next message after it.
+    """
+
+    at: int
+    n_bytes: int
+    why: str
+    after_ns: int | None = None
+    before_ns: int | None = None
+
+
 class Scan:
     """Iterates over what can be read of an MCAP file, in one pass, a chunk at a time in memory.
 
     Yields schemas, channels, messages, metadata records and attachments. Schemas and channels come
-    once; a message comes after its channel. What follows a torn record is no record.
+    once; a message comes after its channel.
+
+    What cannot be believed is left out: a chunk whose CRC does not hold, with all it has; a record whose
+    length is wrong, up to the next chunk that is whole. Of a chunk that is torn at the end of the file come
+    the first records, as far as its compression gives them.
 
     Attributes:
         path: the file's.
         part: what was read until now.
-        lost_bytes: bytes that could not be used until now, as they lie in the file.
+        library: what wrote the file, in its own words.
+        lag_ns: how much earlier than one before it a message was until now, nanoseconds.
+        damages: what could not be used until now, as it lies in the file.
+        size: of the file when it was opened, bytes; what is appended later is not read.
+        magic: its first bytes.
 
     Raises:
         BagError: the file is no MCAP file, or is compressed in a way that cannot be read here.
@@ -79,80 +112,182 @@ class Scan:
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self.part = Part(path.name)
-        self.lost_bytes = 0
+        self.damages: list[Damage] = []
         self.path = path
+        self.library = ""
+        self.lag_ns = 0
         self._file = file
+        self._frames = Frames(file)
+        self.size = self._frames.size
+        self.magic = self._frames.read(0, len(MAGIC))
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, str] = {}
+        self._last_ns: int | None = None
+        self._chunked = False
+        self._at = 0  # of the record, or chunk, that is being read
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes that could not be used until now, as they lie in the file."""
+        return sum(damage.n_bytes for damage in self.damages)
+
+    @cached_property
+    def summary(self) -> Summary | None:
+        """What the end of the file tells; None without an end."""
+        try:
+            if not has_end(self._file):
+                return None
+            self._file.seek(-len(MAGIC), os.SEEK_END)  # mcap wants one; that at the start may be damaged
+            return SeekingReader(self._file).get_summary()
+        except Exception:  # of mcap, struct: one without a CRC, and damaged
+            return None
 
     def __iter__(self) -> Iterator[McapRecord]:
         """Start at the beginning of the file; once."""
-        size = os.fstat(self._file.fileno()).st_size
-        self._file.seek(0)
-        magic = self._file.read(len(MAGIC))
-        if magic != MAGIC[: len(magic)]:
-            raise BagError(f"{self.path} starts with {magic!r}; expected {MAGIC!r}, as an MCAP file does")
-        used = len(magic)
-        if len(magic) < len(MAGIC):
-            self.lost_bytes += used
+        size = self.size
+        if not self._starts():
             return
-        for opcode, content in _frames(self._file, size - used):
-            used += _FRAME.size + len(content)
-            if opcode == Opcode.FOOTER:
+        at = len(MAGIC)
+        while at < size:
+            self._at = at
+            record = self._frames.record(at)
+            # No writer puts messages beside chunks: it would be an index whose opcode is damaged.
+            if record is not None and not (self._chunked and record[0] == Opcode.MESSAGE):
+                opcode, content, at = record
+                if opcode == Opcode.FOOTER:
+                    self._lose(at + len(MAGIC), size - at - len(MAGIC), "bytes after the file's end")
+                    return
+                yield from self._record(opcode, content)
+                continue
+            chunk = self._frames.chunk(at)
+            if chunk is not None:
+                self._chunked = True
+                head, at = chunk
+                yield from self._chunk(head, at)
+                continue
+            torn = self._frames.torn_chunk(at)
+            if torn is not None:
+                yield from self._torn(torn)
                 return
-            yield from self._chunk(content) if opcode == Opcode.CHUNK else self._record(opcode, content)
-        rest = size - used
-        self._file.seek(used)
-        start = self._file.read(_FRAME.size + _CHUNK.size + 8)  # 8: length of the data
-        if len(start) == _FRAME.size + _CHUNK.size + 8 and start[0] == Opcode.CHUNK:
-            *_, name_length = _CHUNK.unpack_from(start, _FRAME.size)
-            if name_length == 0:  # not compressed, so its first records are there
-                rest -= len(start)
-                for opcode, content in _frames(self._file, rest):
-                    rest -= _FRAME.size + len(content)
-                    yield from self._record(opcode, content)
-        self.lost_bytes += rest
+            following = self._resume(at + 1)
+            torn_end = following == size and self.summary is None
+            self._lose(at, following - at, "torn at the end" if torn_end else "damaged")
+            at = following
 
-    def _chunk(self, content: bytes) -> Iterator[McapRecord]:
+    def is_mcap(self) -> bool:
+        """Whether it is an MCAP file: by its magic, torn or not, or by the header behind a damaged one."""
+        if MAGIC.startswith(self.magic):
+            return True
+        record = self._frames.record(len(MAGIC))
+        return record is not None and record[0] == Opcode.HEADER
+
+    def _starts(self) -> bool:
+        """Whether the file goes on after its magic."""
+        if self.magic == MAGIC:
+            return True
+        if not self.is_mcap():
+            raise BagError(
+                f"{self.path} starts with {self.magic!r}; expected {MAGIC!r}, as an MCAP file does"
+            )
+        torn = MAGIC.startswith(self.magic)
+        self._lose(0, len(self.magic), "torn at the end" if torn else "damaged")
+        return not torn
+
+    @cached_property
+    def _known(self) -> list[int]:
+        """Where records begin that the end of the file tells of."""
+        if self.summary is None:
+            return []
+        known = [index.chunk_start_offset for index in self.summary.chunk_indexes]
+        known += [index.offset for index in self.summary.metadata_indexes]
+        known += [index.offset for index in self.summary.attachment_indexes]
+        return sorted(known)
+
+    def _resume(self, at: int) -> int:
+        """Where reading goes on after damage; the end of the file, if nowhere."""
+        number = bisect_left(self._known, at)
+        if number < len(self._known):
+            return self._known[number]
+        found = None
+        if self._channels and not self._chunked:  # messages inside of a damaged chunk are not to be believed
+            found = self._frames.next_message(at, self._channels)
+        if found is None:
+            found = self._frames.next_chunk(at)
+        return self.size if found is None else found
+
+    def _chunk(self, head: ChunkHead, end: int) -> Iterator[McapRecord]:
         try:
-            chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-            if chunk.compression not in _COMPRESSIONS:
-                raise UnsupportedCompressionError(chunk.compression)
-            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+            data = unpack(head, self._frames.read(end - head.data_bytes, head.data_bytes))
         except UnsupportedCompressionError as error:
             # Left out, its messages would be gone once the file is written anew.
-            raise BagError(f"{self.path}: {error}; expected one of {_COMPRESSIONS} at hand") from None
-        except Exception:  # of struct, zlib, zstandard, lz4, mcap: a chunk that a disk has damaged
-            self.lost_bytes += _FRAME.size + len(content)
+            raise BagError(f"{self.path}: {error}; expected one of {COMPRESSIONS} at hand") from None
+        if data is None:
+            self._lose(self._at, end - self._at, "a chunk whose content is damaged")
             return
-        inside = BytesIO(stream.read(size))
-        rest = size
-        for opcode, record in _frames(inside, size):
-            rest -= _FRAME.size + len(record)
-            yield from self._record(opcode, record)
-        self.lost_bytes += rest
+        rest = yield from self._inside(data)
+        if rest:
+            self._lose(self._at, rest, "records that are none in a chunk")
+
+    def _torn(self, head: ChunkHead) -> Iterator[McapRecord]:
+        """The first records of the chunk at the end of the file; no CRC can tell of them."""
+        at, end = self._at, self.size
+        data_at = at + FRAME.size + head.data_at
+        data = inflate_torn(head.compression, self._frames.read(data_at, end - data_at))[: head.size]
+        before = self.part.message_count
+        rest = yield from self._inside(data)
+        kept = self.part.message_count - before
+        # Which compressed bytes the lost records were in, nobody can tell.
+        n_bytes = end - at if head.compression else rest
+        told = f"; messages of it that are whole: {kept}" if kept else ""
+        if n_bytes:
+            self._lose(end - n_bytes, n_bytes, f"a chunk torn at the end{told}")
+
+    def _inside(self, data: bytes) -> Generator[McapRecord, None, int]:
+        """Records of a chunk. Returns how many bytes at its end are none."""
+        rest = len(data)
+        for opcode, content in frames(BytesIO(data), rest):
+            rest -= FRAME.size + len(content)
+            yield from self._record(opcode, content)
+        return rest
 
     def _record(self, opcode: int, content: bytes) -> Iterator[McapRecord]:
         """A record outside of chunks, or inside of one; none if it is of no use for a copy."""
-        if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
-            channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(content)
+        if opcode == Opcode.MESSAGE and len(content) >= MESSAGE.size:
+            channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(content)
             if channel not in self._channels:
-                self.lost_bytes += _FRAME.size + len(content)
+                yield from self._announced(channel)
+            if channel not in self._channels:
+                self._lose(self._at, FRAME.size + len(content), "messages of a topic that is lost")
                 return
             self.part.count(self._channels[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
-            data = content[_MESSAGE.size :]
+            self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
+            self._last_ns = log_time_ns
+            for damage in reversed(self.damages):
+                if damage.before_ns is not None:
+                    break
+                damage.before_ns = log_time_ns
+            data = content[MESSAGE.size :]
             yield Message(channel, log_time_ns, data, publish_time_ns, sequence)
             return
-        read = _READERS.get(Opcode(opcode)) if opcode in Opcode._value2member_map_ else None
-        if read is None:  # an index: it is made anew
+        if opcode in (Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX):
             return
-        try:
-            record = read(ReadDataStream(BytesIO(content)))
-        except (McapError, struct.error, UnicodeDecodeError):
-            self.lost_bytes += _FRAME.size + len(content)
-            return
-        if self._is_new(record):
+        record = parse(opcode, content)
+        if isinstance(record, Header):
+            self.library = record.library
+        if isinstance(record, _KEPT) and self._is_new(record):
             yield record
+        elif record is None and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE):
+            self._lose(self._at, FRAME.size + len(content), "a record that is none")
+
+    def _announced(self, channel_id: int) -> Iterator[McapRecord]:
+        """A channel, with its schema, as the summary repeats them: the chunk that had them is damaged."""
+        channel = self.summary.channels.get(channel_id) if self.summary is not None else None
+        if channel is None or self.summary is None:
+            return
+        schema = self.summary.schemas.get(channel.schema_id)
+        for record in (schema, channel):
+            if record is not None and self._is_new(record):
+                yield record
 
     def _is_new(self, record: McapRecord) -> bool:
         """Enter a record; False for a schema or channel that the summary repeats."""
@@ -170,12 +305,15 @@ class Scan:
             self.part.about |= record.metadata
         return True
 
-
-def _frames(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of each record that is there in full, within `size` bytes from here."""
-    while size >= _FRAME.size:
-        opcode, length = _FRAME.unpack(stream.read(_FRAME.size))
-        size -= _FRAME.size + length
-        if opcode == 0 or size < 0:  # 0 is no opcode: zeros that a power cut left
+    def _lose(self, at: int, n_bytes: int, why: str) -> None:
+        """Enter bytes that could not be used; those that follow each other are one place."""
+        if n_bytes <= 0:
             return
-        yield opcode, stream.read(length)
+        last = self.damages[-1] if self.damages else None
+        if last is not None and (
+            len(self.damages) >= DAMAGES_MAX
+            or (last.before_ns is None and (last.at + last.n_bytes == at or last.why == why))
+        ):
+            last.n_bytes += n_bytes
+            return
+        self.damages.append(Damage(at, n_bytes, why, after_ns=self._last_ns))

@@ -1,24 +1,23 @@
 """The storage files of a bag: MCAP through mcap, rosbag2's SQLite through rosbags."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
-from mcap.exceptions import McapError
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Message, Schema
 from rosbags.interfaces import ConnectionExtRosbag2
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from uav_dc_ros.bags.metadata import METADATA_NAME, to_yaml
+from uav_dc_ros.bags.metadata import read_metadata, to_yaml
 from uav_dc_ros.bags.part import part_paths
-from uav_dc_ros.bags.scan import MAGIC, Scan, has_end
+from uav_dc_ros.bags.scan import Damage
 from uav_dc_ros.errors import BagError, UavDcError
 
 SQLITE = "*.db3"
+COMPRESSED = "*.mcap.zstd"  # files that rosbag2 compressed as a whole
+RECOVER = "python -m uav_dc_ros.bag recover"
 
 
 class BagMessage(NamedTuple):
@@ -64,7 +63,13 @@ class RecordedTopic:
 
 @dataclass(kw_only=True)
 class Storage:
-    """A storage file: what it holds, and its messages between two log times (the second one excluded)."""
+    """A storage file: what it holds, and its messages between two log times (the second one excluded).
+
+    Attributes:
+        library: what wrote it, in its own words.
+        damages: what of it cannot be used; told only where it was read as far as it goes.
+        has_end: whether it is finished.
+    """
 
     path: Path
     topics: list[RecordedTopic]
@@ -72,28 +77,45 @@ class Storage:
     last_ns: int
     messages: Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
     about: dict[str, str] = field(default_factory=dict)
+    library: str = ""
+    damages: Sequence[Damage] = ()
+    has_end: bool = True
 
 
 def storage_files(path: Path) -> list[Path]:
     """The storage files of a bag, in their order; for SQLite storage the folder itself.
 
     Raises:
-        BagError: there is no bag.
+        BagError: there is no bag, or one that is compressed as a whole.
+    """
+    if path.is_dir() and not part_paths(path) and any(path.glob(SQLITE)):
+        return [path]
+    return mcap_files(path)
+
+
+def mcap_files(path: Path) -> list[Path]:
+    """The MCAP files of a bag, in their order.
+
+    Raises:
+        BagError: there are none.
     """
     if path.is_file():
         return [path]
     if not path.is_dir():
         raise BagError(f"bag {path}: no such folder or file")
     found = part_paths(path)
-    if found:
-        return found
-    if any(path.glob(SQLITE)):
-        return [path]
-    raise BagError(f"bag {path} holds no MCAP file; expected at least one (*.mcap)")
+    if not found and any(path.glob(COMPRESSED)):
+        raise BagError(f"bag {path} holds {COMPRESSED}; expected *.mcap, as `zstd -d` makes of them")
+    if not found:
+        raise BagError(f"bag {path} holds no MCAP file; expected at least one (*.mcap)")
+    mode = str((read_metadata(path) or {}).get("compression_mode", "")).lower()
+    if mode == "message":  # the chunks' own compression is another thing
+        raise BagError(f"bag {path} holds messages that rosbag2 compressed one by one; expected plain ones")
+    return found
 
 
 @contextmanager
-def _damage(path: Path) -> Iterator[None]:
+def damage(path: Path, help: str = f"; {RECOVER} brings back what is whole") -> Iterator[None]:
     """What goes wrong inside the libraries, in words; nothing of ours is to be called in it."""
     try:
         yield
@@ -101,108 +123,9 @@ def _damage(path: Path) -> Iterator[None]:
         raise BagError(f"{path} cannot be read: {error.strerror or error}") from None
     except UavDcError:
         raise
-    except Exception as error:  # of mcap, struct, zstandard, lz4, sqlite3: damaged bytes
+    except Exception as error:  # of mcap, struct, zstandard, lz4, sqlite3, rosbags: damaged bytes
         told = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BagError(
-            f"{path} is damaged: {told}; python -m uav_dc_ros.bag recover brings back what is whole"
-        ) from None
-
-
-def open_mcap(path: Path, file: IO[bytes]) -> Storage:
-    """An MCAP file that has its end.
-
-    Raises:
-        BagError: no MCAP file, one without its end, or a damaged one.
-    """
-    with _damage(path):
-        whole, start = has_end(file), _start(file)
-    if not MAGIC.startswith(start) and not start.startswith(MAGIC):
-        raise BagError(f"{path} starts with {start!r}; expected {MAGIC!r}, as an MCAP file does")
-    if not whole:
-        raise BagError(
-            f"{path} has no end: its recorder was killed, or still writes it; expected a whole bag, as "
-            "python -m uav_dc_ros.bag recover makes of it"
-        )
-    with _damage(path):
-        file.seek(0)
-        reader = SeekingReader(file, validate_crcs=True)
-        summary = reader.get_summary()
-        if summary is None or summary.statistics is None:
-            raise McapError("its summary has no statistics")
-        about: dict[str, str] = {}
-        for metadata in reader.iter_metadata():
-            if metadata.name == METADATA_NAME:
-                about |= metadata.metadata
-        statistics = summary.statistics
-        topics = [
-            _topic(channel, summary.schemas.get(channel.schema_id), statistics.channel_message_counts)
-            for channel in summary.channels.values()
-        ]
-
-    def messages(
-        topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[BagMessage]:
-        if not summary.chunk_indexes:  # nothing to seek by: in the order of the file
-            with _damage(path):
-                yield from _scanned(path, file, topics, start_ns, end_ns)
-            return
-        stream = reader.iter_messages(topics, starting_at=start_ns, ending_before=end_ns)
-        while True:
-            with _damage(path):
-                found = next(stream, None)
-            if found is None:
-                return
-            schema, channel, message = found
-            yield _message(channel.topic, schema.name if schema else "", message)
-
-    return Storage(
-        path=path,
-        topics=topics,
-        first_ns=statistics.message_start_time,
-        last_ns=statistics.message_end_time,
-        messages=messages,
-        about=about,
-    )
-
-
-def _start(file: IO[bytes]) -> bytes:
-    file.seek(0)
-    return file.read(len(MAGIC))
-
-
-def _topic(channel: Channel, schema: Schema | None, counts: Mapping[int, int]) -> RecordedTopic:
-    return RecordedTopic(
-        name=channel.topic,
-        type=schema.name if schema else "",
-        definition=schema.data if schema else b"",
-        encoding=schema.encoding if schema else "",
-        serialization=channel.message_encoding,
-        offered_qos=channel.metadata.get("offered_qos_profiles", ""),
-        count=counts.get(channel.id, 0),
-    )
-
-
-def _message(topic: str, type: str, message: Message) -> BagMessage:
-    return BagMessage(topic, type, message.data, message.log_time, message.publish_time)
-
-
-def _scanned(
-    path: Path, file: IO[bytes], topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
-) -> Iterator[BagMessage]:
-    """Messages of a file without chunks, as they lie in it."""
-    schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}
-    for record in Scan(path, file):
-        if isinstance(record, Schema):
-            schemas[record.id] = record.name
-        elif isinstance(record, Channel):
-            channels[record.id] = record.topic, schemas.get(record.schema_id, "")
-        elif isinstance(record, Message):
-            topic, type = channels[record.channel_id]
-            early = start_ns is not None and record.log_time < start_ns
-            late = end_ns is not None and record.log_time >= end_ns
-            if not early and not late and (topics is None or topic in topics):
-                yield _message(topic, type, record)
+        raise BagError(f"{path} is damaged: {told}{help}") from None
 
 
 def open_sqlite(folder: Path, closing: ExitStack) -> Storage:
@@ -214,9 +137,9 @@ def open_sqlite(folder: Path, closing: ExitStack) -> Storage:
     try:
         reader = Reader(folder)
         reader.open()
-    except (ReaderError, OSError) as error:
+        closing.callback(reader.close)
+    except Exception as error:  # of rosbags, sqlite3, YAML: damaged, or no bag
         raise BagError(f"bag {folder} cannot be read: {error}") from None
-    closing.callback(reader.close)
     topics = []
     for connection in reader.connections:
         assert isinstance(connection.ext, ConnectionExtRosbag2), "a bag of ROS 2"
@@ -240,7 +163,7 @@ def open_sqlite(folder: Path, closing: ExitStack) -> Storage:
             return
         stream = reader.messages(wanted, start=start_ns, stop=end_ns)
         while True:
-            with _damage(folder):
+            with damage(folder, ""):
                 found = next(stream, None)
             if found is None:
                 return

@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import messages, payloads, scenarios, topics
-from uav_dc_ros.bags.definitions import TYPESTORE
-from uav_dc_ros.bags.read import BagMessage, BagReader
+from uav_dc_ros.bags.definitions import TYPESTORE, is_defined_so
+from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import BagError, MessageError, ScenarioError
@@ -148,6 +148,9 @@ class Steps:
         namespace: as `namespace` gives it.
         step_ns: duration of a step: a pose that is later than its step is none of it.
 
+    Raises:
+        BagError: a topic of that name is of another type.
+
     Attributes:
         rejected: messages that could not be read, by topic and reason.
         orphans: messages that came when their step was handed out without them, by topic.
@@ -161,10 +164,10 @@ class Steps:
         self._reader = reader
         self._step_ns = step_ns
         self._topics = {
-            topic.name: name
-            for name in STEP_TOPICS
-            if (topic := reader.topics.get(f"{namespace}/{name}")) and topic.type == topics.TOPICS[name].type
+            f"{namespace}/{name}": name for name in STEP_TOPICS if f"{namespace}/{name}" in reader.topics
         }
+        for full, name in self._topics.items():
+            _expect(reader, reader.topics[full], topics.TOPICS[name].type)
         self._awaited = [name for full, name in self._topics.items() if reader.topics[full].count]
         self._open: dict[Key, RecordedStep] = {}
         self._bytes: dict[Key, int] = {}  # of the messages of open steps
@@ -298,6 +301,20 @@ def _ends(before: messages.Stepped, now: messages.Stepped) -> bool:
     if not isinstance(before, messages.Mission) or not isinstance(now, messages.Mission):
         return False
     return not before.phase.is_over and now == msgspec.structs.replace(before, phase=now.phase) != before
+
+
+def _expect(reader: BagReader, topic: RecordedTopic, type: str) -> None:
+    """Raises BagError for a topic that is not of our type, as ROS 2 Jazzy defines it."""
+    if (topic.type, topic.serialization) != (type, "cdr"):
+        raise BagError(
+            f"bag {reader.path}: topic {topic.name} is of type {topic.type or '(none)'} "
+            f"({topic.serialization or 'no encoding'}); expected {type} (cdr)"
+        )
+    if not is_defined_so(type, topic.encoding, topic.definition):
+        raise BagError(
+            f"bag {reader.path}: topic {topic.name}: its definition of {type} is another one than that of "
+            "ROS 2 Jazzy"
+        )
 
 
 def _pose(message: BagMessage) -> RecordedPose:

@@ -1,0 +1,238 @@
+"""Info: what a bag holds and lacks, for whole and torn bags, ours and others."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+from tests.bags.made import STRING, TYPES, content, text
+from uav_dc_ros import bag as command
+from uav_dc_ros import messages, payloads, scenarios, topics
+from uav_dc_ros.bags.write import BagWriter
+
+N_USERS = 4
+STEP_NS = 15 * 10**9
+
+
+def write_step(
+    bag: BagWriter, mission: int, step: int, *, last: int, log_ns: int, without: tuple[str, ...] = ()
+) -> None:
+    """All messages of a step; the users are collected one after the other."""
+    stamp_ns = (mission * (last + 1) + step) * STEP_NS
+    said: dict[str, messages.Payload] = {
+        "users": messages.Users(
+            mission=mission, step=step, stamp_ns=stamp_ns, cluster=[0] * N_USERS,
+            x_m=[1.0] * N_USERS, y_m=[2.0] * N_USERS,
+        ),
+        "rates": messages.Rates(
+            mission=mission, step=step, sum_rate_bps=0.0, sinr=[0.0] * N_USERS, rate_bps=[0.0] * N_USERS,
+            data_bits=[0.0] * N_USERS, served=[False] * N_USERS,
+            collected=[user < step for user in range(N_USERS)],
+        ),
+        "mission": messages.Mission(
+            mission=mission, step=step,
+            phase=messages.Phase.LANDED if step == last else messages.Phase.READY,
+            cell=(0, 0, 0), remaining_steps=9, seed=7 + mission, scenario="five_clusters",
+            fingerprint=scenarios.load("five_clusters").fingerprint,
+        ),
+    }  # fmt: skip
+    if step < last:
+        said["move"] = messages.Move(mission=mission, step=step, action="left")
+    t = TYPES.types
+    pose = t["geometry_msgs/msg/PoseStamped"](
+        t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](stamp_ns // 10**9, 0), "map"),
+        t["geometry_msgs/msg/Pose"](
+            t["geometry_msgs/msg/Point"](0.0, 0.0, 100.0),
+            t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        ),
+    )
+    serialised = {name: payloads.cdr_of_text(messages.encode(payload)) for name, payload in said.items()}
+    serialised["pose"] = bytes(TYPES.serialize_cdr(pose, topics.POSE))
+    for i, (name, data) in enumerate(serialised.items()):
+        if name not in without:
+            bag.write(f"/{name}", data, log_time_ns=log_ns + i, publish_time_ns=log_ns + i)
+
+
+def diagnostics(name: str, values: dict[str, str]) -> bytes:
+    """A node's diagnostics, serialised."""
+    t = TYPES.types
+    header = t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](0, 0), "")
+    pairs = [t["diagnostic_msgs/msg/KeyValue"](key, value) for key, value in values.items()]
+    status = t["diagnostic_msgs/msg/DiagnosticStatus"](0, name, "active", "uav_dc_ros", pairs)
+    message = t["diagnostic_msgs/msg/DiagnosticArray"](header, [status])
+    return bytes(TYPES.serialize_cdr(message, topics.DIAGNOSTICS))
+
+
+def flown(
+    folder: Path, about: dict[str, str] | None = None, *, without: tuple[str, ...] = (), close: bool = True
+) -> Path:
+    """Two missions of three steps, 0.1 s each, 2 s between them; `without` some in mission 1, step 1."""
+    told = {
+        "version": "0.1.0",
+        "scenario": "five_clusters",
+        "policy": "p",
+        "policy_sha256": "ab12",
+        "seed": "7",
+        "missions": "2",
+    }
+    bag = BagWriter(folder, told | (about or {}))
+    for name in ("pose", "users", "rates", "mission", "move", "diagnostics"):
+        bag.add_topic(f"/{name}", topics.TOPICS[name].type)
+    for mission in range(2):
+        for step in range(4):
+            log_ns = 10**18 + mission * 2_300_000_000 + step * 100_000_000
+            gone = without if (mission, step) == (1, 1) else ()
+            write_step(bag, mission, step, last=3, log_ns=log_ns, without=gone)
+    bag.write(
+        "/diagnostics", diagnostics("observer", {"restarts of policy": "2", "restarts of world": "0"}),
+        log_time_ns=10**18 + 5, publish_time_ns=0,
+    )  # fmt: skip
+    if close:
+        bag.close()
+    return folder
+
+
+def info(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    """What the verb prints."""
+    with pytest.raises(SystemExit) as stopped:
+        command.main(["info", str(path), *options])
+    told = capsys.readouterr()
+    assert (stopped.value.code, told.err) == (0, "")
+    return told.out
+
+
+def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = flown(tmp_path / "bag")
+    before = content(bag)
+    told = json.loads(info(bag, capsys, "--json"))
+    assert (told["complete"], told["problems"], told["recoverable"]) == (True, [], False)
+    assert (told["messages"], told["ros_distro"], told["about"]["policy_sha256"]) == (39, "jazzy", "ab12")
+    assert told["duration_s"] == pytest.approx(2.6, abs=1e-6)
+    assert told["restarts"] == {"policy": 2}
+    assert told["parts"][0]["library"].startswith("uav_dc_ros ")
+    missions = [
+        (m["mission"], m["outcome"], m["steps"], m["collected"], m["users"]) for m in told["missions"]
+    ]
+    assert missions == [(0, "landed", 3, 3, 4), (1, "landed", 3, 3, 4)]
+    assert [(m["seed"], m["missing"]) for m in told["missions"]] == [(7, {}), (8, {})]
+    [users] = [topic for topic in told["topics"] if topic["name"] == "/users"]
+    assert users["mean_hz"] == pytest.approx(7 / 2.6)
+    assert (users["gap_s"], users["gap_at_s"]) == pytest.approx((2.0, 0.3))
+    text = info(bag, capsys)
+    for expected in (
+        "bag complete",
+        "five_clusters (",
+        "p (ab12)",
+        "2: 2 landed; 75.0% of the users",
+        "policy 2",
+        "uav_dc_ros 0.1.0, ROS 2 jazzy",
+        "2.000 s at 0.3 s",
+        "3 of 4",
+    ):
+        assert expected in text
+    assert max(map(len, text.splitlines()[1:])) <= 80
+    assert content(bag) == before
+    info(bag, capsys, "--json", str(tmp_path / "info.json"))
+    assert json.loads((tmp_path / "info.json").read_text()) == told
+
+
+def test_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = flown(
+        tmp_path / "bag", {"missions": "3", "dropped": '{"/pose": 5, "/users": 0}'}, without=("rates", "pose")
+    )
+    (bag / "metadata.yaml").unlink()
+    told = json.loads(info(bag, capsys, "--json"))
+    assert not told["complete"]
+    assert told["problems"] == [
+        "metadata.yaml is missing",
+        "5 messages of /pose were dropped",
+        "steps lack messages: 1 pose, 1 rates",
+        "2 of 3 missions are there to their end",
+    ]
+    assert {topic["name"]: topic["dropped"] for topic in told["topics"]}["/pose"] == 5
+    assert "dropped" in info(bag, capsys)
+
+
+def test_metadata_that_tells_something_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = flown(tmp_path / "bag")
+    shutil.copy(bag / "bag_0.mcap", bag / "bag_1.mcap")
+    assert "metadata.yaml tells other files, or other numbers of messages, than there are" in info(
+        bag, capsys
+    )
+    (bag / "metadata.yaml").write_text("[}")
+    assert "metadata.yaml says nothing of a bag" in info(bag, capsys)
+
+
+def test_a_torn_bag_and_a_damaged_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Told as far as they go, and how to go on."""
+    file = content(flown(tmp_path / "bag"))["bag_0.mcap"]
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(file[:-700])
+    text = info(torn, capsys)
+    assert re.search(r"torn.mcap not complete\n  - torn.mcap has no end: its recorder was killed", text)
+    assert f"python -m uav_dc_ros.bag recover {torn} --out DIR" in text
+    assert "2: 2 landed" in text
+    damaged = bytearray(file)
+    damaged[file.index(b"\4\0\0\0zstd") + 100] ^= 1  # in the only chunk
+    torn.write_bytes(damaged)
+    told = json.loads(info(torn, capsys, "--json"))
+    assert (told["complete"], told["recoverable"], told["messages"]) == (False, True, 0)
+    assert "a chunk whose content is damaged" in told["problems"][0]
+    assert told["about"]["seed"] == "7"
+
+
+def test_a_bag_of_somebody_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "somebody [bold]")
+        schema = writer.register_schema("Thing", "jsonschema", b"{}")
+        channel = writer.register_channel("/a/topic/of/a/very/long/name/" + 80 * "x", "json", schema)
+        for i in range(3):
+            writer.add_message(channel, 10, b"{}", 5, i)  # all at once
+        writer.finish()
+    text = info(path, capsys)
+    assert "foreign.mcap complete" in text
+    assert "written by somebody [bold]" in text
+    assert max(map(len, text.splitlines()[1:])) <= 80
+
+
+@pytest.mark.parametrize(
+    ("type", "definition", "expected"),
+    [
+        ("std_msgs/msg/Int32", b"", "topic /users is of type std_msgs/msg/Int32"),
+        (STRING, b"float64 data", "its definition of std_msgs/msg/String is another one"),
+    ],
+)
+def test_a_topic_of_another_type(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], type: str, definition: bytes, expected: str
+) -> None:
+    path = tmp_path / "odd.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        ours, other = writer.register_schema(STRING, "ros2msg", b"string data"), 0
+        other = writer.register_schema(type, "ros2msg", definition)
+        for topic, schema in (("/mission", ours), ("/users", other)):
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 1, text("x"), 1)
+        writer.finish()
+    assert expected in info(path, capsys).replace("\n", " ")
+
+
+def test_what_is_no_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    (tmp_path / "text.mcap").write_text("hello, world")
+    for name, expected in (
+        ("none", "no such folder"),
+        ("empty.mcap", "is empty"),
+        ("text.mcap", "starts with"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            command.main(["info", str(tmp_path / name)])
+        error = capsys.readouterr().err
+        assert stopped.value.code == 2
+        assert expected in error
+        assert error.count("\n") == 1

@@ -1,0 +1,279 @@
+"""What a bag holds and what it lacks: its topics, its missions, and whether it is complete.
+
+Whole bags and torn ones, ours and others, in two passes: one over all messages, one over the steps.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from uav_dc_ros import topics
+from uav_dc_ros.bags.definitions import TYPESTORE
+from uav_dc_ros.bags.metadata import FILE_NAME, LOST, Part, is_told, read_metadata
+from uav_dc_ros.bags.read import BagMessage, BagReader
+from uav_dc_ros.bags.storage import Storage
+from uav_dc_ros.errors import BagError
+from uav_dc_ros.recordings.missions import MissionSurvey, look_through, mission_problems
+from uav_dc_ros.recordings.steps import namespaces
+
+HARDWARE_ID = "uav_dc_ros"  # of our nodes' diagnostics
+TOLD_MAX = 3  # damaged places of a file that are told one by one
+
+
+@dataclass(kw_only=True)
+class TopicSurvey:
+    """A topic: its messages, and how they follow each other by their log times.
+
+    Attributes:
+        messages: how many.
+        dropped: messages that the recorder heard of, but does not have, as it says itself.
+        first_s, last_s: log times after the bag's first message, seconds; None without messages.
+        mean_hz: messages per second between the first and the last; None below two.
+        gap_s: longest time without a message between two, seconds; None below two.
+        gap_at_s: when it began.
+    """
+
+    name: str
+    type: str
+    messages: int = 0
+    dropped: int = 0
+    first_s: float | None = None
+    last_s: float | None = None
+    mean_hz: float | None = None
+    gap_s: float | None = None
+    gap_at_s: float | None = None
+
+
+@dataclass(kw_only=True)
+class PartSurvey:
+    """A file of a bag; `library` is what wrote it, in its own words."""
+
+    name: str
+    messages: int
+    library: str
+    has_end: bool
+    lost_bytes: int
+
+
+@dataclass(kw_only=True)
+class Survey:
+    """What a bag holds and lacks.
+
+    Attributes:
+        complete: whether nothing is known to be missing.
+        problems: what is missing, a line each.
+        recoverable: whether `recover` makes a whole bag of it.
+        start_ns: log time of the first message, nanoseconds since the epoch.
+        restarts: how often nodes were started again while it was recorded, by node.
+        ros_distro: of metadata.yaml; None without one.
+        about: what our recorder says of the bag.
+    """
+
+    path: str
+    complete: bool = True
+    problems: list[str] = field(default_factory=list)
+    recoverable: bool = False
+    size_bytes: int
+    start_ns: int
+    duration_s: float
+    messages: int
+    parts: list[PartSurvey]
+    topics: list[TopicSurvey]
+    missions: list[MissionSurvey]
+    restarts: dict[str, int]
+    ros_distro: str | None
+    about: dict[str, str]
+
+
+def survey(path: Path) -> Survey:
+    """Look through a bag.
+
+    Raises:
+        BagError: there is no bag, or nothing in it can be read.
+    """
+    try:
+        with BagReader(path) as reader:
+            return _survey(reader, None)
+    except BagError as error:
+        with BagReader(path, torn=True) as reader:
+            if not (reader.topics or reader.about):
+                raise
+            return _survey(reader, error)
+
+
+def _survey(reader: BagReader, error: BagError | None) -> Survey:
+    """Look through an open bag; `error` tells why it had to be opened as far as it goes."""
+    problems: list[str] = []
+    for storage in reader.storages:
+        problems += _damages(storage)
+    recoverable = bool(problems) or error is not None
+    if error is not None and not problems:
+        problems.append(str(error))
+    told = read_metadata(reader.path) if reader.path.is_dir() else None
+    problems += _metadata_problems(reader, told)
+    problems += _lost(reader)
+    dropped = _dropped(reader, problems)
+    found, restarts = _topics(reader, dropped)
+    missions: list[MissionSurvey] = []
+    for namespace in namespaces(reader):
+        missions += look_through(reader, namespace, problems)
+    problems += mission_problems(reader, missions)
+    distro = told.get("ros_distro") if told is not None else None
+    return Survey(
+        path=str(reader.path),
+        complete=not problems,
+        problems=problems,
+        recoverable=recoverable,
+        size_bytes=sum(_size(part) for part in reader.parts),
+        start_ns=reader.first_ns,
+        duration_s=(reader.last_ns - reader.first_ns) / 1e9,
+        messages=reader.message_count,
+        parts=[
+            PartSurvey(
+                name=storage.path.name,
+                messages=sum(topic.count for topic in storage.topics),
+                library=storage.library,
+                has_end=storage.has_end,
+                lost_bytes=sum(damage.n_bytes for damage in storage.damages),
+            )
+            for storage in reader.storages
+        ],
+        topics=found,
+        missions=missions,
+        restarts=restarts,
+        ros_distro=distro if isinstance(distro, str) and distro else None,
+        about=reader.about,
+    )
+
+
+def _damages(storage: Storage) -> Iterator[str]:
+    if not storage.has_end:
+        yield f"{storage.path.name} has no end: its recorder was killed, or still writes it"
+    for damage in storage.damages[:TOLD_MAX]:
+        yield f"{storage.path.name}: {damage.n_bytes:,} bytes lost at byte {damage.at:,}: {damage.why}"
+    if len(storage.damages) > TOLD_MAX:
+        n_bytes = sum(damage.n_bytes for damage in storage.damages[TOLD_MAX:])
+        n_places = len(storage.damages) - TOLD_MAX
+        yield f"{storage.path.name}: {n_bytes:,} bytes lost at {n_places:,} places more"
+
+
+def _metadata_problems(reader: BagReader, told: dict[str, Any] | None) -> Iterator[str]:
+    """A folder's metadata.yaml must tell its parts; one MCAP file needs none, and SQLite is read by it."""
+    if not reader.path.is_dir() or reader.parts == (reader.path,):
+        return
+    if told is None:
+        there = (reader.path / FILE_NAME).exists()
+        yield f"{FILE_NAME} {'says nothing of a bag' if there else 'is missing'}"
+        return
+    parts = []
+    for storage in reader.storages:
+        part = Part(storage.path.name)
+        for topic in storage.topics:
+            part.topics[topic.name] = {"offered_qos_profiles": []}
+            part.counts[topic.name] = part.counts.get(topic.name, 0) + topic.count
+        parts.append(part)
+    if not is_told(reader.path, parts):
+        yield f"{FILE_NAME} tells other files, or other numbers of messages, than there are"
+
+
+def _lost(reader: BagReader) -> Iterator[str]:
+    """What was lost before the bag was recovered."""
+    for storage in reader.storages:
+        if LOST in storage.about:
+            yield f"{storage.path.name} was recovered, without {storage.about[LOST][:40]} bytes of its source"
+
+
+def _dropped(reader: BagReader, problems: list[str]) -> Counter[str]:
+    """Messages dropped by topic, as the recorder of each part says of it."""
+    total: Counter[str] = Counter()
+    for storage in reader.storages:
+        text = storage.about.get("dropped")
+        if text is None:
+            continue
+        try:
+            total.update(msgspec.json.decode(text, type=dict[str, int]))
+        except msgspec.DecodeError:
+            problems.append(f"{storage.path.name}: dropped is {text[:40]!r}; expected numbers by topic")
+    problems += [f"{n:,} messages of {topic} were dropped" for topic, n in sorted(total.items()) if n]
+    return total
+
+
+@dataclass
+class _Pace:
+    """How the messages of a topic follow each other; log times in nanoseconds since the epoch."""
+
+    n: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    gap_ns: int = -1
+    gap_at_ns: int = 0
+
+    def add(self, log_time_ns: int) -> None:
+        if self.n == 0:
+            self.first_ns = self.last_ns = log_time_ns
+        elif log_time_ns - self.last_ns > self.gap_ns:
+            self.gap_ns, self.gap_at_ns = log_time_ns - self.last_ns, self.last_ns
+        self.last_ns = max(self.last_ns, log_time_ns)
+        self.n += 1
+
+
+def _topics(reader: BagReader, dropped: Counter[str]) -> tuple[list[TopicSurvey], dict[str, int]]:
+    """One pass over all messages: the pace of each topic, and the restarts that diagnostics tell."""
+    paces = {name: _Pace() for name in reader.topics}
+    restarts: dict[str, int] = {}
+    for message in reader.messages():
+        paces[message.topic].add(message.log_time_ns)
+        if message.type == topics.DIAGNOSTICS:
+            for node, n in _restarts(message):
+                restarts[node] = max(n, restarts.get(node, 0))
+    found = []
+    for name in sorted({*reader.topics, *dropped}):
+        pace = paces.get(name, _Pace())
+        topic = TopicSurvey(
+            name=name,
+            type=reader.topics[name].type if name in reader.topics else "",
+            messages=pace.n,
+            dropped=dropped[name],
+        )
+        if pace.n:
+            topic.first_s = (pace.first_ns - reader.first_ns) / 1e9
+            topic.last_s = (pace.last_ns - reader.first_ns) / 1e9
+        if pace.n > 1:
+            span_ns = pace.last_ns - pace.first_ns
+            topic.mean_hz = (pace.n - 1) * 1e9 / span_ns if span_ns else None
+            topic.gap_s, topic.gap_at_s = pace.gap_ns / 1e9, (pace.gap_at_ns - reader.first_ns) / 1e9
+        found.append(topic)
+    return found, {node: n for node, n in sorted(restarts.items()) if n}
+
+
+def _restarts(message: BagMessage) -> Iterator[tuple[str, int]]:
+    """Nodes that a diagnostics message tells of, and how often each was started again."""
+    try:
+        array: Any = TYPESTORE.deserialize_cdr(message.data, topics.DIAGNOSTICS)
+    except Exception:  # of struct, numpy, rosbags: another one's bytes are not ours to judge
+        return
+    namespace = message.topic.removesuffix("/diagnostics").removeprefix("/")
+    prefix = f"{namespace}/" if namespace else ""
+    for status in array.status:
+        if status.hardware_id != HARDWARE_ID:
+            continue
+        for pair in status.values:
+            if pair.key == "restarts" and pair.value.isdecimal():
+                yield prefix + status.name, int(pair.value)
+            elif pair.key.startswith("restarts of ") and pair.value.isdecimal():
+                yield prefix + pair.key.removeprefix("restarts of "), int(pair.value)
+
+
+def _size(part: Path) -> int:
+    files = part.glob("*") if part.is_dir() else [part]
+    return sum(file.stat().st_size for file in files)
+
+
+def start_text(start_ns: int) -> str:
+    """The date and time of a log time, UTC."""
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(start_ns // 10**9))
