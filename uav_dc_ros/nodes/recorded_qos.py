@@ -21,9 +21,9 @@ from uav_dc_ros.nodes.qos import HISTORY_BYTES, HISTORY_LEAST
 
 # Depth of a publisher whose own one is not known, as most recorders leave it: discovery does not carry it.
 UNKNOWN_DEPTH = 10  # rosbag2's
-ALL_DEPTH = 5000  # of a publisher that kept all: Fast DDS keeps no more
-# What is not acknowledged yet has to be kept. Fast DDS acknowledges after 5 ms, or a little later.
-WINDOW = 1000
+# What is not acknowledged yet has to be kept. Fast DDS acknowledges after 5 ms, or a little later; with 1000
+# messages half as many arrived in a second as with so many.
+WINDOW = 5000
 ACKNOWLEDGE_S = 0.02
 FOREVER_S = 2**31 - 1  # and more: what recorders write for "no limit"; so is 0
 
@@ -70,7 +70,7 @@ def profile(topic: RecordedTopic, *, message_bytes: int, per_s: float) -> QoSPro
 
 def _depth(offer: Qos) -> int:
     if offer.history == QosHistory.KEEP_ALL:
-        return ALL_DEPTH
+        return WINDOW
     return offer.depth if offer.history == QosHistory.KEEP_LAST and offer.depth > 0 else UNKNOWN_DEPTH
 
 
