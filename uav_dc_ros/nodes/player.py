@@ -287,5 +287,5 @@ class Player:
             self._tick(now_s, GRAPH_IDLE_S)
             self._heed(self._keys.wait(TICK_S))
         self._waits = False
-        for told in self._audience.others():
+        for told in (*self._audience.others(), *self._audience.deaf()):
             self.display.note(told)
