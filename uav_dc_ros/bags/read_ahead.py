@@ -7,6 +7,7 @@ would be late with the second one.
 import contextlib
 import queue
 import threading
+import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +18,7 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 BATCH = 256  # messages that are handed over at once
 BATCH_BYTES = 2**20
 BATCHES = 16  # read ahead
+FILL_S = 0.5  # to read that much at the start, at most
 LOOK_S = 0.1  # how soon the thread sees that nobody wants more
 
 
@@ -38,8 +40,11 @@ class ReadAhead:
         self._thread = threading.Thread(target=self._read, daemon=True)
 
     def __enter__(self) -> Self:
-        """Start to read."""
+        """Start to read; the first messages lie ready, so that reading does not compete with playing them."""
         self._thread.start()
+        deadline_s = time.monotonic() + FILL_S
+        while self._thread.is_alive() and not self._batches.full() and time.monotonic() < deadline_s:
+            time.sleep(0.002)
         return self
 
     def __exit__(

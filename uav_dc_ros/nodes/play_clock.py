@@ -37,6 +37,7 @@ class PlayClock:
 
     @rate.setter
     def rate(self, rate: float) -> None:
+        """Run at another rate from here on."""
         self.jump(self.position_ns())
         self._rate = rate
 

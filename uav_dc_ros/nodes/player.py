@@ -153,6 +153,7 @@ class Player:
         with ReadAhead(
             self.plan.path, list(self.outlets), start_ns=self._start_ns, end_ns=self._end_ns
         ) as messages:
+            self.clock.jump(self._start_ns)  # reading the beginning took no time of the bag
             for message in messages:
                 if self.outlets[message.topic].repeats(message):
                     continue
