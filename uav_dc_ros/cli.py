@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from uav_dc_ros.errors import UavDcError
 
 # What a shell says of a command that Ctrl-C ended.
 INTERRUPTED = 130
+NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")  # between the slashes of a ROS name
 
 
 class Parser(argparse.ArgumentParser):
@@ -43,6 +45,17 @@ def whole_number(least: int) -> Callable[[str], int]:
 
 
 count = whole_number(1)
+
+
+def namespace(text: str) -> str:
+    """The type of an option that is a ROS namespace: absolute, and only the root ends with a slash."""
+    names = text.strip("/").split("/")
+    if text != "/" and not all(NAME.fullmatch(name) for name in names):
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; expected a ROS namespace: letters, digits and single '_', beginning with a letter, "
+            "with '/' between parts"
+        )
+    return "/" + "/".join(names)
 
 
 def run(command: Callable[[], int], prog: str) -> NoReturn:

@@ -4,8 +4,6 @@ python -m uav_dc_ros.run_all --scenario five_clusters --seed 3
 """
 
 import argparse
-import os
-import re
 from pathlib import Path
 from typing import NoReturn
 
@@ -14,10 +12,8 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
 
 PROG = "python -m uav_dc_ros.run_all"
-DOMAIN_MAX = 232  # the ports of higher ones do not exist
 PORT_MAX = 65535
 LIVE_PORT = 8765  # Foxglove's own default
-NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")
 WATCHABLE_PACE = 90.0  # a mission of sixty steps of 15 s in ten seconds
 
 
@@ -67,7 +63,7 @@ def parser() -> cli.Parser:
     recording.add_argument("--no-record", action="store_true", help="fly without a bag")
     options.add_argument(
         "--namespace",
-        type=_namespace,
+        type=cli.namespace,
         default="/",
         metavar="NS",
         help="namespace of the mission: several fly side by side on one network, each in its own",
@@ -96,7 +92,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     options = parser().parse_args(arguments)
 
     def command() -> int:
-        _prepare_ros(alone=options.nodes is None)  # before it is imported
+        from uav_dc_ros.nodes import environment
+
+        environment.prepare(alone=options.nodes is None)  # before ROS is imported
         from uav_dc_ros.nodes.flight import Flight
 
         return Flight(options).run()
@@ -104,41 +102,11 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     cli.run(command, PROG)
 
 
-def _prepare_ros(*, alone: bool) -> None:
-    """What holds for this command and its nodes, unless the user's environment says otherwise.
-
-    Args:
-        alone: do all nodes run on this host?
-
-    Raises:
-        ParameterError: an environment in which ROS cannot start.
-    """
-    domain = os.environ.get("ROS_DOMAIN_ID", "0")
-    if not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
-        raise ParameterError(f"ROS_DOMAIN_ID is {domain!r}; expected a whole number from 0 to {DOMAIN_MAX}")
-    # Nobody else on the network should see these nodes by accident.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST" if alone else "SUBNET")
-    os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "{severity}: {message}")
-    from uav_dc_ros.nodes import fastdds
-
-    fastdds.use_profiles()
-
-
 def _pace(text: str) -> float | None:
     try:
         return pace.parse(text)
     except ParameterError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _namespace(text: str) -> str:
-    names = text.strip("/").split("/")
-    if text != "/" and not all(NAME.fullmatch(name) for name in names):
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; expected a ROS namespace: letters, digits and single '_', beginning with a letter, "
-            "with '/' between parts"
-        )
-    return "/" + "/".join(names)
 
 
 def _names(text: str) -> list[str]:

@@ -18,7 +18,7 @@ REFRESH_S = 0.05
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
 
 
-class _Console(Console):
+class QuietConsole(Console):
     """A console that falls silent when nobody reads it any more (`| head`): the mission flies on."""
 
     def on_broken_pipe(self) -> None:
@@ -38,7 +38,7 @@ class Display:
     def __init__(self, scenario: Scenario, missions: int) -> None:
         self.scenario = scenario
         self.missions = missions
-        self.console = _Console(highlight=False, soft_wrap=True)
+        self.console = QuietConsole(highlight=False, soft_wrap=True)
         self.errors = Console(stderr=True, highlight=False, soft_wrap=True)
         self._every = max(1, scenario.mission.max_steps // PLAIN_LINES)
         self._bar = Progress(

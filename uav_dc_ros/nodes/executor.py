@@ -91,7 +91,10 @@ class DirectExecutor:
         self._subscriptions = subscriptions
 
     def _take_what_comes(self) -> bool:
-        """Wait for messages, and handle them; False if none came within `BUSY_S`, or somebody wakes us."""
+        """Wait for messages, and handle them; False if none came within `BUSY_S`.
+
+        Whoever wakes us has ended this wait: no other may follow before `spin` has looked at its condition.
+        """
         wait_set = self._few
         wait_set.clear_entities()
         for subscription in self._subscriptions:
@@ -103,7 +106,7 @@ class DirectExecutor:
         ]
         for subscription in ready:
             self._take_messages(subscription)
-        return bool(ready) and not wait_set.is_ready("guard_condition", 0)
+        return bool(ready) or wait_set.is_ready("guard_condition", 0)
 
     def _look_at_all(self, timeout_s: float | None) -> None:
         """Wait for anything, and handle it."""

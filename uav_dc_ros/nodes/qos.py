@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
@@ -45,6 +46,12 @@ UNKNOWN = "UNKNOWN_"  # in a name that the graph does not know yet
 OVERRIDES = QoSOverridingOptions(
     [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY]
 )
+
+
+def type_name(message: Any) -> str:
+    """The ROS name of a message class, such as `std_msgs/msg/String`."""
+    package, kind, *_ = message.__module__.split(".")
+    return f"{package}/{kind}/{message.__name__}"
 
 
 def offered(topic: Topic, message_bytes: int = 0) -> QoSProfile:
@@ -104,7 +111,7 @@ def _mismatch(
     peer = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     if UNKNOWN in peer:
         return  # found so lately that nobody knows its name yet
-    kind = next(name for name, type in MESSAGE_TYPES.items() if type is ours.msg_type)
+    kind = type_name(ours.msg_type)
     if end.topic_type != kind:
         yield ours.topic_name, peer, f"its type is {end.topic_type}; expected {kind}"
         return

@@ -1,0 +1,49 @@
+"""Who else is there while a bag is played: subscribers, those that cannot hear, other publishers."""
+
+from collections.abc import Collection, Iterator
+
+from rclpy.node import Node
+
+from uav_dc_ros.nodes import qos
+from uav_dc_ros.nodes.outlet import Outlet
+
+
+class Audience:
+    """Looks at the graph around some outlets.
+
+    Args:
+        node: that publishes.
+        outlets: its outlets.
+    """
+
+    def __init__(self, node: Node, outlets: Collection[Outlet]) -> None:
+        self._node = node
+        self._outlets = outlets
+        self._told: set[tuple[str, str]] = set()
+
+    def counts(self) -> dict[str, int]:
+        """Number of subscribers that hear, by published topic."""
+        return {outlet.name: outlet.publisher.get_subscription_count() for outlet in self._outlets}
+
+    def subscribers(self, outlet: Outlet) -> str:
+        """Full names of the nodes that subscribe to an outlet's topic."""
+        ends = self._node.get_subscriptions_info_by_topic(outlet.name)
+        return ", ".join(sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends))
+
+    def others(self) -> Iterator[str]:
+        """What is to be told of topics that somebody else publishes, too: two worlds at once help nobody."""
+        names = [outlet.name for outlet in self._outlets]
+        for name in dict.fromkeys(names):
+            if self._node.count_publishers(name) > names.count(name):
+                ends = self._node.get_publishers_info_by_topic(name)
+                nodes = {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}
+                others = sorted(nodes - {self._node.get_fully_qualified_name()})
+                yield f"topic {name} is published by {', '.join(others) or 'another player'}, too"
+
+    def deaf(self) -> Iterator[str]:
+        """What is to be told of subscribers that cannot hear, of each once."""
+        publishers = [outlet.publisher for outlet in self._outlets]
+        for topic, peer, why in qos.incompatible(self._node, publishers, ()):
+            if (topic, peer) not in self._told:
+                self._told.add((topic, peer))
+                yield f"{peer} does not hear {topic}: {why}"
