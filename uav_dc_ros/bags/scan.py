@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
-from uav_dc_ros.bags.metadata import METADATA_NAME, Part
+from uav_dc_ros.bags.metadata import Part, is_latched
 from uav_dc_ros.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -84,6 +84,7 @@ class Scan:
         self._file = file
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, str] = {}
+        self._latched: set[str] = set()
 
     def __iter__(self) -> Iterator[McapRecord]:
         """Start at the beginning of the file; once."""
@@ -139,8 +140,11 @@ class Scan:
             if channel not in self._channels:
                 self.lost_bytes += _FRAME.size + len(content)
                 return
-            self.part.count(self._channels[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+            topic = self._channels[channel]
+            self.part.count(topic, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
             data = content[_MESSAGE.size :]
+            if topic in self._latched:
+                self.part.latest[topic] = data, publish_time_ns
             yield Message(channel, log_time_ns, data, publish_time_ns, sequence)
             return
         read = _READERS.get(Opcode(opcode)) if opcode in Opcode._value2member_map_ else None
@@ -166,8 +170,10 @@ class Scan:
             self._channels[record.id] = record.topic
             type = self._schemas[record.schema_id]
             self.part.announce(record.topic, type, record.message_encoding, record.metadata)
-        elif isinstance(record, Metadata) and record.name == METADATA_NAME:
-            self.part.about |= record.metadata
+            if is_latched(self.part.topics[record.topic]):
+                self._latched.add(record.topic)
+        elif isinstance(record, Metadata):
+            self.part.learn(record.name, record.metadata)
         return True
 
 

@@ -13,7 +13,7 @@ from rosbags.interfaces import ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from uav_dc_ros.bags.metadata import METADATA_NAME, to_yaml
+from uav_dc_ros.bags.metadata import Part, to_yaml
 from uav_dc_ros.bags.part import part_paths
 from uav_dc_ros.bags.scan import MAGIC, Scan, has_end
 from uav_dc_ros.errors import BagError, UavDcError
@@ -64,7 +64,10 @@ class RecordedTopic:
 
 @dataclass(kw_only=True)
 class Storage:
-    """A storage file: what it holds, and its messages between two log times (the second one excluded)."""
+    """A storage file: what it holds, and its messages between two log times (the second one excluded).
+
+    `about` and `dropped` are those of `metadata.Part`.
+    """
 
     path: Path
     topics: list[RecordedTopic]
@@ -72,6 +75,7 @@ class Storage:
     last_ns: int
     messages: Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
     about: dict[str, str] = field(default_factory=dict)
+    dropped: dict[str, int] | None = None
 
 
 def storage_files(path: Path) -> list[Path]:
@@ -108,8 +112,13 @@ def _damage(path: Path) -> Iterator[None]:
         ) from None
 
 
-def open_mcap(path: Path, file: IO[bytes]) -> Storage:
+def open_mcap(path: Path, file: IO[bytes], *, repeats: bool = True) -> Storage:
     """An MCAP file that has its end.
+
+    Args:
+        path: the file's.
+        file: open for reading.
+        repeats: give the latched messages at its head that an earlier file of the bag holds already?
 
     Raises:
         BagError: no MCAP file, one without its end, or a damaged one.
@@ -129,15 +138,17 @@ def open_mcap(path: Path, file: IO[bytes]) -> Storage:
         summary = reader.get_summary()
         if summary is None or summary.statistics is None:
             raise McapError("its summary has no statistics")
-        about: dict[str, str] = {}
+        told = Part(path.name)
         for metadata in reader.iter_metadata():
-            if metadata.name == METADATA_NAME:
-                about |= metadata.metadata
+            told.learn(metadata.name, metadata.metadata)
+        left_out = {} if repeats else told.repeated
         statistics = summary.statistics
         topics = [
             _topic(channel, summary.schemas.get(channel.schema_id), statistics.channel_message_counts)
             for channel in summary.channels.values()
         ]
+        for topic in topics:
+            topic.count -= left_out.get(topic.name, 0)
 
     def messages(
         topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
@@ -153,6 +164,8 @@ def open_mcap(path: Path, file: IO[bytes]) -> Storage:
             if found is None:
                 return
             schema, channel, message = found
+            if message.sequence == 0 and channel.topic in left_out:
+                continue
             yield _message(channel.topic, schema.name if schema else "", message)
 
     return Storage(
@@ -161,7 +174,8 @@ def open_mcap(path: Path, file: IO[bytes]) -> Storage:
         first_ns=statistics.message_start_time,
         last_ns=statistics.message_end_time,
         messages=messages,
-        about=about,
+        about=told.about,
+        dropped=told.dropped,
     )
 
 
