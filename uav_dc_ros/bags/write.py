@@ -10,9 +10,8 @@ first new message, and the sequence 0; a metadata record counts them.
 """
 
 import os
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Self
@@ -22,35 +21,11 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 
 from uav_dc_ros.bags import definitions
 from uav_dc_ros.bags.mend import mend_parts
-from uav_dc_ros.bags.metadata import (
-    DROPPED_NAME,
-    FILE_NAME,
-    METADATA_NAME,
-    REPEATED_NAME,
-    Part,
-    is_latched,
-    to_yaml,
-    total,
-    write_metadata,
-)
-from uav_dc_ros.bags.part import CHUNK_BYTES, FolderLock, PartWriter, number, part_paths
+from uav_dc_ros.bags.metadata import FILE_NAME, Part, is_latched, to_yaml, total, write_metadata
+from uav_dc_ros.bags.part import FolderLock, part_paths
+from uav_dc_ros.bags.series import PartSeries, Row
 from uav_dc_ros.bags.sync import DiskSync
 from uav_dc_ros.errors import BagError
-
-CHUNKS_OF_A_PART = 8  # at least, so that its size comes near to what was asked for
-CHUNK_LEAST_BYTES = 1024
-
-
-@dataclass
-class _Row:
-    """A topic of the bag: how it is announced, and, if it is latched, its last messages with publish time."""
-
-    type: str
-    definition: bytes
-    channel: Mapping[str, str]
-    latest: deque[tuple[bytes, int]] | None
-    sequence: int
-    number: int = field(default=0)
 
 
 class BagWriter:
@@ -82,14 +57,6 @@ class BagWriter:
         split_s: float = 0.0,
     ) -> None:
         self.folder = folder
-        self._about = dict(about)
-        self._compression = compression
-        self._split_bytes = split_bytes
-        self._split_ns = round(split_s * 1e9)
-        self._rows: dict[str, _Row] = {}
-        self._parts: list[Part] = []  # that are closed
-        self._dropped_before: Counter[str] = Counter()  # in closed parts, since this writer began
-        self._counts_dropped = False
         self._disk = DiskSync()
         if not resume:
             if folder.exists():
@@ -100,52 +67,42 @@ class BagWriter:
                 raise BagError(f"bag folder {folder} cannot be made: {error.strerror}") from None
         self._lock = FolderLock(folder)
         try:
-            if resume:
-                self._parts = _earlier_parts(folder)
-            self._resumed = total(self._parts)
-            self._begin()
+            earlier = _earlier_parts(folder) if resume else []
+            self._resumed = total(earlier)
+            try:
+                self._parts = PartSeries(
+                    folder,
+                    about,
+                    earlier,
+                    compression=compression,
+                    split_bytes=split_bytes,
+                    split_ns=round(split_s * 1e9),
+                )
+            except OSError as error:
+                raise BagError(f"bag {folder} cannot be written: {error.strerror}") from None
         except BaseException:
             self._lock.release()
             raise
 
-    def _begin(self) -> None:
-        """Begin the next part."""
-        n = max((number(self.folder / part.name) for part in self._parts), default=-1) + 1
-        small = self._split_bytes // CHUNKS_OF_A_PART if self._split_bytes else CHUNK_BYTES
-        self._chunk_bytes = min(CHUNK_BYTES, max(small, CHUNK_LEAST_BYTES))
-        self._begun_ns: int | None = None  # log time of its first message
-        self._unlooked_bytes = 0  # written since its size was looked at
-        self._schemas: dict[str, int] = {}
-        self._head: list[str] = []  # topics of which it has yet to repeat the last messages
-        try:
-            self._writer = PartWriter(
-                self.folder / f"{self.folder.name}_{n}.mcap",
-                compression=self._compression,
-                chunk_bytes=self._chunk_bytes,
-            )
-            self._writer.add_metadata(METADATA_NAME, self._about)
-        except OSError as error:
-            raise BagError(f"bag {self.folder} cannot be written: {error.strerror}") from None
-
     @property
     def message_count(self) -> int:
         """Messages in the bag so far, those of earlier parts and repeated ones included."""
-        return sum(part.message_count for part in self._parts) + self._writer.part.message_count
+        return sum(part.message_count for part in self._parts.all)
 
     @property
     def closed(self) -> bool:
         """Whether it was closed, or given up."""
-        return self._writer.closed
+        return self._parts.current.closed
 
     @property
     def topics(self) -> list[str]:
         """Topics that were added, by full name."""
-        return list(self._rows)
+        return list(self._parts.rows)
 
     @property
     def part_count(self) -> int:
         """Parts of the bag so far."""
-        return len(self._parts) + 1
+        return len(self._parts.all)
 
     @property
     def already_written(self) -> Mapping[str, int]:
@@ -191,34 +148,23 @@ class BagWriter:
         if not definition:
             definition = _definition(name, type)
             type_hash = definitions.TYPESTORE.hash_rihs01(type)
-        row = _Row(
-            type,
-            definition,
-            {"offered_qos_profiles": to_yaml(qos), "topic_type_hash": type_hash},
-            deque(maxlen=len(qos)) if is_latched({"offered_qos_profiles": qos}) else None,
-            self._resumed.counts.get(name, 0) - self._resumed.repeated.get(name, 0),
+        row = Row(
+            type=type,
+            definition=definition,
+            channel={"offered_qos_profiles": to_yaml(qos), "topic_type_hash": type_hash},
+            latest=deque(maxlen=len(qos)) if is_latched({"offered_qos_profiles": qos}) else None,
+            sequence=self._resumed.counts.get(name, 0) - self._resumed.repeated.get(name, 0),
         )
         if row.latest is not None and name in self._resumed.latest:
             row.latest.append(self._resumed.latest[name])
-        self._announce(name, row)
-        self._rows[name] = row
-
-    def _announce(self, name: str, row: _Row) -> None:
-        """Enter a topic into the part."""
         try:
-            if row.type not in self._schemas:
-                self._schemas[row.type] = self._writer.add_schema(
-                    row.type, definitions.ENCODING, row.definition
-                )
-            row.number = self._writer.add_channel(name, "cdr", self._schemas[row.type], row.channel)
+            self._parts.add(name, row)
         except OSError as error:  # a definition may be what fills the chunk
             raise self._failure(error) from None
-        if row.latest:
-            self._head.append(name)
 
     def keep_latched(self, topic: str, n: int) -> None:
         """Repeat the last `n` messages of a latched topic at the head of the next part: one a publisher."""
-        row = self._rows[topic]
+        row = self._parts.rows[topic]
         if row.latest is not None and row.latest.maxlen != n > 0:
             row.latest = deque(row.latest, maxlen=n)
 
@@ -234,77 +180,10 @@ class BagWriter:
         Raises:
             BagError: the disk is full, or gone.
         """
-        row = self._rows[topic]
         try:
-            if self._begun_ns is None:
-                self._begun_ns = log_time_ns
-            elif (self._split_ns or self._split_bytes) and self._is_full(log_time_ns, len(data)):
-                self._split()
-                self._begun_ns = log_time_ns
-            if self._head:
-                self._repeat(log_time_ns)
-            row.sequence += 1
-            self._writer.add_message(
-                row.number,
-                data,
-                log_time_ns=log_time_ns,
-                publish_time_ns=publish_time_ns,
-                sequence=row.sequence,
-            )
+            self._parts.write(topic, data, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
         except OSError as error:
             raise self._failure(error) from None
-        if row.latest is not None:
-            row.latest.append((data, publish_time_ns))
-
-    def _is_full(self, log_time_ns: int, size: int) -> bool:
-        """Whether the part has reached one of its limits."""
-        assert self._begun_ns is not None, "it has a message"
-        if self._split_ns and log_time_ns - self._begun_ns >= self._split_ns:
-            return True
-        if not self._split_bytes:
-            return False
-        self._unlooked_bytes += size
-        if self._unlooked_bytes < self._chunk_bytes:  # no more than that was finished meanwhile
-            return False
-        self._unlooked_bytes = 0
-        return self._writer.size >= self._split_bytes
-
-    def _split(self) -> None:
-        """End the part, and begin the next one with the same topics."""
-        self._writer.finish()
-        self._parts.append(self._writer.part)
-        self._dropped_before.update(self._writer.part.dropped or {})
-        self._begin()
-        if self._counts_dropped:
-            self._writer.add_metadata(DROPPED_NAME, {})
-        for name, row in self._rows.items():
-            self._announce(name, row)
-
-    def _repeat(self, log_time_ns: int) -> None:
-        """Write the last messages of latched topics at the head of a part."""
-        rows = {name: self._rows[name] for name in self._head}
-        self._head.clear()
-        counts = {name: str(len(row.latest or ())) for name, row in rows.items()}
-        self._writer.add_metadata(REPEATED_NAME, counts)
-        for row in rows.values():
-            for data, publish_time_ns in row.latest or ():
-                self._writer.add_message(
-                    row.number, data, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns, sequence=0
-                )
-
-    def tell_dropped(self, dropped: Mapping[str, int]) -> None:
-        """Note how many messages of each topic were lost by now, since this writer began.
-
-        Raises:
-            BagError: the disk is full, or gone.
-        """
-        here = {topic: n - self._dropped_before[topic] for topic, n in dropped.items()}
-        told = self._writer.part.dropped
-        news = {topic: str(n) for topic, n in here.items() if n != (told or {}).get(topic, 0)}
-        if not news and told is not None:
-            return
-        self._counts_dropped = True
-        self._add_metadata(DROPPED_NAME, news)
 
     def tell(self, about: Mapping[str, str]) -> None:
         """Add to what the bag is about.
@@ -312,12 +191,19 @@ class BagWriter:
         Raises:
             BagError: the disk is full, or gone.
         """
-        self._about |= about
-        self._add_metadata(METADATA_NAME, about)
-
-    def _add_metadata(self, name: str, content: Mapping[str, str]) -> None:
         try:
-            self._writer.add_metadata(name, content)
+            self._parts.tell(about)
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def tell_dropped(self, dropped: Mapping[str, int]) -> None:
+        """Note how many messages of each topic were lost by now, since this writer began.
+
+        Raises:
+            BagError: the disk is full, or gone.
+        """
+        try:
+            self._parts.tell_dropped(dropped)
         except OSError as error:
             raise self._failure(error) from None
 
@@ -331,10 +217,10 @@ class BagWriter:
             BagError: the disk is full, or gone.
         """
         try:
-            self._writer.flush()
+            self._parts.current.flush()
             if self._disk.is_free:
                 folder = os.open(self.folder, os.O_RDONLY)  # the names of new parts, too
-                self._disk.begin([self._writer.descriptor(), folder])
+                self._disk.begin([self._parts.current.descriptor(), folder])
         except OSError as error:
             raise self._failure(error) from None
 
@@ -344,12 +230,12 @@ class BagWriter:
         Raises:
             BagError: the disk is full, or gone.
         """
-        if self._writer.closed:
+        if self.closed:
             return
         try:
             self._disk.wait()
-            self._writer.finish()
-            write_metadata(self.folder, [*self._parts, self._writer.part])
+            self._parts.current.finish()
+            write_metadata(self.folder, self._parts.all)
         except OSError as error:
             raise self._failure(error) from None
         finally:
@@ -358,7 +244,7 @@ class BagWriter:
 
     def _failure(self, error: OSError) -> BagError:
         """Give the file up as it is: what was written until now stays."""
-        self._writer.abandon()
+        self._parts.current.abandon()
         self._disk.close()
         self._lock.release()
         return BagError(
