@@ -140,15 +140,16 @@ class DirectExecutor:
     def _take_messages(self, subscription: Any) -> None:
         handle = subscription.handle
         with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
-        for _ in range(self._at_once):
-            taken = handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                return
-            self._heard_s = time.monotonic()
-            if with_info:
-                subscription.callback(*taken)
-            else:
-                subscription.callback(taken[0])
+        with handle:  # raises InvalidHandle, if it was destroyed since it became ready
+            for _ in range(self._at_once):
+                taken = handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
+                    return
+                self._heard_s = time.monotonic()
+                if with_info:
+                    subscription.callback(*taken)
+                else:
+                    subscription.callback(taken[0])
         self._behind = True
 
     def _emptied(self, *capacity: int) -> Any:

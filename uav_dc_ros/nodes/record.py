@@ -8,9 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import rclpy
+from rclpy.exceptions import InvalidNamespaceException
+from rclpy.validate_namespace import validate_namespace
 
 from uav_dc_ros import __version__, cli
 from uav_dc_ros.bags.part import COMPRESSIONS
+from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.nodes import parameters as p
 from uav_dc_ros.nodes import runtime
 from uav_dc_ros.nodes.recording import BagNode
@@ -89,5 +92,11 @@ def run(options: argparse.Namespace) -> int:
         "compression": options.compression,
         "min_free_bytes": options.min_free_bytes,
     }
-    remapped = ["--ros-args", "-r", f"__ns:={'/' + options.namespace.strip('/')}"]
+    namespace = "/" + options.namespace.strip("/")
+    try:
+        validate_namespace(namespace)
+    except InvalidNamespaceException as error:
+        told = str(error).splitlines()[0]
+        raise ParameterError(f"--namespace {options.namespace!r}: {told}; expected a ROS namespace") from None
+    remapped = ["--ros-args", "-r", f"__ns:={namespace}"]
     runtime.main(lambda: Record(values), remapped)
