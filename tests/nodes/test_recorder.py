@@ -111,6 +111,7 @@ def test_whatever_is_published_is_recorded_also_late_and_with_its_qos(ros: Ros) 
     assert custom(bag)["dropped"] == "{}"
 
 
+@pytest.mark.long
 def test_topics_by_list_and_a_namespace(ros: Ros) -> None:
     recorder = record(ros, "--namespace", "/uav1", "--topics", "a,/elsewhere/b,never", "--compression", "lz4")
     talker = talk(ros, *({"topic": t, "n": 5} for t in ("/uav1/a", "/elsewhere/b")), {
@@ -126,6 +127,7 @@ def test_topics_by_list_and_a_namespace(ros: Ros) -> None:
     assert json.loads(custom(ros.folder / "bag")["not_recorded"]) == {"/uav1/never": "nobody published it"}
 
 
+@pytest.mark.long
 def test_a_publisher_that_offers_less_is_heard_too_and_nothing_twice(ros: Ros) -> None:
     recorder = record(ros)
     talker = talk(
@@ -163,7 +165,7 @@ def test_a_kill_takes_the_last_second_at_most(ros: Ros) -> None:
     assert told == list(range(len(told)))
 
 
-@pytest.mark.parametrize("reliable", [False, True])
+@pytest.mark.parametrize("reliable", [pytest.param(False, marks=pytest.mark.long), True])
 def test_every_dropped_message_is_counted(ros: Ros, reliable: bool) -> None:
     """A recorder that stands still for a while gets more than its middleware can hold for it."""
     recorder = record(ros)
@@ -185,12 +187,12 @@ def test_every_dropped_message_is_counted(ros: Ros, reliable: bool) -> None:
     assert dropped is not None
     assert dropped.keys() == {"/a"}
     assert dropped["/a"] > 500
-    print(recorded, dropped)
     assert recorded + dropped["/a"] == told["/a"] == 12_000
     assert json.loads(custom(ros.folder / "bag")["dropped"]) == dropped
     assert f"dropped messages: /a {dropped['/a']}" in output
 
 
+@pytest.mark.long
 def test_recording_stops_before_the_disk_is_full(ros: Ros) -> None:
     status, output = ros.run(
         "uav_dc_ros.bag", "record", "--out", ros.folder / "never", "--min-free-bytes", 2**60
@@ -220,13 +222,17 @@ def test_recording_stops_before_the_disk_is_full(ros: Ros) -> None:
     ("options", "told"),
     [
         (("--topics", "a,,b"), "topics: 'a,,b'; expected names of topics with a comma between"),
-        (("--topics", "1a"), "topics: '1a': "),
-        (("--split-s", "-1"), "split_s: -1.0; expected a number from 0.0"),
+        pytest.param(("--topics", "1a"), "topics: '1a': ", marks=pytest.mark.long),
+        pytest.param(
+            ("--split-s", "-1"), "split_s: -1.0; expected a number from 0.0", marks=pytest.mark.long
+        ),
         (("--split-s", "nan"), "split_s: nan; expected a number from 0.0"),
-        (("--split-bytes", "-1"), "--split-bytes: '-1'; expected a whole number"),
-        (("--compression", "bz2"), "invalid choice: 'bz2'"),
+        pytest.param(
+            ("--split-bytes", "-1"), "--split-bytes: '-1'; expected a whole number", marks=pytest.mark.long
+        ),
+        pytest.param(("--compression", "bz2"), "invalid choice: 'bz2'", marks=pytest.mark.long),
         (("--namespace", "a b"), "--namespace 'a b': "),
-        (("--out", "."), "exists already; expected a new one"),
+        pytest.param(("--out", "."), "exists already; expected a new one", marks=pytest.mark.long),
     ],
 )
 def test_mistakes_are_one_line(ros: Ros, options: tuple[str, ...], told: str) -> None:
@@ -238,6 +244,7 @@ def test_mistakes_are_one_line(ros: Ros, options: tuple[str, ...], told: str) ->
     assert not (ros.folder / "bag").exists()
 
 
+@pytest.mark.long
 def test_a_mission_s_bag_has_all_of_its_namespace_and_nothing_of_another_mission(
     ros: Ros, small_scenario: Path, small_policy: Path
 ) -> None:

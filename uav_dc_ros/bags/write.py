@@ -163,9 +163,9 @@ class BagWriter:
             raise self._failure(error) from None
 
     def keep_latched(self, topic: str, n: int) -> None:
-        """Repeat the last `n` messages of a latched topic at the head of the next part: one a publisher."""
+        """Repeat at least the last `n` messages of a latched topic in the next part: one a publisher."""
         row = self._parts.rows[topic]
-        if row.latest is not None and row.latest.maxlen != n > 0:
+        if row.latest is not None and n > (row.latest.maxlen or 0):
             row.latest = deque(row.latest, maxlen=n)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
-from rclpy.qos import QoSProfile
+from rclpy.qos import LivelinessPolicy, QoSProfile
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosgraph_msgs.msg import Clock
 
@@ -60,11 +60,17 @@ def offered_qos(profile: QoSProfile, depth: int | None = None) -> Qos:
         durability=QosDurability[profile.durability.name],
         deadline=_qos_time(profile.deadline),
         lifespan=_qos_time(profile.lifespan),
-        liveliness=QosLiveliness[profile.liveliness.name],
+        liveliness=(
+            QosLiveliness.MANUAL_BY_TOPIC
+            if profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC
+            else QosLiveliness.AUTOMATIC
+        ),
         liveliness_lease_duration=_qos_time(profile.liveliness_lease_duration),
         avoid_ros_namespace_conventions=profile.avoid_ros_namespace_conventions,
     )
 
 
 def _qos_time(duration: Duration) -> QosTime:
-    return QosTime(*divmod(duration.nanoseconds, 10**9)) if duration.nanoseconds < _FOREVER_NS else _FOREVER
+    """A duration; 0 stands for none given, which is an infinite one."""
+    given = 0 < duration.nanoseconds < _FOREVER_NS
+    return QosTime(*divmod(duration.nanoseconds, 10**9)) if given else _FOREVER

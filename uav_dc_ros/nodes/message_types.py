@@ -6,8 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from rosidl_parser import definition as idl  # type: ignore[import-untyped]
-
 from uav_dc_ros.bags import definitions
 
 _NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
@@ -63,7 +61,7 @@ def _describe(type: str, texts: dict[str, str]) -> None:
     texts[type] = "".join(f"{line}\n" for line in lines)
     for kind in found.SLOT_TYPES[: len(names)]:
         element = getattr(kind, "value_type", kind)
-        if isinstance(element, idl.NamespacedType):
+        if hasattr(element, "namespaced_name"):
             inner = "/".join(element.namespaced_name())
             if inner not in texts:
                 _describe(inner, texts)
@@ -71,6 +69,8 @@ def _describe(type: str, texts: dict[str, str]) -> None:
 
 def _text(kind: Any) -> str:
     """A field's type, as .msg files write it."""
+    from rosidl_parser import definition as idl  # type: ignore[import-untyped]  # a fifth of a second
+
     match kind:
         case idl.BasicType():
             return _BASIC.get(kind.typename, str(kind.typename))

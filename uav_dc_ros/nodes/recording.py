@@ -3,6 +3,8 @@
 Messages that were lost on the way are counted by the middleware: what a best-effort reader sees missing
 between two messages, and what a reliable publisher no longer had when it was to send it again. Subscriptions
 keep all; those of Fast DDS hold five thousand messages, so only who reads too slowly for long loses any.
+What nobody can count: the last messages of a best-effort publisher, if none comes after them, and what was
+published before a topic was found, a fifth of a second at most, unless it is latched.
 """
 
 import json
@@ -13,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from uav_dc_ros.bags.write import BagWriter
-from uav_dc_ros.errors import NodeError, ParameterError
-from uav_dc_ros.nodes import convert, message_types
+from uav_dc_ros.errors import BagError, NodeError, ParameterError
+from uav_dc_ros.nodes import convert, message_types, qos
 from uav_dc_ros.nodes.hearing import Hearing
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.topics import TOPICS, Topic
@@ -22,7 +24,7 @@ from uav_dc_ros.topics import TOPICS, Topic
 LOOK_S = 0.2  # for new topics
 SYNC_S = 0.5  # what a kill takes at most is what came since, and what waits to be handled
 DRAIN_S = 2.0  # for messages that have arrived when the node is deactivated
-NEVER = ("/parameter_events", "/rosout")  # unless asked for by name
+HOUSEKEEPING = ("/parameter_events", "/rosout", "/transition_event")  # of ROS: not unless asked for by name
 
 
 class BagNode(MissionNode):
@@ -156,24 +158,34 @@ class BagNode(MissionNode):
         return hear
 
     def announce(self, name: str, topic: Topic) -> None:
-        """Enter a topic of the row into the bag, once, with the QoS that its publishers offer by now."""
-        if name not in self._announced and (not self.asked or name in self.asked):
-            self._announce(name, topic.type, topic.depth)
+        """Enter a topic of the row into the bag, once, with the QoS that its publishers offer by now.
 
-    def _announce(self, name: str, type: str, depth: int | None) -> None:
-        self._announced.add(name)
+        Of a topic that nobody publishes yet it is the table's.
+        """
+        if name not in self._announced and (not self.asked or name in self.asked):
+            self._announce(name, topic.type, topic)
+
+    def _announce(self, name: str, type: str, topic: Topic | None) -> None:
+        """Enter a topic into the bag.
+
+        Raises:
+            BagError: earlier parts of the bag have it with another type; or the disk is full, or gone.
+            LookupError: a type inside its type is not installed.
+        """
         ends = [end for end in self.get_publishers_info_by_topic(name) if end.topic_type == type]
-        offers = {convert.offered_qos(end.qos_profile, depth) for end in ends}
+        profiles = [end.qos_profile for end in ends] or ([] if topic is None else [qos.offered(topic)])
+        depth = None if topic is None else topic.depth
         hashes = {str(end.topic_type_hash) for end in ends}
         assert self.writer is not None, "subscriptions end with the bag"
         self.writer.add_topic(
             name,
             type,
-            sorted(offers, key=str),
+            sorted({convert.offered_qos(profile, depth) for profile in profiles}, key=str),
             definition=message_types.definition(type),
             type_hash=min(hashes, default=""),
         )
         self.writer.keep_latched(name, len(ends))
+        self._announced.add(name)
 
     def _look(self) -> None:
         """Hear topics that are new, and adapt to new publishers of those that are not."""
@@ -208,7 +220,7 @@ class BagNode(MissionNode):
         if self.asked:
             return name in self.asked
         inside = self.get_namespace().rstrip("/") + "/"
-        if name in NEVER or not name.startswith(inside) or name.startswith(others):
+        if name.endswith(HOUSEKEEPING) or not name.startswith(inside) or name.startswith(others):
             return False
         row = TOPICS.get(name.removeprefix(inside))
         hidden = any(part.startswith("_") for part in name.split("/"))
@@ -220,17 +232,35 @@ class BagNode(MissionNode):
         us = (self.get_namespace(), self.get_name())
         if all((end.node_namespace, end.node_name) == us for end in ends):
             return
-        kind = message_types.find(types[0])
+        type = types[0]
+        kind = message_types.find(type)
         if len(types) > 1 or kind is None:
             several = f"it has several types: {', '.join(types)}"
-            self._not_recorded[name] = several if len(types) > 1 else f"type {types[0]} is not installed here"
-            self.get_logger().warning(f"{name} is not recorded: {self._not_recorded[name]}")
+            self._leave_out(name, several if len(types) > 1 else f"type {type} is not installed here")
             return
-        self._announce(name, types[0], None)
-        hearing = Hearing(self, name, types[0], self._hear(name, name, None))
+        hearing = Hearing(self, name, type, self._hear(name, name, None))
         hearing.publishers = len(ends)
-        hearing.subscribe(kind, ends)
+        try:
+            hearing.subscribe(kind, ends)
+        except Exception as error:  # of rclpy and of what a package's own type support raises
+            self._leave_out(name, f"type {type} cannot be used: {error}")
+            return
+        try:
+            self._announce(name, type, None)
+        except (BagError, LookupError) as error:
+            hearing.close()
+            assert self.writer is not None, "timers end with the bag"
+            if self.writer.closed:
+                raise
+            self._leave_out(
+                name, f"{error} is not installed" if isinstance(error, LookupError) else str(error)
+            )
+            return
         self._hearings[name] = hearing
+
+    def _leave_out(self, name: str, why: str) -> None:
+        self._not_recorded[name] = why
+        self.get_logger().warning(f"{name} is not recorded: {why}")
 
     # What is kept.
 
