@@ -67,7 +67,12 @@ def diagnostics(name: str, values: dict[str, str]) -> bytes:
 
 
 def flown(
-    folder: Path, about: dict[str, str] | None = None, *, without: tuple[str, ...] = (), close: bool = True
+    folder: Path,
+    about: dict[str, str] | None = None,
+    *,
+    without: tuple[str, ...] = (),
+    dropped: dict[str, int] | None = None,
+    close: bool = True,
 ) -> Path:
     """Two missions of three steps, 0.1 s each, 2 s between them; `without` some in mission 1, step 1."""
     told = {
@@ -90,6 +95,8 @@ def flown(
         "/diagnostics", diagnostics("observer", {"restarts of policy": "2", "restarts of world": "0"}),
         log_time_ns=10**18 + 5, publish_time_ns=0,
     )  # fmt: skip
+    if dropped is not None:
+        bag.tell_dropped(dropped)
     if close:
         bag.close()
     return folder
@@ -141,7 +148,7 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = flown(
-        tmp_path / "bag", {"missions": "3", "dropped": '{"/pose": 5, "/users": 0}'}, without=("rates", "pose")
+        tmp_path / "bag", {"missions": "3"}, without=("rates", "pose"), dropped={"/pose": 5, "/users": 0}
     )
     (bag / "metadata.yaml").unlink()
     told = json.loads(info(bag, capsys, "--json"))

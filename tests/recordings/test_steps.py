@@ -296,7 +296,9 @@ def test_namespaces(tmp_path):
 
 def test_a_topic_of_another_type_is_told():
     odometry = [m._replace(type="nav_msgs/msg/Odometry") if m.topic == "/pose" else m for m in FLIGHT]
-    with pytest.raises(BagError, match=r"topic /pose is of type nav_msgs/msg/Odometry \(cdr\); expected geom"):
+    with pytest.raises(
+        BagError, match=r"topic /pose is of type nav_msgs/msg/Odometry \(cdr\); expected geom"
+    ):
         read(odometry)
 
 

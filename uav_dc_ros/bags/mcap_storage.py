@@ -11,7 +11,7 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Message, Schema
 
 from uav_dc_ros.bags.frames import COMPRESSIONS, MAGIC
-from uav_dc_ros.bags.metadata import METADATA_NAME
+from uav_dc_ros.bags.metadata import Part
 from uav_dc_ros.bags.scan import Scan, has_end
 from uav_dc_ros.bags.storage import RECOVER, BagMessage, RecordedTopic, Storage, damage
 from uav_dc_ros.errors import BagError
@@ -20,13 +20,14 @@ WAITING_BYTES = 64 * 2**20  # of messages that wait for earlier ones; a clock th
 MESSAGE_BYTES = 400  # that a message takes beside its data
 
 
-def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False) -> Storage:
+def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False, repeats: bool = True) -> Storage:
     """An MCAP file.
 
     Args:
         path: the file.
         closing: closes it.
         torn: read it as far as it goes, if it has no end or is damaged: once more for what it holds.
+        repeats: give the latched messages at its head that an earlier file of the bag holds already?
 
     Raises:
         BagError: no MCAP file; without `torn`, one without its end, or a damaged one.
@@ -34,7 +35,7 @@ def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False) -> Storage:
     with damage(path):
         file = closing.enter_context(path.open("rb"))
     if torn:
-        return _open_torn(path, file)
+        return _open_torn(path, file, repeats=repeats)
     with damage(path):
         scan = Scan(path, file)
         whole = has_end(file)
@@ -53,16 +54,18 @@ def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False) -> Storage:
         summary = reader.get_summary()
         if summary is None or summary.statistics is None:
             raise McapError("its summary has no statistics")
-        about: dict[str, str] = {}
+        told = Part(path.name)
         for metadata in reader.iter_metadata():
-            if metadata.name == METADATA_NAME:
-                about |= metadata.metadata
+            told.learn(metadata.name, metadata.metadata)
+        left_out = {} if repeats else told.repeated
         library = reader.get_header().library
         statistics = summary.statistics
         topics = [
             _topic(channel, summary.schemas.get(channel.schema_id), statistics.channel_message_counts)
             for channel in summary.channels.values()
         ]
+        for topic in topics:
+            topic.count -= left_out.get(topic.name, 0)
     for index in summary.chunk_indexes:
         if index.compression not in COMPRESSIONS:
             raise BagError(
@@ -82,7 +85,7 @@ def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False) -> Storage:
                     f"{path} is damaged: {scan.lost_bytes} bytes; {RECOVER} brings back the others"
                 )
             with damage(path):
-                yield from _scanned(Scan(path, file), scan.lag_ns, topics, start_ns, end_ns)
+                yield from _scanned(Scan(path, file), scan.lag_ns, left_out, topics, start_ns, end_ns)
             return
         stream = reader.iter_messages(topics, starting_at=start_ns, ending_before=end_ns)
         while True:
@@ -91,6 +94,8 @@ def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False) -> Storage:
             if found is None:
                 return
             schema, channel, message = found
+            if message.sequence == 0 and channel.topic in left_out:
+                continue
             yield _message(channel.topic, schema.name if schema else "", message)
 
     return Storage(
@@ -99,19 +104,20 @@ def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False) -> Storage:
         first_ns=statistics.message_start_time,
         last_ns=statistics.message_end_time,
         messages=messages,
-        about=about,
+        about=told.about,
+        dropped=told.dropped,
         library=library,
     )
 
 
-def _open_torn(path: Path, file: IO[bytes]) -> Storage:
+def _open_torn(path: Path, file: IO[bytes], *, repeats: bool) -> Storage:
     """An MCAP file as far as it goes: read once for what it holds, and again for its messages."""
 
     def messages(
         topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[BagMessage]:
         with damage(path):
-            yield from _scanned(Scan(path, file), scan.lag_ns, topics, start_ns, end_ns)
+            yield from _scanned(Scan(path, file), scan.lag_ns, left_out, topics, start_ns, end_ns)
 
     schemas: dict[int, Schema] = {}
     topics: dict[str, RecordedTopic] = {}
@@ -123,8 +129,9 @@ def _open_torn(path: Path, file: IO[bytes]) -> Storage:
             elif isinstance(record, Channel):
                 topics.setdefault(record.topic, _topic(record, schemas.get(record.schema_id), {}))
         ended = has_end(file)
+    left_out = {} if repeats else scan.part.repeated
     for name, count in scan.part.counts.items():
-        topics[name].count = count
+        topics[name].count = count - left_out.get(name, 0)
     return Storage(
         path=path,
         topics=list(topics.values()),
@@ -132,6 +139,7 @@ def _open_torn(path: Path, file: IO[bytes]) -> Storage:
         last_ns=scan.part.last_ns,
         messages=messages,
         about=scan.part.about,
+        dropped=scan.part.dropped,
         library=scan.library,
         damages=scan.damages,
         has_end=ended,
@@ -155,13 +163,19 @@ def _message(topic: str, type: str, message: Message) -> BagMessage:
 
 
 def _scanned(
-    scan: Scan, lag_ns: int, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    scan: Scan,
+    lag_ns: int,
+    left_out: Collection[str],
+    topics: Collection[str] | None,
+    start_ns: int | None,
+    end_ns: int | None,
 ) -> Iterator[BagMessage]:
     """Messages of a file that has no index to read it by, in the order of their log times.
 
     Args:
         scan: of the file, new.
         lag_ns: how much earlier than one before it a message may be, nanoseconds.
+        left_out: topics whose repeated messages are left out.
         topics, start_ns, end_ns: which messages.
     """
     schemas: dict[int, str] = {}
@@ -175,6 +189,8 @@ def _scanned(
             channels[record.id] = record.topic, schemas.get(record.schema_id, "")
         elif isinstance(record, Message):
             topic, type = channels[record.channel_id]
+            if record.sequence == 0 and topic in left_out:
+                continue
             early = start_ns is not None and record.log_time < start_ns
             late = end_ns is not None and record.log_time >= end_ns
             newest_ns = max(newest_ns, record.log_time)

@@ -6,12 +6,14 @@ killed. No part is ever dropped: one that holds nothing becomes an empty part.
 """
 
 import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
+from uav_dc_ros.bags import metadata
 from uav_dc_ros.bags.metadata import Part, is_told, total, write_metadata
 from uav_dc_ros.bags.part import FolderLock, PartWriter, part_paths
 from uav_dc_ros.bags.scan import Scan, has_end
@@ -130,9 +132,13 @@ def copy(scan: Scan, writer: PartWriter) -> None:
     """Write what can be read of a part into another one; its indexes are made anew."""
     schemas = {0: 0}  # a channel without a schema stays one
     channels: dict[int, int] = {}
+    topics: dict[int, str] = {}
+    repeated: Counter[str] = Counter()
     for record in scan:
         match record:
             case Message():
+                if record.sequence == 0 and topics[record.channel_id] in scan.part.repeated:
+                    repeated[topics[record.channel_id]] += 1
                 writer.add_message(
                     channels[record.channel_id],
                     record.data,
@@ -146,7 +152,8 @@ def copy(scan: Scan, writer: PartWriter) -> None:
                 channels[record.id] = writer.add_channel(
                     record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
                 )
-            case Metadata(name="rosbag2"):
+                topics[record.id] = record.topic
+            case Metadata(name="rosbag2") | Metadata(name=metadata.REPEATED_NAME):
                 pass  # counts of a part that was not finished: the copy gets its own
             case Metadata():
                 writer.add_metadata(record.name, record.metadata)
@@ -158,3 +165,5 @@ def copy(scan: Scan, writer: PartWriter) -> None:
                     log_time_ns=record.log_time,
                     create_time_ns=record.create_time,
                 )
+    if repeated:
+        writer.add_metadata(metadata.REPEATED_NAME, {topic: str(n) for topic, n in repeated.items()})

@@ -1,6 +1,8 @@
 """What a part of a bag holds, and metadata.yaml over all parts of a bag, as rosbag2 of Jazzy writes it."""
 
+import json
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import StringIO
@@ -17,6 +19,9 @@ from uav_dc_ros.errors import BagError, UavDcError
 
 METADATA_NAME = "uav_dc_ros"  # of our record inside an MCAP file: what the bag is about
 LOST = "lost_bytes"  # its key for what recovering a part could not use
+# Messages at the head of a file that an earlier file of the bag holds already, by topic; their sequence is 0.
+REPEATED_NAME = "uav_dc_ros_repeated"
+DROPPED_NAME = "uav_dc_ros_dropped"  # messages that were lost while a file was written, by topic
 FILE_NAME = "metadata.yaml"
 
 
@@ -32,6 +37,9 @@ class Part:
         published_ns: latest publish time by topic, of topics with messages, nanoseconds since the epoch.
         first_ns: earliest log time; None without messages.
         last_ns: latest log time.
+        repeated: messages by topic that repeat latched ones of earlier parts; `counts` has them, too.
+        dropped: messages by topic that were published but never reached the recorder; None: nobody counted.
+        latest: last message and its publish time by topic, of latched topics; only what was read has it.
     """
 
     name: str
@@ -41,6 +49,9 @@ class Part:
     published_ns: dict[str, int] = field(default_factory=dict)
     first_ns: int | None = None
     last_ns: int = 0
+    repeated: dict[str, int] = field(default_factory=dict)
+    dropped: dict[str, int] | None = None
+    latest: dict[str, tuple[bytes, int]] = field(default_factory=dict)
 
     @property
     def message_count(self) -> int:
@@ -75,12 +86,27 @@ class Part:
         }
         self.counts[topic] = 0
 
+    def learn(self, name: str, content: Mapping[str, str]) -> None:
+        """Enter a metadata record; those of others say nothing here."""
+        if name == METADATA_NAME:
+            self.about |= content
+        elif name == REPEATED_NAME:
+            self.repeated |= _numbers(content)
+        elif name == DROPPED_NAME:
+            self.dropped = (self.dropped or {}) | _numbers(content)
+
     def count(self, topic: str, *, log_time_ns: int, publish_time_ns: int) -> None:
         """Enter a message of a topic that was announced; times in nanoseconds since the epoch."""
         self.counts[topic] += 1
         self.published_ns[topic] = max(publish_time_ns, self.published_ns.get(topic, publish_time_ns))
         self.first_ns = log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
         self.last_ns = max(self.last_ns, log_time_ns)
+
+
+def is_latched(row: Mapping[str, Any]) -> bool:
+    """Whether all publishers of a topic, by its row of metadata.yaml, offer old messages to newcomers."""
+    offers = row["offered_qos_profiles"]
+    return bool(offers) and all(offer["durability"] == "transient_local" for offer in offers)
 
 
 def total(parts: Sequence[Part]) -> Part:
@@ -97,6 +123,12 @@ def total(parts: Sequence[Part]) -> Part:
                 whole.topics[topic] = row
             whole.topics.setdefault(topic, row)
             whole.counts[topic] = whole.counts.get(topic, 0) + part.counts[topic]
+            whole.repeated[topic] = whole.repeated.get(topic, 0) + part.repeated.get(topic, 0)
+        if part.dropped is not None:
+            lost = Counter(whole.dropped or {})
+            lost.update(part.dropped)
+            whole.dropped = dict(lost)
+        whole.latest |= part.latest
         for topic, published_ns in part.published_ns.items():
             whole.published_ns[topic] = max(published_ns, whole.published_ns.get(topic, published_ns))
         if part.first_ns is not None:
@@ -121,9 +153,14 @@ def information(parts: Sequence[Part]) -> dict[str, Any]:
         "compression_mode": "",
         "relative_file_paths": [part.name for part in parts],
         "files": [{"path": part.name, **_times(part, start_ns)} for part in parts],
-        "custom_data": whole.about,
+        "custom_data": whole.about
+        | ({} if whole.dropped is None else {"dropped": json.dumps(whole.dropped, sort_keys=True)}),
         "ros_distro": "jazzy",
     }
+
+
+def _numbers(content: Mapping[str, str]) -> dict[str, int]:
+    return {topic: int(count) for topic, count in content.items() if count.isdecimal()}
 
 
 def _times(part: Part, otherwise_ns: int) -> dict[str, Any]:

@@ -12,10 +12,15 @@ from typing import Self
 from mcap.writer import CompressionType, Writer
 
 from uav_dc_ros import __version__
-from uav_dc_ros.bags.metadata import METADATA_NAME, Part, information, to_yaml
+from uav_dc_ros.bags.metadata import Part, information, to_yaml
 from uav_dc_ros.errors import BagError
 
-CHUNK_BYTES = 128 * 1024  # small: a chunk that was not finished is what a killed recorder loses
+CHUNK_BYTES = 128 * 1024  # small: a chunk that was not finished is what a killed writer loses
+COMPRESSIONS = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
 _NUMBER = re.compile(r"_(\d+)\.mcap$")
 
 
@@ -71,22 +76,31 @@ class FolderLock:
 
 
 class PartWriter:
-    """Writes one MCAP file with zstd chunks, and keeps count of what it holds.
+    """Writes one MCAP file in chunks, and keeps count of what it holds.
 
     Args:
         path: the file; must not exist.
         name: the part's name, where the file has a temporary one.
+        compression: of its chunks, one of COMPRESSIONS.
+        chunk_bytes: size at which a chunk is finished, before compression.
 
     Raises (all methods): OSError, which whoever owns the bag puts into words.
     """
 
-    def __init__(self, path: Path, *, name: str | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        name: str | None = None,
+        compression: str = "zstd",
+        chunk_bytes: int = CHUNK_BYTES,
+    ) -> None:
         self.part = Part(name or path.name)
         self._topics: dict[int, str] = {}  # by channel
         self._types: dict[int, str] = {0: ""}  # by schema; channel without schema: 0, as MCAP has it
         self._file = path.open("xb")
         try:
-            self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            self._mcap = Writer(self._file, chunk_size=chunk_bytes, compression=COMPRESSIONS[compression])
             self._mcap.start(profile="ros2", library=f"uav_dc_ros {__version__}")
             self._file.flush()
         except OSError:
@@ -99,9 +113,8 @@ class PartWriter:
         return self._file.closed
 
     def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
-        """Append a metadata record; ours is what the bag is about."""
-        if name == METADATA_NAME:
-            self.part.about |= content
+        """Append a metadata record; ours are those that `Part.learn` knows."""
+        self.part.learn(name, content)
         self._mcap.add_metadata(name, dict(content))
         self._file.flush()
 
@@ -131,6 +144,19 @@ class PartWriter:
         self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
         self._file.flush()  # a chunk that is finished is out of this process, whatever happens to it
         self.part.count(self._topics[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file by now, without the chunk that is being filled."""
+        return self._file.tell()
+
+    def flush(self) -> None:
+        """Finish the chunk that is being filled, and hand it to the operating system."""
+        self._mcap.flush()  # type: ignore[no-untyped-call]
+
+    def descriptor(self) -> int:
+        """A file descriptor for `os.fsync`, for the caller to close: it outlives the file object."""
+        return os.dup(self._file.fileno())
 
     def finish(self) -> None:
         """End the file, on the disk, with rosbag2's record of what this part holds."""

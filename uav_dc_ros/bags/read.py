@@ -1,10 +1,14 @@
 """Read a whole bag, of any recorder, as a stream: message by message, a few chunks at a time in memory.
 
+Each part that our recorder writes repeats latched messages of earlier parts at its head, for who has no other
+part: of the parts of one folder they are left out, except of the first one there.
+
 A bag is a rosbag2 folder with MCAP files, with or without metadata.yaml, or one MCAP file. Folders in
 rosbag2's SQLite storage are read, too. What a killed recorder left is recovered first.
 """
 
 import heapq
+from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from operator import attrgetter
@@ -38,6 +42,7 @@ class BagReader:
         storages: what each of them holds.
         topics: by name.
         about: what our recorder wrote about it, text by key; empty for a bag of another one.
+        dropped: messages by topic that were published, but lost before they were recorded; None: not counted.
         first_ns, last_ns: log times of its first and last message, nanoseconds since the epoch; 0 without.
 
     Raises:
@@ -49,15 +54,19 @@ class BagReader:
         self.path = path
         self.topics: dict[str, RecordedTopic] = {}
         self.about: dict[str, str] = {}
+        self.dropped: dict[str, int] | None = None
         self._closing = ExitStack()
         try:
-            self.storages = [self._open(part, torn) for part in storage_files(path)]
+            files = storage_files(path)
+            self.storages = [self._open(part, torn, repeats=part is files[0]) for part in files]
         except BaseException:
             self._closing.close()
             raise
         self.parts = tuple(part.path for part in self.storages)
         for part in self.storages:
             self.about = part.about | self.about  # what was said first stays
+            if part.dropped is not None:
+                self.dropped = dict(Counter(self.dropped or {}) + Counter(part.dropped))
             for topic in part.topics:
                 self._enter(topic)
         with_messages = [part for part in self.storages if any(topic.count for topic in part.topics)]
@@ -118,7 +127,7 @@ class BagReader:
             known.offered_qos = topic.offered_qos
         known.count += topic.count
 
-    def _open(self, path: Path, torn: bool) -> Storage:
+    def _open(self, path: Path, torn: bool, *, repeats: bool) -> Storage:
         if path.is_dir():
             return open_sqlite(path, self._closing)
-        return open_mcap(path, self._closing, torn=torn)
+        return open_mcap(path, self._closing, torn=torn, repeats=repeats)

@@ -34,7 +34,7 @@ from uav_dc_ros.bags.frames import (
     parse,
     unpack,
 )
-from uav_dc_ros.bags.metadata import METADATA_NAME, Part
+from uav_dc_ros.bags.metadata import Part, is_latched
 from uav_dc_ros.errors import BagError
 
 _END_BYTES = FRAME.size + FOOTER_BYTES + len(MAGIC)
@@ -122,6 +122,7 @@ class Scan:
         self.magic = self._frames.read(0, len(MAGIC))
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, str] = {}
+        self._latched: set[str] = set()
         self._last_ns: int | None = None
         self._chunked = False
         self._at = 0  # of the record, or chunk, that is being read
@@ -259,7 +260,8 @@ class Scan:
             if channel not in self._channels:
                 self._lose(self._at, FRAME.size + len(content), "messages of a topic that is lost")
                 return
-            self.part.count(self._channels[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+            topic = self._channels[channel]
+            self.part.count(topic, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
             self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
             self._last_ns = log_time_ns
             for damage in reversed(self.damages):
@@ -267,6 +269,8 @@ class Scan:
                     break
                 damage.before_ns = log_time_ns
             data = content[MESSAGE.size :]
+            if topic in self._latched:
+                self.part.latest[topic] = data, publish_time_ns
             yield Message(channel, log_time_ns, data, publish_time_ns, sequence)
             return
         if opcode in (Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX):
@@ -301,8 +305,10 @@ class Scan:
             self._channels[record.id] = record.topic
             type = self._schemas[record.schema_id]
             self.part.announce(record.topic, type, record.message_encoding, record.metadata)
-        elif isinstance(record, Metadata) and record.name == METADATA_NAME:
-            self.part.about |= record.metadata
+            if is_latched(self.part.topics[record.topic]):
+                self._latched.add(record.topic)
+        elif isinstance(record, Metadata):
+            self.part.learn(record.name, record.metadata)
         return True
 
     def _lose(self, at: int, n_bytes: int, why: str) -> None:

@@ -66,6 +66,7 @@ class Storage:
     """A storage file: what it holds, and its messages between two log times (the second one excluded).
 
     Attributes:
+        about, dropped: as those of `metadata.Part`.
         library: what wrote it, in its own words.
         damages: what of it cannot be used; told only where it was read as far as it goes.
         has_end: whether it is finished.
@@ -77,6 +78,7 @@ class Storage:
     last_ns: int
     messages: Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
     about: dict[str, str] = field(default_factory=dict)
+    dropped: dict[str, int] | None = None
     library: str = ""
     damages: Sequence[Damage] = ()
     has_end: bool = True

@@ -1,11 +1,16 @@
-"""Write a rosbag2 folder: MCAP files with zstd chunks, and metadata.yaml.
+"""Write a rosbag2 folder: MCAP files, and metadata.yaml.
 
 Messages are stored as they came, serialised; nothing is decoded. An MCAP file tells the whole story
 by itself, so a folder whose metadata.yaml was never written loses nothing but convenience.
 
-A bag has one part, `<folder>_0.mcap`, unless its writer was killed: who goes on writes the next part.
+A bag has one part, `<folder>_0.mcap`, unless it is split, or its writer was killed: who goes on writes the
+next part. Each part after the first begins with the last messages of each latched topic, one for each of its
+publishers, so that it can be understood alone. They have their own publish time, the log time of the part's
+first new message, and the sequence 0; a metadata record counts them.
 """
 
+import os
+from collections import deque
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -14,10 +19,12 @@ from typing import Self
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from uav_dc_ros.bags.definitions import ENCODING, TYPESTORE, definition
+from uav_dc_ros.bags import definitions
 from uav_dc_ros.bags.mend import mend_parts
-from uav_dc_ros.bags.metadata import FILE_NAME, METADATA_NAME, Part, to_yaml, total, write_metadata
-from uav_dc_ros.bags.part import FolderLock, PartWriter, number, part_paths
+from uav_dc_ros.bags.metadata import FILE_NAME, Part, is_latched, to_yaml, total, write_metadata
+from uav_dc_ros.bags.part import FolderLock, part_paths
+from uav_dc_ros.bags.series import PartSeries, Row
+from uav_dc_ros.bags.sync import DiskSync
 from uav_dc_ros.errors import BagError
 
 
@@ -28,6 +35,10 @@ class BagWriter:
         folder: the bag's folder; must not exist, unless its writing is resumed.
         about: what the bag is about, stored inside as text by key. What earlier parts say of a key stays.
         resume: go on with a bag whose writer was killed: its parts are mended, and a new one is begun.
+        compression: of its chunks: one of part.COMPRESSIONS.
+        split_bytes: size of a part's file after which the next one is begun; 0: never. A part is larger by
+            no more than a chunk, one message and its index.
+        split_s: log time after which the next part is begun, seconds; 0: never.
 
     Raises:
         BagError: the folder exists, or cannot be made. When resuming: there is no such folder, the bag was
@@ -35,11 +46,18 @@ class BagWriter:
             cannot be mended.
     """
 
-    def __init__(self, folder: Path, about: Mapping[str, str], *, resume: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        about: Mapping[str, str],
+        *,
+        resume: bool = False,
+        compression: str = "zstd",
+        split_bytes: int = 0,
+        split_s: float = 0.0,
+    ) -> None:
         self.folder = folder
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-        self._earlier: list[Part] = []
+        self._disk = DiskSync()
         if not resume:
             if folder.exists():
                 raise BagError(f"bag folder {folder} exists already; expected a new one")
@@ -49,36 +67,60 @@ class BagWriter:
                 raise BagError(f"bag folder {folder} cannot be made: {error.strerror}") from None
         self._lock = FolderLock(folder)
         try:
-            if resume:
-                self._earlier = _earlier_parts(folder)
-            self._whole = total(self._earlier)  # of the earlier parts
-            self._begin(about)
+            earlier = _earlier_parts(folder) if resume else []
+            self._resumed = total(earlier)
+            try:
+                self._parts = PartSeries(
+                    folder,
+                    about,
+                    earlier,
+                    compression=compression,
+                    split_bytes=split_bytes,
+                    split_ns=round(split_s * 1e9),
+                )
+            except OSError as error:
+                raise BagError(f"bag {folder} cannot be written: {error.strerror}") from None
         except BaseException:
             self._lock.release()
             raise
 
-    def _begin(self, about: Mapping[str, str]) -> None:
-        n = max((number(self.folder / part.name) for part in self._earlier), default=-1) + 1
-        try:
-            self._writer = PartWriter(self.folder / f"{self.folder.name}_{n}.mcap")
-            self._writer.add_metadata(METADATA_NAME, about)
-        except OSError as error:
-            raise BagError(f"bag {self.folder} cannot be written: {error.strerror}") from None
-
     @property
     def message_count(self) -> int:
-        """Messages in the bag so far, those of earlier parts included."""
-        return self._whole.message_count + self._writer.part.message_count
+        """Messages in the bag so far, those of earlier parts and repeated ones included."""
+        return sum(part.message_count for part in self._parts.all)
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed, or given up."""
+        return self._parts.current.closed
+
+    @property
+    def topics(self) -> list[str]:
+        """Topics that were added, by full name."""
+        return list(self._parts.rows)
+
+    @property
+    def part_count(self) -> int:
+        """Parts of the bag so far."""
+        return len(self._parts.all)
 
     @property
     def already_written(self) -> Mapping[str, int]:
-        """Latest publish time of each topic that earlier parts hold, nanoseconds since the epoch.
+        """Latest publish time of each topic that a killed writer's parts hold, nanoseconds since the epoch.
 
         Latched topics come again to who subscribes again: what is not newer than this is in the bag.
         """
-        return MappingProxyType(self._whole.published_ns)
+        return MappingProxyType(self._resumed.published_ns)
 
-    def add_topic(self, name: str, type: str, offered_qos: Iterable[Qos] = ()) -> None:
+    def add_topic(
+        self,
+        name: str,
+        type: str,
+        offered_qos: Iterable[Qos] = (),
+        *,
+        definition: bytes = b"",
+        type_hash: str = "",
+    ) -> None:
         """Announce a topic, once, before its first message.
 
         A topic of which earlier parts hold messages keeps the QoS that they tell: metadata.yaml has one
@@ -88,24 +130,43 @@ class BagWriter:
             name: full name, with its namespace.
             type: ROS 2 message type, such as `std_msgs/msg/String`.
             offered_qos: QoS that the topic's publishers offer.
+            definition: of a type that ROS 2 itself does not have, with all types inside it, as `ros2msg`.
+            type_hash: of such a type (REP-2011).
 
         Raises:
             BagError: ROS 2 has no such type, the topic has another one in earlier parts, or the disk is full.
         """
         qos = dump_qos_v9(list(offered_qos))
-        if name in self._whole.topics:
-            row = self._whole.topics[name]
-            if row["type"] != type:
-                raise BagError(f"topic {name} is of type {type}; expected {row['type']}, as in earlier parts")
-            if self._whole.counts[name]:
-                qos = row["offered_qos_profiles"]
+        if name in self._resumed.topics:
+            earlier = self._resumed.topics[name]
+            if earlier["type"] != type:
+                raise BagError(
+                    f"topic {name} is of type {type}; expected {earlier['type']}, as in earlier parts"
+                )
+            if self._resumed.counts[name]:
+                qos = earlier["offered_qos_profiles"]
+        if not definition:
+            definition = _definition(name, type)
+            type_hash = definitions.TYPESTORE.hash_rihs01(type)
+        row = Row(
+            type=type,
+            definition=definition,
+            channel={"offered_qos_profiles": to_yaml(qos), "topic_type_hash": type_hash},
+            latest=deque(maxlen=len(qos)) if is_latched({"offered_qos_profiles": qos}) else None,
+            sequence=self._resumed.counts.get(name, 0) - self._resumed.repeated.get(name, 0),
+        )
+        if row.latest is not None and name in self._resumed.latest:
+            row.latest.append(self._resumed.latest[name])
         try:
-            if type not in self._schemas:
-                self._schemas[type] = self._writer.add_schema(type, ENCODING, _definition(name, type))
-            told = {"offered_qos_profiles": to_yaml(qos), "topic_type_hash": TYPESTORE.hash_rihs01(type)}
-            self._channels[name] = self._writer.add_channel(name, "cdr", self._schemas[type], told)
+            self._parts.add(name, row)
         except OSError as error:  # a definition may be what fills the chunk
             raise self._failure(error) from None
+
+    def keep_latched(self, topic: str, n: int) -> None:
+        """Repeat at least the last `n` messages of a latched topic in the next part: one a publisher."""
+        row = self._parts.rows[topic]
+        if row.latest is not None and n > (row.latest.maxlen or 0):
+            row.latest = deque(row.latest, maxlen=n)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:
         """Append a message.
@@ -119,15 +180,47 @@ class BagWriter:
         Raises:
             BagError: the disk is full, or gone.
         """
-        sequence = self._whole.counts.get(topic, 0) + self._writer.part.counts[topic] + 1
         try:
-            self._writer.add_message(
-                self._channels[topic],
-                data,
-                log_time_ns=log_time_ns,
-                publish_time_ns=publish_time_ns,
-                sequence=sequence,
-            )
+            self._parts.write(topic, data, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def tell(self, about: Mapping[str, str]) -> None:
+        """Add to what the bag is about.
+
+        Raises:
+            BagError: the disk is full, or gone.
+        """
+        try:
+            self._parts.tell(about)
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def tell_dropped(self, dropped: Mapping[str, int]) -> None:
+        """Note how many messages of each topic were lost by now, since this writer began.
+
+        Raises:
+            BagError: the disk is full, or gone.
+        """
+        try:
+            self._parts.tell_dropped(dropped)
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def sync(self) -> None:
+        """Hand over all that was written: to the operating system now, and to the disk soon, by a thread.
+
+        What a kill can take is then what came since the last call; what a power cut can take, what came since
+        the last one but one, if the disk keeps up.
+
+        Raises:
+            BagError: the disk is full, or gone.
+        """
+        try:
+            self._parts.current.flush()
+            if self._disk.is_free:
+                folder = os.open(self.folder, os.O_RDONLY)  # the names of new parts, too
+                self._disk.begin([self._parts.current.descriptor(), folder])
         except OSError as error:
             raise self._failure(error) from None
 
@@ -137,19 +230,22 @@ class BagWriter:
         Raises:
             BagError: the disk is full, or gone.
         """
-        if self._writer.closed:
+        if self.closed:
             return
         try:
-            self._writer.finish()
-            write_metadata(self.folder, [*self._earlier, self._writer.part])
+            self._disk.wait()
+            self._parts.current.finish()
+            write_metadata(self.folder, self._parts.all)
         except OSError as error:
             raise self._failure(error) from None
         finally:
+            self._disk.close()
             self._lock.release()
 
     def _failure(self, error: OSError) -> BagError:
         """Give the file up as it is: what was written until now stays."""
-        self._writer.abandon()
+        self._parts.current.abandon()
+        self._disk.close()
         self._lock.release()
         return BagError(
             f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no index, "
@@ -179,6 +275,6 @@ def _earlier_parts(folder: Path) -> list[Part]:
 
 def _definition(topic: str, type: str) -> bytes:
     try:
-        return definition(type)
+        return definitions.definition(type)
     except BagError as error:
         raise BagError(f"topic {topic} is of type {error}") from None

@@ -22,7 +22,8 @@ The nodes:
 world            the vehicle in simulation, and the users who walk about
 channel_monitor  SINR, rates, and the data collected
 policy           decides moves with a trained policy; pairs brings together what belongs to one step
-recorder         writes the bag
+recorder         writes the mission's bag; record, whatever anybody publishes (`bag record`); both are made of
+                 recording; hearing is one topic of it; message_types finds the types of any package
 visualizer       draws path and markers; track knows which poses belong to the mission, drawing draws
 live_view        serves the mission to Foxglove; foxglove_server is its server
 

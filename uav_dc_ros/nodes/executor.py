@@ -29,13 +29,14 @@ class DirectExecutor:
     `qos.incompatible` looks for peers that do not match.
 
     Args:
-        rest_s: pause after each turn that handled something, seconds. Who need not answer at once takes
+        rest_s: pause after each turn that handled all there was, seconds. Who need not answer at once takes
             what came meanwhile in one turn, and leaves the cores to those who must.
     """
 
     def __init__(self, rest_s: float = 0.0) -> None:
         self.rest_s = rest_s
         self._at_once = TURN_MAX if rest_s else 1
+        self._behind = False  # did messages wait for another turn
         self._context: Any = get_default_context()
         self._guard = GuardCondition(callback=None, callback_group=None, context=self._context)
         self._nodes: list[Node] = []
@@ -66,8 +67,9 @@ class DirectExecutor:
                 self._turn(quiet_s)
                 if quiet_s is not None and time.monotonic() - self._heard_s > quiet_s:
                     return
-                if self.rest_s:
+                if self.rest_s and not self._behind:
                     time.sleep(self.rest_s)
+                self._behind = False
 
     def spin_once(self, timeout_s: float) -> None:
         """Handle what is ready, or becomes so within `timeout_s` seconds."""
@@ -141,15 +143,17 @@ class DirectExecutor:
     def _take_messages(self, subscription: Any) -> None:
         handle = subscription.handle
         with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
-        for _ in range(self._at_once):
-            taken = handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                return
-            self._heard_s = time.monotonic()
-            if with_info:
-                subscription.callback(*taken)
-            else:
-                subscription.callback(taken[0])
+        with handle:  # raises InvalidHandle, if it was destroyed since it became ready
+            for _ in range(self._at_once):
+                taken = handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
+                    return
+                self._heard_s = time.monotonic()
+                if with_info:
+                    subscription.callback(*taken)
+                else:
+                    subscription.callback(taken[0])
+        self._behind = True
 
     def _emptied(self, *capacity: int) -> Any:
         """The wait set, empty, with room for subscriptions, guards, timers, clients, services."""

@@ -4,10 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from uav_dc_ros.bags.part import COMPRESSIONS
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
 
 WHOLE_MAX = 2**63 - 1  # of a ROS integer
+SPLIT_MAX_S = 1e9  # thirty years
 PORT_MAX = 65535
 
 
@@ -71,6 +73,19 @@ class Parameter:
             raise ParameterError(f"{self.name}: {error}") from None
 
 
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")] if text.strip() else []
+    if "" in names:
+        raise ParameterError(f"{text!r}; expected names of topics with a comma between")
+    return names
+
+
+def _compression(text: str) -> str:
+    if text not in COMPRESSIONS:
+        raise ParameterError(f"{text!r}; expected one of {', '.join(COMPRESSIONS)}")
+    return text
+
+
 AUTOSTART = Parameter(
     name="autostart",
     default=True,
@@ -125,6 +140,42 @@ RESUME = Parameter(
     default=False,
     description="go on with the bag of a recorder that was killed, instead of refusing an existing folder",
 )
+RECORDED_TOPICS = Parameter(
+    name="topics",
+    default="",
+    description="topics to record, by name, with a comma between; empty: all in the node's namespace",
+    parse=_names,
+)
+SPLIT_BYTES = Parameter(
+    name="split_bytes",
+    default=0,
+    least=0,
+    most=WHOLE_MAX,
+    unit="bytes",
+    description="size of a bag's file after which the next one is begun; 0: never",
+)
+SPLIT_S = Parameter(
+    name="split_s",
+    default=0.0,
+    least=0.0,
+    most=SPLIT_MAX_S,
+    unit="s",
+    description="time after which the next file of a bag is begun; 0: never",
+)
+COMPRESSION = Parameter(
+    name="compression",
+    default="zstd",
+    description=f"how a bag's chunks are compressed: one of {', '.join(COMPRESSIONS)}",
+    parse=_compression,
+)
+MIN_FREE_BYTES = Parameter(
+    name="min_free_bytes",
+    default=256 * 2**20,
+    least=0,
+    most=WHOLE_MAX,
+    unit="bytes",
+    description="free space of the disk below which recording stops, and the bag is closed",
+)
 RATE_HZ = Parameter(
     name="rate",
     default=5.0,
@@ -145,4 +196,5 @@ ADDRESS = Parameter(
     default="127.0.0.1",
     description="network address that the server listens on; 0.0.0.0: all of this machine's",
 )
+BAG_FILES = (RECORDED_TOPICS, SPLIT_BYTES, SPLIT_S, COMPRESSION, MIN_FREE_BYTES)  # of who writes a bag
 EVERY = (AUTOSTART, PEERS)  # that every node has

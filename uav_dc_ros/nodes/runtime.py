@@ -73,13 +73,18 @@ def give_way() -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def main(make: Callable[[], MissionNode]) -> NoReturn:
-    """Run one node until it is asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`."""
+def main(make: Callable[[], MissionNode], arguments: list[str] | None = None) -> NoReturn:
+    """Run one node until it is asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`.
+
+    Args:
+        make: makes the node.
+        arguments: ROS arguments; those of the command line, unless given.
+    """
     fastdds.use_profiles()
     give_way()
     status = NOT_BEGUN
     try:
-        node = _made(make)
+        node = _made(make, arguments)
         executor = DirectExecutor(node.rest_s)
         executor.add_node(node)
         stopper = Stopper(executor.wake)
@@ -99,14 +104,14 @@ def main(make: Callable[[], MissionNode]) -> NoReturn:
     os._exit(status)
 
 
-def _made(make: Callable[[], MissionNode]) -> MissionNode:
+def _made(make: Callable[[], MissionNode], arguments: list[str] | None) -> MissionNode:
     """Initialise ROS and make the node.
 
     Raises:
         ParameterError: what stands after --ros-args makes no sense.
     """
     try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         return make()
     except (_rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError, _rclpy.RCLError) as error:
         raise ParameterError(f"{error}; expected ROS arguments after --ros-args") from None

@@ -4,13 +4,10 @@ Whole bags and torn ones, ours and others, in two passes: one over all messages,
 """
 
 import time
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import msgspec
 
 from uav_dc_ros import topics
 from uav_dc_ros.bags.definitions import TYPESTORE
@@ -117,7 +114,8 @@ def _survey(reader: BagReader, error: BagError | None) -> Survey:
     told = read_metadata(reader.path) if reader.path.is_dir() else None
     problems += _metadata_problems(reader, told)
     problems += _lost(reader)
-    dropped = _dropped(reader, problems)
+    dropped = reader.dropped or {}
+    problems += [f"{n:,} messages of {topic} were dropped" for topic, n in sorted(dropped.items()) if n]
     found, restarts = _topics(reader, dropped)
     missions: list[MissionSurvey] = []
     for namespace in namespaces(reader):
@@ -188,21 +186,6 @@ def _lost(reader: BagReader) -> Iterator[str]:
             yield f"{storage.path.name} was recovered, without {storage.about[LOST][:40]} bytes of its source"
 
 
-def _dropped(reader: BagReader, problems: list[str]) -> Counter[str]:
-    """Messages dropped by topic, as the recorder of each part says of it."""
-    total: Counter[str] = Counter()
-    for storage in reader.storages:
-        text = storage.about.get("dropped")
-        if text is None:
-            continue
-        try:
-            total.update(msgspec.json.decode(text, type=dict[str, int]))
-        except msgspec.DecodeError:
-            problems.append(f"{storage.path.name}: dropped is {text[:40]!r}; expected numbers by topic")
-    problems += [f"{n:,} messages of {topic} were dropped" for topic, n in sorted(total.items()) if n]
-    return total
-
-
 @dataclass
 class _Pace:
     """How the messages of a topic follow each other; log times in nanoseconds since the epoch."""
@@ -222,7 +205,7 @@ class _Pace:
         self.n += 1
 
 
-def _topics(reader: BagReader, dropped: Counter[str]) -> tuple[list[TopicSurvey], dict[str, int]]:
+def _topics(reader: BagReader, dropped: Mapping[str, int]) -> tuple[list[TopicSurvey], dict[str, int]]:
     """One pass over all messages: the pace of each topic, and the restarts that diagnostics tell."""
     paces = {name: _Pace() for name in reader.topics}
     restarts: dict[str, int] = {}
@@ -238,7 +221,7 @@ def _topics(reader: BagReader, dropped: Counter[str]) -> tuple[list[TopicSurvey]
             name=name,
             type=reader.topics[name].type if name in reader.topics else "",
             messages=pace.n,
-            dropped=dropped[name],
+            dropped=dropped.get(name, 0),
         )
         if pace.n:
             topic.first_s = (pace.first_ns - reader.first_ns) / 1e9

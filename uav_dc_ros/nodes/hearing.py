@@ -1,0 +1,189 @@
+"""One recorded topic: its subscription, changed when publishers come that offer less, and what it lost."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.event_handler import (
+    QoSSubscriptionEventType,
+    SubscriptionEventCallbacks,
+    UnsupportedEventTypeError,
+)
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+Callback = Callable[[bytes, Any], None]
+
+
+def union(ends: Sequence[TopicEndpointInfo]) -> QoSProfile:
+    """The QoS with which all publishers are heard, and those that resend or keep messages do so."""
+    offers = [end.qos_profile for end in ends]
+    reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+    latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+class _Ear:
+    """A subscription, and the middleware's count of what it lost."""
+
+    def __init__(self, subscription: Any) -> None:
+        self.subscription = subscription
+        kind = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST
+        try:
+            self._event = _rclpy.EventHandle(subscription.handle, kind)
+        except UnsupportedEventTypeError:
+            self._event = None
+
+    def lost(self) -> int:
+        """Messages that were lost until now; 0 with a middleware that does not count."""
+        if self._event is None:
+            return 0
+        with self._event:
+            return int(self._event.take_event().total_count)
+
+    def take(self) -> Any:
+        """The next message and its info; None if there is none now."""
+        with self.subscription.handle:
+            return self.subscription.handle.take_message(self.subscription.msg_type, True)
+
+    def close(self) -> None:
+        """Let go of the count."""
+        if self._event is not None:
+            self._event.destroy_when_not_in_use()
+            self._event = None
+
+
+class Hearing:
+    """A topic that is recorded.
+
+    Args:
+        node: that records it.
+        name: full name.
+        type: ROS 2 message type.
+        callback: takes each message and its info.
+
+    Attributes:
+        publishers: how many there were when somebody last looked.
+    """
+
+    def __init__(self, node: Node, name: str, type: str, callback: Callback) -> None:
+        self.name = name
+        self.type = type
+        self.callback = callback
+        self.publishers = 0
+        self._node = node
+        self._ear: _Ear
+        self._kind: Any = None  # the class of its messages; None: somebody else made the subscription
+        self._profile: QoSProfile
+        self._leaving: _Ear | None = None
+        self._seen: set[tuple[int, int]] = set()  # messages, while two subscriptions hear them
+        self._lost = 0  # by subscriptions that are gone
+
+    @property
+    def subscription(self) -> Any:
+        """The subscription."""
+        return self._ear.subscription
+
+    def add(self, subscription: Any) -> None:
+        """Use a subscription that somebody else has made, and will destroy."""
+        self._ear = _Ear(subscription)
+
+    def subscribe(self, kind: Any, ends: Sequence[TopicEndpointInfo]) -> None:
+        """Make a subscription that hears all of these publishers."""
+        self._kind = kind
+        self._profile = union(ends)
+        self._ear = self._made(self.callback)
+
+    def _made(self, callback: Callback) -> _Ear:
+        handler: Any = callback  # rclpy sees by the signature what it takes; its types do not
+        return _Ear(
+            self._node.create_subscription(
+                self._kind,
+                self.name,
+                handler,
+                self._profile,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                raw=True,
+            )
+        )
+
+    def adapt(self, ends: Sequence[TopicEndpointInfo]) -> None:
+        """Hear new publishers, too, if they offer less than was asked for.
+
+        A new subscription takes over from the old one; while there are two, each message is taken once.
+        """
+        if self._kind is None or self._leaving is not None:
+            return
+        wanted = union(ends)
+        if not _asks_less(wanted, self._profile):
+            return
+        self._profile = wanted
+        self._leaving = self._ear
+        self._leaving.subscription.callback = self._once
+        self._ear = self._made(self._once)
+
+    def _once(self, data: bytes, info: Any) -> None:
+        key = (info["publication_sequence_number"], info["source_timestamp"])
+        if key not in self._seen:
+            self._seen.add(key)
+            self.callback(data, info)
+
+    def settle(self) -> None:
+        """End the time of two subscriptions, once the new one hears all that the old one does."""
+        if self._leaving is None:
+            return
+        if self.subscription.get_publisher_count() < self._leaving.subscription.get_publisher_count():
+            return
+        for ear in (self._leaving, self._ear):
+            while (taken := ear.take()) is not None:
+                self._once(*taken)
+        self._lost += self._leaving.lost()
+        self._leaving.close()
+        self._node.destroy_subscription(self._leaving.subscription)
+        self._leaving = None
+        self.subscription.callback = self.callback
+        self._seen.clear()
+
+    def lost(self) -> int:
+        """Messages that were published, and lost before they came here."""
+        return self._lost + sum(ear.lost() for ear in self._ears)
+
+    @property
+    def _ears(self) -> list[_Ear]:
+        return [self._ear] if self._leaving is None else [self._leaving, self._ear]
+
+    def drain(self, until_ns: int, deadline_s: float) -> int:
+        """Handle what has arrived; how many of these messages there was no time for.
+
+        Args:
+            until_ns: messages published later do not count, nanoseconds since the epoch.
+            deadline_s: of the monotonic clock.
+        """
+        left = 0
+        for ear in self._ears:
+            while (taken := ear.take()) is not None and taken[1]["source_timestamp"] <= until_ns:
+                if time.monotonic() < deadline_s:
+                    ear.subscription.callback(*taken)
+                else:
+                    left += 1
+        return left
+
+    def close(self) -> None:
+        """Let go of the subscriptions that were made here."""
+        for ear in self._ears:
+            ear.close()
+            if self._kind is not None:
+                self._node.destroy_subscription(ear.subscription)
+        self._leaving = None
+
+
+def _asks_less(wanted: QoSProfile, asked: QoSProfile) -> bool:
+    return (wanted.reliability != asked.reliability and asked.reliability == ReliabilityPolicy.RELIABLE) or (
+        wanted.durability != asked.durability and asked.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    )

@@ -1,0 +1,102 @@
+"""`python -m uav_dc_ros.bag record`: topics of any publisher into a bag, without a mission.
+
+Ctrl-C or SIGTERM ends it, and closes the bag.
+"""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+
+import rclpy
+from rclpy.exceptions import InvalidNamespaceException
+from rclpy.validate_namespace import validate_namespace
+
+from uav_dc_ros import __version__, cli
+from uav_dc_ros.bags.part import COMPRESSIONS
+from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.nodes import parameters as p
+from uav_dc_ros.nodes import runtime
+from uav_dc_ros.nodes.recording import BagNode
+
+NODE = "bag_record"
+
+
+class Record(BagNode):
+    """Records until it is stopped, and tells what it recorded.
+
+    Args:
+        values: of its parameters.
+    """
+
+    def __init__(self, values: Mapping[str, bool | int | float | str]) -> None:
+        overrides = [rclpy.Parameter(name, value=value) for name, value in values.items()]
+        super().__init__(NODE, [*overrides, rclpy.Parameter("peers", value=[NODE])])  # waits for nobody
+
+    def about(self) -> Mapping[str, str]:
+        """By what it was recorded."""
+        return {"version": __version__}
+
+    def activate(self) -> None:
+        """Record, and say so."""
+        super().activate()
+        what = ", ".join(sorted(self.asked)) or f"everything in {self.get_namespace()}"
+        self.get_logger().info(f"recording {what} into {self.values['bag']}; Ctrl-C ends it")
+
+    def deactivate(self) -> None:
+        """Close the bag, and tell what it holds."""
+        writer = self.writer
+        super().deactivate()
+        if writer is not None:
+            self.get_logger().info(
+                f"bag {writer.folder}: {writer.message_count} messages of {len(writer.topics)} topics, "
+                f"in {writer.part_count} part{'s' * (writer.part_count != 1)}"
+            )
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the verb."""
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the new bag")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with the bag of a recorder that was killed"
+    )
+    parser.add_argument("--namespace", default="/", help="whose topics to record (default: all of them)")
+    parser.add_argument("--topics", default="", metavar="A,B", help=f"{p.RECORDED_TOPICS.description}")
+    parser.add_argument(
+        "--split-bytes", type=cli.whole_number(0), default=0, metavar="N", help=p.SPLIT_BYTES.description
+    )
+    parser.add_argument("--split-s", type=float, default=0.0, metavar="S", help=p.SPLIT_S.description)
+    parser.add_argument(
+        "--compression", choices=tuple(COMPRESSIONS), default="zstd", help=p.COMPRESSION.description
+    )
+    parser.add_argument(
+        "--min-free-bytes",
+        type=cli.whole_number(0),
+        default=p.MIN_FREE_BYTES.default,
+        metavar="N",
+        help=f"{p.MIN_FREE_BYTES.description} (default: {p.MIN_FREE_BYTES.default})",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Record until Ctrl-C or SIGTERM; leaves the process.
+
+    Raises:
+        ParameterError: a value that makes no sense.
+    """
+    values = {
+        "bag": str(options.out),
+        "resume": options.resume,
+        "topics": options.topics,
+        "split_bytes": options.split_bytes,
+        "split_s": p.SPLIT_S.value(options.split_s),
+        "compression": options.compression,
+        "min_free_bytes": options.min_free_bytes,
+    }
+    namespace = "/" + options.namespace.strip("/")
+    try:
+        validate_namespace(namespace)
+    except InvalidNamespaceException as error:
+        told = str(error).splitlines()[0]
+        raise ParameterError(f"--namespace {options.namespace!r}: {told}; expected a ROS namespace") from None
+    remapped = ["--ros-args", "-r", f"__ns:={namespace}"]
+    runtime.main(lambda: Record(values), remapped)
