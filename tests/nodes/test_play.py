@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -29,8 +30,8 @@ from uav_dc_ros.nodes import play as verb
 BAG, PLAY = "uav_dc_ros.bag", "play"
 MS = 10**6
 START_NS = 1_700_000_000 * 10**9
-VOLATILE = convert.offered_qos(depth=10, reliable=True, latched=False)
-LATCHED = convert.offered_qos(depth=2, reliable=True, latched=True)
+VOLATILE = convert.offered_qos(QoSProfile(depth=10), 10)
+LATCHED = convert.offered_qos(QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL), 2)
 WAIT = ("--wait-for-subscribers", 20)
 Messages = list[tuple[str, float, str]]  # topic, milliseconds from the beginning, text
 Heard = list[tuple[str, str, int, int]]  # topic, text, when published, when received, nanoseconds

@@ -4,7 +4,7 @@ import math
 
 import pytest
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, LivelinessPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2.metadata import dump_qos_v8, dump_qos_v9
 
@@ -75,7 +75,7 @@ FOREVER = QosTime(9223372036, 854775807)
 
 
 def offer(**changed: object) -> Qos:
-    return convert.offered_qos(depth=4, reliable=True, latched=False)._replace(**changed)  # type: ignore[arg-type]
+    return convert.offered_qos(QoSProfile(depth=4), 4)._replace(**changed)  # type: ignore[arg-type]
 
 
 def profile(*offers: Qos, per_s: float = 1.0, message_bytes: int = 100):  # type: ignore[no-untyped-def]

@@ -231,7 +231,7 @@ def test_recording_stops_before_the_disk_is_full(ros: Ros) -> None:
             ("--split-bytes", "-1"), "--split-bytes: '-1'; expected a whole number", marks=pytest.mark.long
         ),
         pytest.param(("--compression", "bz2"), "invalid choice: 'bz2'", marks=pytest.mark.long),
-        (("--namespace", "a b"), "--namespace 'a b': "),
+        (("--namespace", "a b"), "--namespace: 'a b'; "),
         pytest.param(("--out", "."), "exists already; expected a new one", marks=pytest.mark.long),
     ],
 )

@@ -8,14 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import rclpy
-from rclpy.exceptions import InvalidNamespaceException
-from rclpy.validate_namespace import validate_namespace
 
 from uav_dc_ros import __version__, cli
 from uav_dc_ros.bags.part import COMPRESSIONS
-from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.nodes import environment, runtime
 from uav_dc_ros.nodes import parameters as p
-from uav_dc_ros.nodes import runtime
 from uav_dc_ros.nodes.recording import BagNode
 
 NODE = "bag_record"
@@ -59,7 +56,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="go on with the bag of a recorder that was killed"
     )
-    parser.add_argument("--namespace", default="/", help="whose topics to record (default: all of them)")
+    parser.add_argument(
+        "--namespace",
+        type=cli.namespace,
+        default="/",
+        metavar="NS",
+        help="whose topics to record (default: all of them)",
+    )
     parser.add_argument("--topics", default="", metavar="A,B", help=f"{p.RECORDED_TOPICS.description}")
     parser.add_argument(
         "--split-bytes", type=cli.whole_number(0), default=0, metavar="N", help=p.SPLIT_BYTES.description
@@ -92,11 +95,6 @@ def run(options: argparse.Namespace) -> int:
         "compression": options.compression,
         "min_free_bytes": options.min_free_bytes,
     }
-    namespace = "/" + options.namespace.strip("/")
-    try:
-        validate_namespace(namespace)
-    except InvalidNamespaceException as error:
-        told = str(error).splitlines()[0]
-        raise ParameterError(f"--namespace {options.namespace!r}: {told}; expected a ROS namespace") from None
-    remapped = ["--ros-args", "-r", f"__ns:={namespace}"]
+    environment.prepare(alone=False)  # what is recorded may come from anywhere
+    remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
     runtime.main(lambda: Record(values), remapped)
