@@ -48,6 +48,7 @@ def test_smoke_makes_all_of_it(smoke):
     assert all(f"C{i}" in text for i in range(1, 21))
 
 
+@pytest.mark.long
 def test_the_same_seeds_give_the_same_curves(smoke, tmp_path):
     """Whatever the number of workers."""
     done = paper("--out", tmp_path / "again", "--workers", 1)

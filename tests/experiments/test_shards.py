@@ -88,6 +88,7 @@ def test_a_shard_goes_on_from_its_checkpoint(tmp_path, expected, monkeypatch):
     assert flown == [1, 2, 3, *range(3, 18), *range(17, 31)], "only the lost episode is flown twice"
 
 
+@pytest.mark.long
 def test_a_shard_whose_worker_always_dies_is_given_up(tmp_path, monkeypatch):
     one = shard(0)
 
@@ -131,6 +132,7 @@ def test_a_damaged_result_is_named(tmp_path, expected, damage):
         shards.load(tmp_path, one)
 
 
+@pytest.mark.long
 def test_a_ray_cluster_that_loses_a_node_brings_the_same(tmp_path, expected):
     """A real cluster of two nodes on this machine; one is killed while it works."""
     pytest.importorskip("ray")

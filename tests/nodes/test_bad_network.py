@@ -304,6 +304,7 @@ def test_a_pace_with_delay(ros: Ros, mission: Mission) -> None:
     assert flown.hovered() < STEPS / 2
 
 
+@pytest.mark.long
 def test_a_pace_with_a_partition(ros: Ros, mission: Mission) -> None:
     """Steps of a fifth of a second, cut at step 5 for ten of them: it hovered, and flew afterwards."""
     flown = fly(ros, mission, pace=50, bad={"delay_s": 0.02}, cut_s=2.0)

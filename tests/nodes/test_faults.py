@@ -137,6 +137,7 @@ def test_a_full_disk_ends_the_mission_with_its_reason(ros: Ros, arguments: list[
     assert "Traceback" not in output
 
 
+@pytest.mark.long
 def test_a_closed_pipe_ends_no_mission(ros: Ros, arguments: list[object], tmp_path: Path) -> None:
     process = ros.start("uav_dc_ros.run_all", *arguments, *("--pace", 100, "--missions", 2))
     assert process.stdout is not None

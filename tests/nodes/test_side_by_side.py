@@ -98,6 +98,7 @@ def test_a_policy_that_starts_late_flies_from_the_first_step(
     assert payloads(bag) == payloads(ros.folder / "alone")
 
 
+@pytest.mark.long
 def test_a_recorder_that_starts_late_is_told_what_it_missed(
     ros: Ros, options: list[object], small_scenario: Path
 ) -> None:

@@ -71,6 +71,7 @@ def test_a_mission_is_drawn_as_it_was_flown(ros: Ros, small_scenario: Path, smal
     check_is_the_end(bag)
 
 
+@pytest.mark.long
 def test_in_lockstep_each_mission_has_its_own_path(
     ros: Ros, small_scenario: Path, small_policy: Path
 ) -> None:
