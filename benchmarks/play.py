@@ -21,6 +21,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from rclpy.qos import QoSProfile
 from rosbags.typesys import Stores, get_typestore
 
 from uav_dc_ros.bags.read import BagReader
@@ -29,7 +30,7 @@ from uav_dc_ros.nodes import convert
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 STRING = "std_msgs/msg/String"
-QOS = convert.offered_qos(depth=10, reliable=True, latched=False)
+QOS = convert.offered_qos(QoSProfile(depth=10), 10)
 LISTENER = Path(__file__).parents[1] / "tests" / "nodes" / "listener.py"
 ENVIRONMENT = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 START_NS = 1_700_000_000 * 10**9

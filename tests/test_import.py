@@ -1,7 +1,9 @@
 """What importing the package does, and does not do."""
 
+import importlib.util
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -27,3 +29,17 @@ def test_gymnasium_knows_the_environment(code: str) -> None:
 def test_the_package_alone_brings_nothing_heavy() -> None:
     heavy = ("gymnasium", "torch", "numpy", "rclpy", "matplotlib")
     assert python(f"import sys, uav_dc_ros; print(*[m for m in {heavy} if m in sys.modules])").strip() == ""
+
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.mark.parametrize("benchmark", sorted(path.stem for path in BENCHMARKS.glob("*.py")))
+def test_a_benchmark_can_be_started(benchmark: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if benchmark == "sb3_dqn":
+        pytest.importorskip("stable_baselines3")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    spec = importlib.util.spec_from_file_location(benchmark, BENCHMARKS / f"{benchmark}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
