@@ -269,3 +269,52 @@ def test_a_mission_s_bag_has_all_of_its_namespace_and_nothing_of_another_mission
             reader.topics
         )
         assert reader.dropped == {}
+
+
+def disk_for(folder: Path) -> Path | None:
+    """A disk of its own, mounted from an image file; None where that cannot be."""
+    image, at = folder / "disk.img", folder / "disk"
+    at.mkdir()
+    commands = (
+        ["truncate", "-s", "600M", image],
+        ["mkfs.ext4", "-q", "-F", image],
+        ["mount", "-o", "loop", image, at],
+    )
+    for command in commands:
+        if (
+            shutil.which(command[0]) is None
+            or subprocess.run(command, check=False, capture_output=True).returncode
+        ):
+            return None
+    return image
+
+
+@pytest.mark.long
+def test_a_pulled_plug_takes_the_last_second_at_most(
+    ros: Ros, small_scenario: Path, small_policy: Path
+) -> None:
+    """What has reached the disk at some moment: a copy of its image, mounted as after a power cut."""
+    image, later = disk_for(ros.folder), ros.folder / "later"
+    if image is None:
+        pytest.skip("a disk cannot be mounted here: needs root and loop devices")
+    later.mkdir()
+    options = ("--scenario", small_scenario, "--policy", small_policy, "--pace", 50)
+    flight = ros.start("uav_dc_ros.run_all", *options, "--bag", ros.folder / "disk" / "bag")
+    try:
+        assert flight.stdout is not None
+        wait_for(flight.stdout, "step 20/30")
+        plug_ns = time.time_ns()
+        copy = shutil.copy(image, ros.folder / "copy.img")
+        assert finish(flight)[0] == 0
+        subprocess.run(["mount", "-o", "loop", copy, later], check=True)
+        status, output = ros.run(
+            "uav_dc_ros.bag", "recover", later / "bag", "--out", ros.folder / "recovered"
+        )
+    finally:
+        flight.wait(60)
+        for mounted in (later, ros.folder / "disk"):
+            subprocess.run(["umount", mounted], check=False, capture_output=True)
+    assert status == 0, output
+    with BagReader(ros.folder / "recovered") as reader:
+        assert reader.message_count > 50
+        assert plug_ns - reader.last_ns < 10**9

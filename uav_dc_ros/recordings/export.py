@@ -164,7 +164,7 @@ def write_tables(
             raise BagError("the bag holds no step of any mission; expected at least one")
         stack.close()  # everything is written before the folder takes its name
     told = ", ".join(f"{table.count} rows of {name}" for name, table in tables.items())
-    print(f"{folder}: {n_missions} missions: {told}")
+    print(f"{folder}: {n_missions} mission{'s' * (n_missions != 1)}: {told}")
 
 
 def write_transitions(
