@@ -163,7 +163,8 @@ def verify(
             f"bag {reader.path}: none of its {n_steps} steps can be recomputed: {_reasons(channel)}"
         )
     told = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
-    flown = f"{n_missions} mission{'s' * (n_missions != 1)}, {n_steps} steps in scenario {scenario.name!r}{told}"
+    missions = f"{n_missions} mission{'s' * (n_missions != 1)}"
+    flown = f"{missions}, {n_steps} steps in scenario {scenario.name!r}{told}"
     lines = [*_lines("channel", channel), *_channel_notes(channel), *_lines("world", world)]
     if world.hovered:
         lines.append(f"  {world.hovered} moves were not flown: they came too late, and the vehicle hovered")
