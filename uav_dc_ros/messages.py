@@ -31,9 +31,15 @@ Name: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}(?!\n)$")]
 
 
 class Phase(StrEnum):
-    """Where a mission stands."""
+    """Where a mission stands. A simulated vehicle knows `ready` and the ends only."""
 
+    IDLE = "idle"  # nothing has begun
+    CONNECTING = "connecting"  # waiting for the autopilot, and for its position
+    PREFLIGHT = "preflight"  # on the ground, until mode and motors are as they must be
+    TAKEOFF = "takeoff"  # on its way to where the mission starts
     READY = "ready"  # waiting for the move of this step
+    MOVING = "moving"  # on its way to a cell
+    LANDING = "landing"  # on its way down
     LANDED = "landed"  # over, at the dock
     TIMEOUT = "timeout"  # over, out of steps somewhere else
     ABORTED = "aborted"  # over, stopped before its end
@@ -41,7 +47,7 @@ class Phase(StrEnum):
     @property
     def is_over(self) -> bool:
         """Has this mission no further step."""
-        return self is not Phase.READY
+        return self in (Phase.LANDED, Phase.TIMEOUT, Phase.ABORTED)
 
 
 class Payload(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

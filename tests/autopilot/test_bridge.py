@@ -1,0 +1,216 @@
+"""The bridge's decisions, with a simulated vehicle and clock: missions, faults, pilots."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.autopilot.simulated import Vehicle
+from uav_dc_ros import scenarios
+from uav_dc_ros.autopilot.bridge import Bridge, Settings
+from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode
+from uav_dc_ros.core.grid import Action
+from uav_dc_ros.messages import Phase
+
+SCENARIO = scenarios.load("five_clusters")
+TICK_S = 0.05
+START = Enu(*SCENARIO.mission.start_m)
+ARMING = Settings(arm=True)
+
+
+def way_home(bridge: Bridge) -> Action:
+    """A policy: straight to the dock, then hover."""
+    (x, y, _), (dock_x, dock_y) = bridge.cell, SCENARIO.dock_cell
+    if x != dock_x:
+        return Action.RIGHT if x < dock_x else Action.LEFT
+    if y != dock_y:
+        return Action.FORWARD if y < dock_y else Action.BACKWARD
+    return Action.HOVER
+
+
+class Flight:
+    """Bridge, vehicle and policy, tick by tick."""
+
+    def __init__(self, how: Settings = ARMING, vehicle: Vehicle | None = None, **bridge: object) -> None:
+        self.vehicle = vehicle or Vehicle(position=Enu(START.east_m, START.north_m, 0.0))
+        self.log: list[tuple[Phase, int, str]] = []
+        self.executed: list[int] = []
+        self.bridge = Bridge(SCENARIO, how, self._note, **bridge)  # type: ignore[arg-type]
+        self.policy: Callable[[Bridge], Action] | None = way_home
+
+    def _note(self) -> None:
+        bridge = self.bridge
+        changed = not self.log or self.log[-1][0] is not bridge.phase
+        self.log.append((bridge.phase, bridge.step, bridge.reason))
+        if bridge.phase is Phase.MOVING and changed:
+            self.executed.append(bridge.step)
+
+    def tick(self, tick_s: float = TICK_S) -> None:
+        bridge, vehicle = self.bridge, self.vehicle
+        for wish in bridge.tick(vehicle.now_s, vehicle.told):
+            vehicle.ask(wish)
+        if bridge.setpoint is not None:
+            assert bridge.fence.breach(bridge.setpoint) is None
+        if bridge.phase is Phase.READY and self.policy is not None:
+            bridge.move(bridge.step, self.policy(bridge))
+        vehicle.pass_time(tick_s, bridge.setpoint)
+
+    def until(self, phase: Phase, limit_s: float = 3000.0) -> None:
+        end_s = self.vehicle.now_s + limit_s
+        while self.bridge.phase is not phase:
+            assert self.vehicle.now_s < end_s, self.log[-5:]
+            assert not self.bridge.is_over, self.log[-5:]
+            self.tick()
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK_S)):
+            self.tick()
+
+
+def test_a_whole_mission_from_the_ground_to_the_dock() -> None:
+    flight = Flight()
+    flight.until(Phase.LANDED)
+    phases = list(dict.fromkeys(phase for phase, _, _ in flight.log))
+    assert phases == [
+        *(Phase.CONNECTING, Phase.PREFLIGHT, Phase.TAKEOFF, Phase.READY, Phase.MOVING),
+        *(Phase.LANDING, Phase.LANDED),
+    ]
+    assert flight.executed == list(range(SCENARIO.mission.max_steps))
+    assert flight.bridge.cell[:2] == SCENARIO.dock_cell
+    assert flight.vehicle.position.up_m < 0.1
+    assert np.allclose(flight.vehicle.position[:2], SCENARIO.mission.dock_m, atol=ARMING.tolerance_m)
+    assert not flight.vehicle.armed
+
+
+def test_without_arm_it_waits_for_a_pilot_and_asks_for_nothing() -> None:
+    flight = Flight(Settings())
+    flight.run(600.0)
+    assert flight.vehicle.asked == []
+    assert flight.bridge.phase is Phase.PREFLIGHT
+    flight.vehicle.mode, flight.vehicle.armed = Mode.COMMANDED, True
+    flight.until(Phase.LANDED)
+    assert not any(isinstance(wish, Arm) or wish == SetMode(Mode.COMMANDED) for wish in flight.vehicle.asked)
+
+
+def fly_to_step(step: int, how: Settings = ARMING) -> Flight:
+    flight = Flight(how)
+    while flight.bridge.step < step or flight.bridge.phase is not Phase.MOVING:
+        flight.tick()
+    return flight
+
+
+def test_a_pilot_who_takes_over_has_it_at_once_and_for_good() -> None:
+    flight = fly_to_step(5)
+    flight.vehicle.asked.clear()
+    flight.vehicle.mode = Mode.OTHER
+    flight.run(0.1)
+    assert flight.bridge.phase is Phase.ABORTED
+    assert "taken over" in flight.bridge.reason
+    flight.vehicle.mode = Mode.COMMANDED
+    flight.run(60.0)
+    assert flight.bridge.setpoint is None
+    assert flight.vehicle.asked == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        ({"frozen": True}, "no position for 0.5 s"),
+        ({"estimate_ok": False}, "lost its position estimate"),
+        ({"battery": 0.1}, "battery 10%"),
+    ],
+)
+@pytest.mark.parametrize("then", [Mode.RETURN, Mode.LAND])
+def test_a_fault_that_stays_brings_it_down(fault: dict[str, object], why: str, then: Mode) -> None:
+    flight = fly_to_step(5, Settings(arm=True, then=then))
+    for name, value in fault.items():
+        setattr(flight.vehicle, name, value)
+    flight.until(Phase.ABORTED, 600.0)
+    assert why in flight.bridge.reason
+    assert flight.vehicle.asked[-1] == SetMode(then)
+    assert not flight.vehicle.armed
+
+
+def test_a_short_fault_is_held_through() -> None:
+    flight = fly_to_step(5)
+    setpoint = flight.bridge.setpoint
+    flight.vehicle.frozen = True
+    flight.run(2.0)
+    assert flight.bridge.fault is not None
+    assert flight.bridge.setpoint == setpoint
+    flight.vehicle.frozen = False
+    flight.until(Phase.LANDED)
+    assert flight.executed == list(range(SCENARIO.mission.max_steps))
+
+
+def test_a_silent_policy_ends_the_mission_after_two_steps() -> None:
+    flight = fly_to_step(3)
+    flight.policy = None
+    flight.until(Phase.LANDING)
+    assert flight.bridge.reason == "no move from the policy for 30 s"
+    flight.until(Phase.ABORTED)
+
+
+def test_a_vehicle_that_flies_already_goes_on_where_it_was() -> None:
+    vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
+    flight = Flight(Settings(), vehicle, step=7, cell=(3, 3, 1))
+    flight.until(Phase.LANDED)
+    assert flight.executed == list(range(7, SCENARIO.mission.max_steps))
+
+
+def test_a_vehicle_that_flies_already_lands_where_that_is_wanted() -> None:
+    vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
+    flight = Flight(Settings(flying_at_start="land"), vehicle)
+    flight.until(Phase.ABORTED)
+    assert flight.executed == []
+    assert not vehicle.armed
+
+
+def test_moves_out_of_turn_change_nothing() -> None:
+    flight = fly_to_step(5)
+    before = flight.bridge.cell, flight.bridge.setpoint
+    assert "expected it to be ready" in str(flight.bridge.move(5, Action.UPWARD))
+    flight.policy = None
+    flight.until(Phase.READY)
+    assert flight.bridge.move(5, Action.UPWARD) == "a move for step 5; expected 6"
+    assert (flight.bridge.cell, flight.bridge.setpoint) == before
+
+
+FAULTS = st.sampled_from(
+    ["frozen", "silent", "deaf", "estimate", "battery", "pilot", "disarmed", "blown", "policy"]
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(fault=FAULTS, at_s=st.floats(0.0, 500.0), lasts_s=st.floats(0.1, 60.0))
+def test_whatever_goes_wrong_has_an_end(fault: str, at_s: float, lasts_s: float) -> None:
+    flight = Flight()
+    vehicle = flight.vehicle
+    healed = False
+    while not flight.bridge.is_over and vehicle.now_s < 4000.0:
+        if at_s <= vehicle.now_s < at_s + lasts_s:
+            match fault:
+                case "frozen" | "silent" | "deaf":
+                    setattr(vehicle, fault, True)
+                case "estimate":
+                    vehicle.estimate_ok = False
+                case "battery":
+                    vehicle.battery = 0.15
+                case "pilot":
+                    vehicle.mode = Mode.OTHER
+                case "disarmed":
+                    vehicle.armed = False
+                case "blown":
+                    vehicle.position = vehicle.position._replace(east_m=2000.0)
+                case "policy":
+                    flight.policy = None
+        elif vehicle.now_s >= at_s + lasts_s and not healed:
+            vehicle.frozen = vehicle.silent = vehicle.deaf = False
+            vehicle.estimate_ok, flight.policy, healed = True, way_home, True
+        flight.tick(0.2)
+    assert flight.bridge.is_over, flight.log[-3:]
+    assert flight.bridge.reason
+    assert flight.executed == sorted(set(flight.executed)), "no step twice"

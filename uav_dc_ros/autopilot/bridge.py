@@ -1,0 +1,338 @@
+"""The vehicle between policy and autopilot, from connecting to landing: phases, steps, faults.
+
+    idle -> connecting -> preflight -> takeoff -> ready <-> moving -> landing -> landed | timeout | aborted
+
+It decides, and does nothing itself: `tick` is called often with what is known of the vehicle, and returns
+wishes for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
+last good setpoint stays), then to *return* or *land*, and at last to `aborted` with its reason. A pilot who
+changes the mode has the vehicle at once: from then on there are no setpoints and no wishes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from uav_dc_ros.autopilot.fence import Fence
+from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
+from uav_dc_ros.core import world as core
+from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.messages import Phase
+
+FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
+STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How carefully to fly.
+
+    Attributes:
+        arm: may the bridge set the mode, and arm? Otherwise it waits for a pilot to do so.
+        tolerance_m: distance within which the vehicle is at a cell's centre.
+        dwell_s: how long it must be there for a step to be done, vehicle time.
+        position_age_s: age of the position after which nobody flies by it.
+        link_age_s: age of the last heartbeat after which the link is lost.
+        silent_steps: steps' time without a move after which the policy is given up.
+        hold_s: how long a fault may last before the mission ends.
+        least_battery: charge at which the mission ends, 0 to 1.
+        then: what ends a mission that cannot go on.
+        flying_at_start: what to do with a vehicle that flies already, in the commanded mode.
+        retry_s: pause before a wish that was not fulfilled is uttered again, vehicle time.
+        takeoff_s: longest time from the first wish to take off until the start is reached, vehicle time.
+    """
+
+    arm: bool = False
+    tolerance_m: float = 2.0
+    dwell_s: float = 1.0
+    position_age_s: float = 0.5
+    link_age_s: float = 3.0
+    silent_steps: float = 2.0
+    hold_s: float = 5.0
+    least_battery: float = 0.2
+    then: Literal[Mode.RETURN, Mode.LAND] = Mode.RETURN
+    flying_at_start: Literal["resume", "land"] = "resume"
+    retry_s: float = 2.0
+    takeoff_s: float = 300.0
+
+
+class Bridge:
+    """One mission of one vehicle.
+
+    Args:
+        scenario: the world that is flown.
+        settings: how carefully.
+        on_change: called after each change of phase or step.
+        step, cell: where a mission that is resumed stands.
+
+    Attributes:
+        phase: where the mission stands.
+        reason: why it is in this phase, in words.
+        step: steps flown.
+        cell: the cell that the vehicle is in, or flies to.
+        fault: what keeps it from going on at the moment; None: nothing.
+        setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        settings: Settings,
+        on_change: Callable[[], None] = lambda: None,
+        *,
+        step: int = 0,
+        cell: tuple[int, int, int] | None = None,
+    ) -> None:
+        self.scenario, self.settings = scenario, settings
+        self.fence = Fence.around(scenario)
+        self.phase, self.reason = Phase.IDLE, "not started"
+        self.step, self.cell = step, cell or scenario.start_cell
+        self.fault: str | None = None
+        self.setpoint: Enu | None = None
+        self._on_change = on_change
+        self._outcome = Phase.ABORTED  # of a mission that lands
+        self._asked: dict[Wish, float] = {}  # when a wish was last uttered, vehicle time
+        self._since_s = 0.0  # vehicle time of the last change of phase
+        self._there_since_s: float | None = None
+        self._fault_since_s = 0.0
+        self._now_s = 0.0  # vehicle time
+        self._down: Mode = settings.then  # how it descends
+
+    @property
+    def is_over(self) -> bool:
+        """Is there nothing left to do."""
+        return self.phase.is_over
+
+    def move(self, step: int, action: Action) -> str | None:
+        """Fly a move; or why not. A move for another step, or at another time, changes nothing."""
+        if self.phase is not Phase.READY or self.fault is not None:
+            return f"the vehicle is {self.phase.value} ({self.fault or self.reason}); expected it to be ready"
+        if step != self.step:
+            return f"a move for step {step}; expected {self.step}"
+        cell = self.scenario.grid.move(np.asarray(self.cell), np.asarray(int(action)))
+        breach = self.fence.breach(self._centre(tuple(cell.tolist())))
+        if breach is not None:
+            return f"the target is outside the fence: {breach}"
+        self.cell = tuple(cell.tolist())
+        self.setpoint = self._centre(self.cell)
+        self._enter(Phase.MOVING, f"{action.label} to cell {self.cell}", self._now_s)
+        return None
+
+    def tick(self, now_s: float, known: Telemetry) -> list[Wish]:
+        """Go on.
+
+        Args:
+            now_s: the steady clock that telemetry's times are of.
+            known: of the vehicle.
+
+        Returns:
+            Wishes to be passed on now, at most one of each kind.
+        """
+        self._now_s = known.vehicle_s
+        if self.phase is Phase.IDLE:
+            self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position", known.vehicle_s)
+        if self.phase.is_over:
+            return []
+        if self.phase in FLYING:
+            if self._taken_over(known):
+                return []
+            self._watch(now_s, known)
+        if self.fault is not None and self.phase in STEERED:
+            return []  # hold: the setpoint stays
+        wishes = {
+            Phase.CONNECTING: self._connect,
+            Phase.PREFLIGHT: self._prepare,
+            Phase.TAKEOFF: self._take_off,
+            Phase.READY: self._wait,
+            Phase.MOVING: self._fly,
+            Phase.LANDING: self._land,
+        }[self.phase](now_s, known)
+        return [wish for wish in wishes if self._may_ask(wish, known.vehicle_s)]
+
+    # What goes wrong.
+
+    def _taken_over(self, known: Telemetry) -> bool:
+        """Has somebody else the vehicle now: a pilot who changed the mode, or whoever disarmed it."""
+        ours = (Mode.COMMANDED,) if self.phase in STEERED else (Mode.LAND, Mode.RETURN, Mode.COMMANDED)
+        if self.phase is Phase.LANDING and not known.armed:
+            return False  # it stands
+        if not known.armed:
+            self._end(Phase.ABORTED, f"disarmed by somebody else while it was {self.phase.value}")
+        elif known.mode not in ours:
+            self._end(Phase.ABORTED, f"taken over: mode {known.mode_name or known.mode.value}")
+        return self.phase.is_over
+
+    def _watch(self, now_s: float, known: Telemetry) -> None:
+        """Find what keeps the vehicle from going on; what lasts too long ends the mission."""
+        settings = self.settings
+        if self.phase is Phase.LANDING:
+            return
+        if known.battery is not None and known.battery < settings.least_battery:
+            self._give_up(f"battery {known.battery:.0%}; expected at least {settings.least_battery:.0%}")
+            return
+        position = known.position
+        if position is not None and (breach := self.fence.breach(position)) is not None:
+            self._give_up(f"the vehicle is outside the fence: {breach}")
+            return
+        fault = self._fault(now_s, known)
+        if fault is None:
+            if self.fault is not None:
+                self.fault = None
+                self._change(f"goes on after: {self.reason}")
+            return
+        if self.fault is None:
+            self._fault_since_s = now_s
+            self.fault = fault
+            self._change(f"holds: {fault}")
+        elif now_s - self._fault_since_s > settings.hold_s:
+            self._give_up(fault)
+
+    def _fault(self, now_s: float, known: Telemetry) -> str | None:
+        settings = self.settings
+        if known.heartbeat_s is None or now_s - known.heartbeat_s > settings.link_age_s:
+            return f"no heartbeat for {settings.link_age_s:g} s"
+        if known.position_s is None or now_s - known.position_s > settings.position_age_s:
+            return f"no position for {settings.position_age_s:g} s"
+        if not known.estimate_ok:
+            return "the autopilot has lost its position estimate"
+        return None
+
+    def _give_up(self, why: str) -> None:
+        """End the mission: bring the vehicle down."""
+        self.fault = None
+        self._outcome = Phase.ABORTED
+        self._descend(self.settings.then, why)
+
+    # What is to be done in each phase.
+
+    def _connect(self, now_s: float, known: Telemetry) -> list[Wish]:
+        fault = self._fault(now_s, known)
+        if fault is not None or known.position is None:
+            self._change(fault or "no position yet")
+            return []
+        if (breach := self.fence.breach(known.position)) is not None:
+            self._change(f"the vehicle is outside the fence: {breach}")
+            return []
+        self.setpoint = known.position  # an autopilot may want to see setpoints before it follows any
+        flies = known.armed and known.on_ground is False
+        if flies and known.mode is Mode.COMMANDED:
+            if self.settings.flying_at_start == "land":
+                self._outcome = Phase.ABORTED
+                self._descend(self.settings.then, "it flew already when the bridge came")
+                return []
+            self.setpoint = self._centre(self.cell)
+            self._enter(
+                Phase.TAKEOFF, "it flies already: to the cell where the mission stands", known.vehicle_s
+            )
+            return []
+        self._enter(Phase.PREFLIGHT, "connected", known.vehicle_s)
+        return []
+
+    def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
+        if (fault := self._fault(now_s, known)) is not None:
+            self.setpoint = None
+            self._enter(Phase.CONNECTING, fault, known.vehicle_s)
+            return []
+        if known.mode is Mode.COMMANDED and known.armed:
+            x_m, y_m, _ = known.position or self._centre(self.cell)
+            self.setpoint = Enu(x_m, y_m, self._centre(self.cell).up_m)
+            if (breach := self.fence.breach(self.setpoint)) is not None:
+                self._give_up(f"the target is outside the fence: {breach}")
+                return []
+            self._enter(Phase.TAKEOFF, "armed, in the commanded mode", known.vehicle_s)
+            return []
+        if not self.settings.arm:
+            self._change("waiting for a pilot to set the mode and arm (--arm does it here)")
+            return []
+        if known.mode is not Mode.COMMANDED:
+            return [SetMode(Mode.COMMANDED)]
+        return [Arm()]
+
+    def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
+        start, position = self._centre(self.cell), known.position
+        assert position is not None, "a fault otherwise"
+        if known.vehicle_s - self._since_s > self.settings.takeoff_s:
+            self._give_up(f"not at the start after {self.settings.takeoff_s:g} s")
+            return []
+        if position.up_m >= start.up_m - self.settings.tolerance_m:
+            self.setpoint = start  # high enough to fly across
+        if self._is_there(start, known):
+            self._enter(Phase.READY, f"at the start, cell {self.cell}", known.vehicle_s)
+            return []
+        return [TakeOff(start.up_m)] if known.on_ground is not False else []
+
+    def _wait(self, now_s: float, known: Telemetry) -> list[Wish]:
+        patience_s = self.settings.silent_steps * self.scenario.mission.step_s
+        if known.vehicle_s - self._since_s > patience_s:
+            self._give_up(f"no move from the policy for {patience_s:g} s")
+        return []
+
+    def _fly(self, now_s: float, known: Telemetry) -> list[Wish]:
+        there = self._is_there(self._centre(self.cell), known)
+        if not there and known.vehicle_s - self._since_s < self.scenario.mission.step_s:
+            return []
+        self.step += 1
+        how = "there" if there else f"not there after {self.scenario.mission.step_s:g} s, which a step has"
+        terminated, truncated, landed = core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
+        if not (terminated or truncated):
+            self._enter(Phase.READY, f"step {self.step}: {how}", known.vehicle_s)
+        elif landed:
+            self._outcome = Phase.LANDED
+            self._descend(Mode.LAND, f"step {self.step}: at the dock")
+        else:
+            self._outcome = Phase.TIMEOUT
+            self._descend(self.settings.then, f"step {self.step}: out of steps away from the dock")
+        return []
+
+    def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
+        if not known.armed or known.on_ground:
+            self._end(self._outcome, self.reason)
+            return []
+        return [SetMode(self._down)] if known.mode is not self._down else []
+
+    # Small change.
+
+    def _is_there(self, target: Enu, known: Telemetry) -> bool:
+        """Has the vehicle been at a place for the dwell time."""
+        assert known.position is not None, "a fault otherwise"
+        if float(np.linalg.norm(np.subtract(known.position, target))) > self.settings.tolerance_m:
+            self._there_since_s = None
+            return False
+        if self._there_since_s is None:
+            self._there_since_s = known.vehicle_s
+        return known.vehicle_s - self._there_since_s >= self.settings.dwell_s
+
+    def _centre(self, cell: tuple[int, ...]) -> Enu:
+        return Enu(*self.scenario.grid.centre_m(np.asarray(cell), like=np.zeros(1)).tolist())
+
+    def _descend(self, how: Mode, why: str) -> None:
+        self._down = how
+        self.setpoint = None
+        self._enter(Phase.LANDING, why, self._now_s)
+
+    def _end(self, phase: Phase, why: str) -> None:
+        self.setpoint, self.fault = None, None
+        self._enter(phase, why, self._now_s)
+
+    def _enter(self, phase: Phase, why: str, vehicle_s: float) -> None:
+        self.phase, self._since_s, self._there_since_s = phase, vehicle_s, None
+        self._asked.clear()
+        self.reason = why
+        self._on_change()
+
+    def _change(self, why: str) -> None:
+        """Tell another reason within a phase."""
+        if why != self.reason:
+            self.reason = why
+            self._on_change()
+
+    def _may_ask(self, wish: Wish, vehicle_s: float) -> bool:
+        """Utter a wish now: the first time, or long enough after the last."""
+        last_s = self._asked.get(wish)
+        if last_s is not None and vehicle_s - last_s < self.settings.retry_s:
+            return False
+        self._asked[wish] = vehicle_s
+        return True

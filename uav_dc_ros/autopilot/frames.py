@@ -1,0 +1,107 @@
+"""Frames: ENU with yaw from the east (ROS, REP 103), NED with heading from the north (autopilots).
+
+Local ENU metres are counted from a *datum*, a point on the Earth: the corner of the grid, on the ground.
+An autopilot counts its local NED metres from an *origin* of its own, mostly where it was switched on.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import pymap3d
+
+
+class Enu(NamedTuple):
+    """East, north, up, metres."""
+
+    east_m: float
+    north_m: float
+    up_m: float
+
+
+class Ned(NamedTuple):
+    """North, east, down, metres."""
+
+    north_m: float
+    east_m: float
+    down_m: float
+
+
+def to_ned(position: Enu) -> Ned:
+    """The same point or vector, as NED."""
+    return Ned(position.north_m, position.east_m, -position.up_m)
+
+
+def to_enu(position: Ned) -> Enu:
+    """The same point or vector, as ENU."""
+    return Enu(position.east_m, position.north_m, -position.down_m)
+
+
+def heading_of_yaw(yaw_rad: float) -> float:
+    """Heading, clockwise from the north, of a yaw, counter-clockwise from the east; in (-pi, pi]."""
+    return wrapped(math.pi / 2 - yaw_rad)
+
+
+def yaw_of_heading(heading_rad: float) -> float:
+    """Yaw, counter-clockwise from the east, of a heading, clockwise from the north; in (-pi, pi]."""
+    return wrapped(math.pi / 2 - heading_rad)
+
+
+def wrapped(angle_rad: float) -> float:
+    """The same angle in (-pi, pi]."""
+    return math.pi - (math.pi - angle_rad) % (2 * math.pi)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geodetic:
+    """A point on WGS84.
+
+    Attributes:
+        latitude_deg, longitude_deg: degrees, north and east positive.
+        altitude_m: metres; above what, is the same for all points of one flight.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+    def seen_from(self, datum: "Geodetic") -> Enu:
+        """Position of this point in the ENU frame of a datum (exact on WGS84, not the flat Earth's)."""
+        return Enu(
+            *pymap3d.geodetic2enu(
+                self.latitude_deg,
+                self.longitude_deg,
+                self.altitude_m,
+                datum.latitude_deg,
+                datum.longitude_deg,
+                datum.altitude_m,
+            )
+        )
+
+    def at(self, offset: Enu) -> "Geodetic":
+        """The point at an offset in this point's ENU frame."""
+        latitude_deg, longitude_deg, altitude_m = pymap3d.enu2geodetic(
+            *offset, self.latitude_deg, self.longitude_deg, self.altitude_m
+        )
+        return Geodetic(
+            latitude_deg=float(latitude_deg), longitude_deg=float(longitude_deg), altitude_m=float(altitude_m)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalFrame:
+    """Between the grid's ENU metres and an autopilot's local NED metres.
+
+    Attributes:
+        origin: where the autopilot counts from, in the grid's ENU frame.
+    """
+
+    origin: Enu
+
+    def to_autopilot(self, position: Enu) -> Ned:
+        """A position of the grid, as the autopilot's local NED."""
+        return to_ned(Enu(*(p - o for p, o in zip(position, self.origin, strict=True))))
+
+    def from_autopilot(self, position: Ned) -> Enu:
+        """A position of the autopilot's, in the grid's ENU frame."""
+        return Enu(*(p + o for p, o in zip(to_enu(position), self.origin, strict=True)))

@@ -1,0 +1,66 @@
+"""What passes between the bridge and a transport: telemetry one way, wishes the other."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from uav_dc_ros.autopilot.frames import Enu
+
+
+class Mode(StrEnum):
+    """What an autopilot may be asked to do; each calls it by a name of its own."""
+
+    COMMANDED = "commanded"  # follow setpoints: GUIDED of ArduPilot, OFFBOARD of PX4
+    HOLD = "hold"  # stay where it is: BRAKE or LOITER, AUTO.LOITER
+    RETURN = "return"  # RTL, AUTO.RTL
+    LAND = "land"  # here: LAND, AUTO.LAND
+    OTHER = "other"  # any other: somebody else flies
+
+
+@dataclass(frozen=True, kw_only=True)
+class Telemetry:
+    """What is known of the vehicle; times are of the bridge's steady clock, seconds.
+
+    Attributes:
+        heartbeat_s: when its last heartbeat came; None: never.
+        mode, mode_name: what it does, and what the autopilot calls that.
+        armed: do its motors turn, or may they at any moment?
+        on_ground: does it stand on the ground? None: it does not tell.
+        position: in the grid's ENU frame; None: not known yet.
+        position_s: when that came.
+        estimate_ok: does the autopilot trust its position enough to fly by it?
+        battery: charge that is left, 0 to 1; None: it does not tell.
+        vehicle_s: the vehicle's own time, seconds: a simulated one may be faster than any clock here.
+    """
+
+    heartbeat_s: float | None = None
+    mode: Mode = Mode.OTHER
+    mode_name: str = ""
+    armed: bool = False
+    on_ground: bool | None = None
+    position: Enu | None = None
+    position_s: float | None = None
+    estimate_ok: bool = False
+    battery: float | None = None
+    vehicle_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class SetMode:
+    """A wish: change to a mode."""
+
+    mode: Mode
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A wish: arm. Only ever uttered when the user asked for it."""
+
+
+@dataclass(frozen=True)
+class TakeOff:
+    """A wish: climb from the ground to an altitude in the grid's frame, metres."""
+
+    altitude_m: float
+
+
+Wish = SetMode | Arm | TakeOff
