@@ -21,6 +21,8 @@ class Vehicle:
     frozen: bool = False  # its position does not come any more
     silent: bool = False  # nothing comes any more
     deaf: bool = False  # it follows no wish
+    refused: tuple[Mode, ...] = ()
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of what it believes of its position
     now_s: float = 0.0
     climb_to_m: float | None = None
     asked: list[Wish] = field(default_factory=list)
@@ -35,6 +37,8 @@ class Vehicle:
         if self.deaf or self.silent:
             return
         match wish:
+            case SetMode(mode) if mode in self.refused:
+                pass
             case SetMode(mode):
                 self.mode = mode
             case Arm():
@@ -63,13 +67,14 @@ class Vehicle:
         before = self.told
         if self.silent:
             return
+        believed = Enu(*(p + o for p, o in zip(self.position, self.offset, strict=True)))
         self.told = Telemetry(
             heartbeat_s=self.now_s,
             mode=self.mode,
             mode_name=self.mode.value.upper(),
             armed=self.armed,
             on_ground=self.on_ground,
-            position=before.position if self.frozen else self.position,
+            position=before.position if self.frozen else believed,
             position_s=before.position_s if self.frozen else self.now_s,
             estimate_ok=self.estimate_ok,
             battery=self.battery,

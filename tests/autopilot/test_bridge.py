@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from tests.autopilot.simulated import Vehicle
 from uav_dc_ros import scenarios
-from uav_dc_ros.autopilot.bridge import Bridge, Settings
+from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode
+from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 
@@ -130,8 +131,67 @@ def test_a_fault_that_stays_brings_it_down(fault: dict[str, object], why: str, t
         setattr(flight.vehicle, name, value)
     flight.until(Phase.ABORTED, 600.0)
     assert why in flight.bridge.reason
-    assert flight.vehicle.asked[-1] == SetMode(then)
+    # Who does not know where it is cannot return.
+    assert flight.vehicle.asked[-1] == SetMode(then if flight.vehicle.estimate_ok else Mode.LAND)
     assert not flight.vehicle.armed
+
+
+def test_a_vehicle_that_refuses_to_return_is_told_to_land() -> None:
+    flight = fly_to_step(5)
+    flight.vehicle.battery, flight.vehicle.refused = 0.1, (Mode.RETURN,)
+    flight.until(Phase.ABORTED, 600.0)
+    asked = [wish for wish in flight.vehicle.asked if isinstance(wish, SetMode)]
+    tries = flight.bridge.settings.returning_tries
+    assert asked[1:] == [SetMode(Mode.RETURN)] * tries + [SetMode(Mode.LAND)]
+    assert "it does not return" in flight.bridge.reason
+
+
+def test_until_it_obeys_a_vehicle_that_is_to_land_is_held() -> None:
+    flight = fly_to_step(5)
+    flight.vehicle.battery, flight.vehicle.deaf = 0.1, True
+    before = flight.bridge.setpoint
+    flight.run(60.0)
+    assert flight.bridge.phase is Phase.LANDING
+    assert flight.bridge.setpoint == before, "an autopilot may do anything when the stream ends"
+    flight.vehicle.deaf = False
+    flight.until(Phase.ABORTED, 600.0)
+
+
+def test_a_vehicle_that_is_never_heard_of_again_ends_the_mission_without_a_wish() -> None:
+    flight = fly_to_step(5)
+    flight.vehicle.asked.clear()
+    flight.vehicle.silent = True
+    flight.until(Phase.ABORTED, 200.0)
+    assert "not heard of for 120 s" in flight.bridge.reason
+    assert flight.vehicle.asked == []
+
+
+def test_a_jump_within_the_fence_is_held_through_or_ends_the_mission() -> None:
+    flight = fly_to_step(5, Settings(arm=True, hold_s=2.0))
+    flight.vehicle.offset = (0.0, 300.0, 0.0)
+    flight.run(0.2)
+    assert "jumped by 300 m" in str(flight.bridge.fault)
+    flight.vehicle.offset = (0.0, 0.0, 0.0)
+    flight.run(0.2)
+    assert flight.bridge.fault is None
+    flight.vehicle.offset = (0.0, 300.0, 0.0)
+    flight.until(Phase.ABORTED, 600.0)
+    assert "jumped by" in flight.bridge.reason
+
+
+def test_a_pilot_who_flies_already_is_left_alone() -> None:
+    vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.OTHER, armed=True)
+    flight = Flight(vehicle=vehicle)
+    flight.run(120.0)
+    assert vehicle.asked == []
+    assert "a pilot flies" in flight.bridge.reason
+
+
+def test_nobody_takes_off_with_a_low_battery() -> None:
+    flight = Flight(vehicle=Vehicle(position=Enu(START.east_m, START.north_m, 0.0), battery=0.1))
+    flight.run(60.0)
+    assert not flight.vehicle.armed
+    assert "battery 10%" in flight.bridge.reason
 
 
 def test_a_short_fault_is_held_through() -> None:
@@ -184,7 +244,7 @@ FAULTS = st.sampled_from(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(fault=FAULTS, at_s=st.floats(0.0, 500.0), lasts_s=st.floats(0.1, 60.0))
 def test_whatever_goes_wrong_has_an_end(fault: str, at_s: float, lasts_s: float) -> None:
     flight = Flight()
@@ -210,7 +270,9 @@ def test_whatever_goes_wrong_has_an_end(fault: str, at_s: float, lasts_s: float)
         elif vehicle.now_s >= at_s + lasts_s and not healed:
             vehicle.frozen = vehicle.silent = vehicle.deaf = False
             vehicle.estimate_ok, flight.policy, healed = True, way_home, True
+            vehicle.battery = 1.0  # on the ground, it waits for a full one
         flight.tick(0.2)
-    assert flight.bridge.is_over, flight.log[-3:]
+    waits = flight.bridge.phase is Phase.CONNECTING and not vehicle.armed  # blown away before it began
+    assert flight.bridge.is_over or waits, flight.log[-3:]
     assert flight.bridge.reason
     assert flight.executed == sorted(set(flight.executed)), "no step twice"

@@ -2,5 +2,8 @@
 
 frames   ENU and NED, yaw, and the grid around a datum on the Earth
 fence    where the vehicle may be, and be sent
+vehicle  what passes between the bridge and a transport
+watch    how carefully to fly, and what keeps a vehicle from going on
 bridge   from connecting to landing: phases, steps, faults
+mavlink  a transport: an autopilot on MAVLink, over TCP, UDP or a serial line
 """

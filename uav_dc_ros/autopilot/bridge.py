@@ -9,14 +9,13 @@ changes the mode has the vehicle at once: from then on there are no setpoints an
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
+from uav_dc_ros.autopilot.watch import Settings, Watch
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
@@ -24,39 +23,6 @@ from uav_dc_ros.messages import Phase
 
 FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """How carefully to fly.
-
-    Attributes:
-        arm: may the bridge set the mode, and arm? Otherwise it waits for a pilot to do so.
-        tolerance_m: distance within which the vehicle is at a cell's centre.
-        dwell_s: how long it must be there for a step to be done, vehicle time.
-        position_age_s: age of the position after which nobody flies by it.
-        link_age_s: age of the last heartbeat after which the link is lost.
-        silent_steps: steps' time without a move after which the policy is given up.
-        hold_s: how long a fault may last before the mission ends.
-        least_battery: charge at which the mission ends, 0 to 1.
-        then: what ends a mission that cannot go on.
-        flying_at_start: what to do with a vehicle that flies already, in the commanded mode.
-        retry_s: pause before a wish that was not fulfilled is uttered again, vehicle time.
-        takeoff_s: longest time from the first wish to take off until the start is reached, vehicle time.
-    """
-
-    arm: bool = False
-    tolerance_m: float = 2.0
-    dwell_s: float = 1.0
-    position_age_s: float = 0.5
-    link_age_s: float = 3.0
-    silent_steps: float = 2.0
-    hold_s: float = 5.0
-    least_battery: float = 0.2
-    then: Literal[Mode.RETURN, Mode.LAND] = Mode.RETURN
-    flying_at_start: Literal["resume", "land"] = "resume"
-    retry_s: float = 2.0
-    takeoff_s: float = 300.0
 
 
 class Bridge:
@@ -100,6 +66,8 @@ class Bridge:
         self._fault_since_s = 0.0
         self._now_s = 0.0  # vehicle time
         self._down: Mode = settings.then  # how it descends
+        self._tries = 0  # at having it descend so
+        self._watched = Watch(settings)
 
     @property
     def is_over(self) -> bool:
@@ -162,7 +130,9 @@ class Bridge:
         if not known.armed:
             self._end(Phase.ABORTED, f"disarmed by somebody else while it was {self.phase.value}")
         elif known.mode not in ours:
-            self._end(Phase.ABORTED, f"taken over: mode {known.mode_name or known.mode.value}")
+            why = self.fault or (self.reason if self.phase is Phase.LANDING else None)
+            after = f" (after: {why})" if why else ""  # maybe the autopilot's own answer to that
+            self._end(Phase.ABORTED, f"taken over: mode {known.mode_name or known.mode.value}{after}")
         return self.phase.is_over
 
     def _watch(self, now_s: float, known: Telemetry) -> None:
@@ -170,14 +140,14 @@ class Bridge:
         settings = self.settings
         if self.phase is Phase.LANDING:
             return
-        if known.battery is not None and known.battery < settings.least_battery:
-            self._give_up(f"battery {known.battery:.0%}; expected at least {settings.least_battery:.0%}")
+        if (low := self._watched.battery_is_low(known)) is not None:
+            self._give_up(low)
             return
         position = known.position
         if position is not None and (breach := self.fence.breach(position)) is not None:
             self._give_up(f"the vehicle is outside the fence: {breach}")
             return
-        fault = self._fault(now_s, known)
+        fault = self._watched.fault(now_s, known)
         if fault is None:
             if self.fault is not None:
                 self.fault = None
@@ -188,30 +158,21 @@ class Bridge:
             self.fault = fault
             self._change(f"holds: {fault}")
         elif now_s - self._fault_since_s > settings.hold_s:
-            self._give_up(fault)
+            self._give_up(fault, known)
 
-    def _fault(self, now_s: float, known: Telemetry) -> str | None:
-        settings = self.settings
-        if known.heartbeat_s is None or now_s - known.heartbeat_s > settings.link_age_s:
-            return f"no heartbeat for {settings.link_age_s:g} s"
-        if known.position_s is None or now_s - known.position_s > settings.position_age_s:
-            return f"no position for {settings.position_age_s:g} s"
-        if not known.estimate_ok:
-            return "the autopilot has lost its position estimate"
-        return None
-
-    def _give_up(self, why: str) -> None:
-        """End the mission: bring the vehicle down."""
+    def _give_up(self, why: str, known: Telemetry | None = None) -> None:
+        """End the mission: bring the vehicle down. One that does not know where it is cannot return."""
         self.fault = None
         self._outcome = Phase.ABORTED
-        self._descend(self.settings.then, why)
+        lost = known is not None and not known.estimate_ok
+        self._descend(Mode.LAND if lost else self.settings.then, why)
 
     # What is to be done in each phase.
 
     def _connect(self, now_s: float, known: Telemetry) -> list[Wish]:
-        fault = self._fault(now_s, known)
-        if fault is not None or known.position is None:
-            self._change(fault or "no position yet")
+        fault = self._watched.fault(now_s, known)
+        if known.missing is not None or fault is not None or known.position is None:
+            self._change(known.missing or fault or "no position yet")
             return []
         if (breach := self.fence.breach(known.position)) is not None:
             self._change(f"the vehicle is outside the fence: {breach}")
@@ -232,7 +193,10 @@ class Bridge:
         return []
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
-        if (fault := self._fault(now_s, known)) is not None:
+        fault = self._watched.fault(now_s, known)
+        if fault is None and known.position is not None:
+            fault = self.fence.breach(known.position)
+        if fault is not None and not (known.armed and known.mode is Mode.COMMANDED):
             self.setpoint = None
             self._enter(Phase.CONNECTING, fault, known.vehicle_s)
             return []
@@ -244,12 +208,21 @@ class Bridge:
                 return []
             self._enter(Phase.TAKEOFF, "armed, in the commanded mode", known.vehicle_s)
             return []
+        if known.armed:
+            mode = known.mode_name or known.mode.value
+            if Arm() in self._asked:
+                self._end(Phase.ABORTED, f"taken over: mode {mode}, before it took off")
+            else:
+                self._change(f"a pilot flies: mode {mode}")
+            return []
+        if (low := self._watched.battery_is_low(known)) is not None:
+            self._change(low)
+            return []
         if not self.settings.arm:
             self._change("waiting for a pilot to set the mode and arm (--arm does it here)")
             return []
-        if known.mode is not Mode.COMMANDED:
-            return [SetMode(Mode.COMMANDED)]
-        return [Arm()]
+        self._change(known.refusal or "sets the mode and arms")
+        return [Arm()] if known.mode is Mode.COMMANDED else [SetMode(Mode.COMMANDED)]
 
     def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
         start, position = self._centre(self.cell), known.position
@@ -288,15 +261,29 @@ class Bridge:
         return []
 
     def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
-        if not known.armed or known.on_ground:
+        if self._watched.link_is_lost(now_s, known):  # who knows what mode it is in by now
+            if known.heartbeat_s is None or now_s - known.heartbeat_s > self.settings.lost_s:
+                self._end(Phase.ABORTED, f"{self.reason}; not heard of for {self.settings.lost_s:g} s")
+            return []
+        if not known.armed:
             self._end(self._outcome, self.reason)
             return []
-        return [SetMode(self._down)] if known.mode is not self._down else []
+        if known.mode is self._down:
+            self.setpoint = None
+            return []
+        if self._down is Mode.RETURN and known.mode is Mode.LAND:
+            return []  # its own failsafe knows better
+        asked_s = self._asked.get(SetMode(Mode.RETURN), known.vehicle_s)
+        answered = known.vehicle_s - asked_s >= self.settings.retry_s
+        if self._down is Mode.RETURN and self._tries >= self.settings.returning_tries and answered:
+            self._down = Mode.LAND
+            self._change(f"{self.reason}; it does not return ({known.refusal or 'no answer'}): lands")
+        return [SetMode(self._down)]
 
     # Small change.
 
     def _is_there(self, target: Enu, known: Telemetry) -> bool:
-        """Has the vehicle been at a place for the dwell time."""
+        """Has the vehicle been at a place for the dwell time; where it is must be known."""
         assert known.position is not None, "a fault otherwise"
         if float(np.linalg.norm(np.subtract(known.position, target))) > self.settings.tolerance_m:
             self._there_since_s = None
@@ -309,8 +296,8 @@ class Bridge:
         return Enu(*self.scenario.grid.centre_m(np.asarray(cell), like=np.zeros(1)).tolist())
 
     def _descend(self, how: Mode, why: str) -> None:
-        self._down = how
-        self.setpoint = None
+        """Bring it down; until it obeys, the setpoint holds it where it is."""
+        self._down, self._tries = how, 0
         self._enter(Phase.LANDING, why, self._now_s)
 
     def _end(self, phase: Phase, why: str) -> None:
@@ -335,4 +322,5 @@ class Bridge:
         if last_s is not None and vehicle_s - last_s < self.settings.retry_s:
             return False
         self._asked[wish] = vehicle_s
+        self._tries += 1
         return True

@@ -30,6 +30,8 @@ class Telemetry:
         estimate_ok: does the autopilot trust its position enough to fly by it?
         battery: charge that is left, 0 to 1; None: it does not tell.
         vehicle_s: the vehicle's own time, seconds: a simulated one may be faster than any clock here.
+        missing: what has not come yet, though nobody flies without; None: all of it has.
+        refusal: what the vehicle last refused, and why; None: nothing, or it did it after all.
     """
 
     heartbeat_s: float | None = None
@@ -42,6 +44,8 @@ class Telemetry:
     estimate_ok: bool = False
     battery: float | None = None
     vehicle_s: float = 0.0
+    missing: str | None = None
+    refusal: str | None = None
 
 
 @dataclass(frozen=True)
