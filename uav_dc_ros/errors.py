@@ -37,5 +37,9 @@ class NodeError(UavDcError):
     """A node that failed, or never appeared, while a mission needed it."""
 
 
+class VehicleError(UavDcError):
+    """A vehicle, or a way to it, that cannot be used."""
+
+
 class TrainingError(UavDcError):
     """A training run that cannot start or go on."""
