@@ -1,0 +1,181 @@
+"""The fake autopilot as a process, and a whole flight against it: bridge, transport, a trivial policy."""
+
+import contextlib
+import json
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.autopilot.bridge import Bridge
+from uav_dc_ros.autopilot.frames import Enu, Ned, to_enu
+from uav_dc_ros.autopilot.mavlink import Mavlink
+from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.messages import Phase
+
+ROOT = Path(__file__).parents[2]
+SCENARIO = scenarios.load("five_clusters")
+KINDS = ("ardupilot", "px4")
+WIRES = ("tcp", "udp")
+
+
+def free_udp_port() -> int:
+    """A port that nobody had a moment ago."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Fake:
+    """The process; `address` is where the bridge finds it."""
+
+    def __init__(self, kind: str, wire: str = "tcp", *, speed: float = 1.0, ready_s: float = 5.0) -> None:
+        number = free_udp_port() if wire == "udp" else 0
+        command = [
+            sys.executable,
+            "-m",
+            "tests.autopilot.autopilot",
+            "--kind",
+            kind,
+            f"--{wire}",
+            str(number),
+        ]
+        self.process = subprocess.Popen(
+            [*command, "--speed", str(speed), "--ready-s", str(ready_s)],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.events: list[dict[str, Any]] = []
+        self._new: queue.Queue[dict[str, Any]] = queue.Queue()
+        threading.Thread(target=self._listen, daemon=True).start()
+        port = self.wait_for("listens")["port"]
+        self.address = f"{'tcp' if wire == 'tcp' else 'udpin'}:127.0.0.1:{port}"
+
+    def _listen(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            event = json.loads(line)
+            self.events.append(event)
+            self._new.put(event)
+
+    def do(self, *words: object) -> None:
+        """A line of `Control`'s."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(" ".join(map(str, words)) + "\n")
+        self.process.stdin.flush()
+
+    def wait_for(self, event: str, seconds: float = 20.0) -> dict[str, Any]:
+        """The next event of a name that was not waited for yet."""
+        end = time.monotonic() + seconds
+        while True:
+            try:
+                told = self._new.get(timeout=max(0.0, end - time.monotonic()))
+            except queue.Empty:
+                raise AssertionError(f"no {event!r} within {seconds} s: {self.events[-5:]}") from None
+            if told["event"] == event:
+                return told
+
+    def report(self) -> dict[str, Any]:
+        """How it is now."""
+        self.do("report")
+        return self.wait_for("report")
+
+    def all(self, event: str) -> list[dict[str, Any]]:
+        """All events of a name so far."""
+        return [told for told in self.events if told["event"] == event]
+
+    def close(self) -> None:
+        """End it; it must have lived until now."""
+        died = self.process.poll()
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):
+            self.process.stdin.close()
+        self.process.wait(10.0)
+        assert died is None, f"the fake autopilot died: {died}"
+
+
+@contextlib.contextmanager
+def fake(kind: str, wire: str = "tcp", **options: Any) -> Iterator[Fake]:
+    """A fake autopilot for the time of a block."""
+    autopilot = Fake(kind, wire, **options)
+    try:
+        yield autopilot
+    finally:
+        autopilot.close()
+
+
+def way_home(bridge: Bridge) -> Action:
+    """A policy: straight to the dock, then hover."""
+    (x, y, _), (dock_x, dock_y) = bridge.cell, bridge.scenario.dock_cell
+    if x != dock_x:
+        return Action.RIGHT if x < dock_x else Action.LEFT
+    if y != dock_y:
+        return Action.FORWARD if y < dock_y else Action.BACKWARD
+    return Action.HOVER
+
+
+class Flight:
+    """One flight, tick by tick, as the bridge's node does it.
+
+    Attributes:
+        log: each change of phase or reason.
+        executed: the step of each move that was flown.
+        cells: the cells that were flown to.
+    """
+
+    def __init__(self, autopilot: Fake, how: Settings, scenario: Scenario = SCENARIO, **bridge: Any) -> None:
+        self.fake = autopilot
+        self.log: list[tuple[Phase, int, str]] = []
+        self.executed: list[int] = []
+        self.cells: list[tuple[int, int, int]] = []
+        self.bridge = Bridge(scenario, how, self._note, **bridge)
+        start = scenario.mission.start_m
+        self.place = Enu(start[0], start[1], 0.0)
+        self.vehicle = Mavlink(autopilot.address, place=self.place)
+        self.policy: Callable[[Bridge], Action] | None = way_home
+
+    def _note(self) -> None:
+        bridge = self.bridge
+        if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
+            self.executed.append(bridge.step)
+            self.cells.append(bridge.cell)
+        self.log.append((bridge.phase, bridge.step, bridge.reason))
+
+    def tick(self) -> None:
+        """What the node's timer does."""
+        bridge = self.bridge
+        for wish in bridge.tick(time.monotonic(), self.vehicle.telemetry()):
+            self.vehicle.ask(wish)
+        if bridge.phase is Phase.READY and bridge.fault is None and self.policy is not None:
+            bridge.move(bridge.step, self.policy(bridge))
+        self.vehicle.steer(bridge.setpoint)
+
+    def until(
+        self, done: Callable[[], bool], seconds: float = 60.0, beat: Callable[[], None] = lambda: None
+    ) -> None:
+        """Fly until something is so."""
+        end = time.monotonic() + seconds
+        while not done():
+            assert time.monotonic() < end, (self.log[-6:], self.fake.events[-6:])
+            self.tick()
+            beat()
+            time.sleep(0.002)
+
+    def check_setpoints(self) -> None:
+        """All that the autopilot heard was in frame 1, position only, and inside the fence."""
+        heard = self.fake.all("setpoint")
+        for setpoint in heard:
+            assert (setpoint["frame"], setpoint["mask"]) == (1, 0xDF8)
+            up = to_enu(Ned(*setpoint["ned"]))
+            grid = Enu(*(u + p for u, p in zip(up, self.place, strict=True)))
+            assert self.bridge.fence.breach(grid) is None, setpoint

@@ -1,0 +1,51 @@
+"""Whole missions: bridge, MAVLink, and a fake autopilot in a process of its own."""
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.autopilot.flight import KINDS, SCENARIO, WIRES, Flight, fake
+from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.messages import Phase
+
+ARMING = Settings(arm=True, hold_s=0.5)
+SPEED = 100.0
+
+
+def fly(kind: str, wire: str) -> tuple[Flight, dict[str, Any]]:
+    """A whole mission, and how the autopilot is then."""
+    with fake(kind, wire, speed=SPEED) as autopilot:
+        flight = Flight(autopilot, ARMING)
+        with flight.vehicle:
+            flight.until(lambda: flight.bridge.is_over, 120.0)
+        return flight, autopilot.report()
+
+
+@pytest.fixture(scope="module")
+def flights() -> dict[tuple[str, str], tuple[Flight, dict[str, Any]]]:
+    """Every kind on every wire, at once: they wait for one another's time most of theirs."""
+    cases = list(product(KINDS, WIRES))
+    with ThreadPoolExecutor(len(cases)) as threads:
+        return dict(zip(cases, threads.map(lambda case: fly(*case), cases), strict=True))
+
+
+@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_whole_mission(flights: dict[Any, Any], kind: str, wire: str) -> None:
+    flight, report = flights[kind, wire]
+    assert flight.bridge.phase is Phase.LANDED, flight.log[-5:]
+    phases = list(dict.fromkeys(phase for phase, _, _ in flight.log))
+    assert phases == [
+        *(Phase.CONNECTING, Phase.PREFLIGHT, Phase.TAKEOFF, Phase.READY, Phase.MOVING),
+        *(Phase.LANDING, Phase.LANDED),
+    ]
+    assert flight.executed == list(range(SCENARIO.mission.max_steps))
+    assert len(set(flight.cells)) == 20, "across ten cells, and up ten"
+    north_m, east_m, down_m = report["ned"]
+    assert np.allclose((east_m, north_m), SCENARIO.mission.dock_m, atol=ARMING.tolerance_m)
+    assert (down_m, report["landed"], report["armed"]) == (0.0, True, False)
+    assert report["interrupted"] == 0, "no setpoint while it took off"
+    flight.check_setpoints()
