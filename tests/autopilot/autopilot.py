@@ -70,7 +70,7 @@ class Copter:
         self.target_s = -math.inf
         self.streamed_since_s, self.streamed_s = math.inf, -math.inf
         self.ground_since_s = 0.0
-        self.battery, self.lost, self.refuses = 1.0, False, False
+        self.battery, self.lost, self.refuses, self.balks = 1.0, False, False, False
 
     @property
     def ready(self) -> bool:
@@ -187,6 +187,7 @@ class Autopilot:
         self.later: list[tuple[float, Any]] = []
         self.setpoints, self.last_setpoint, self.interrupted = 0, None, 0
         self.heartbeats = 0
+        self.times: list[float] | None = None  # when setpoints came, steady clock
 
     def write(self, data: bytes) -> None:  # pymavlink calls it
         self.out += data
@@ -290,7 +291,7 @@ class Autopilot:
             if m.param1 < 0.5:
                 c.arm(False, "commanded")
                 return 0, ""
-            if c.refuses:
+            if c.refuses or c.balks:
                 return failed, "Arm: Motors: check frame class"
             if not c.ready:
                 return failed, "Preflight Fail: no local position" if c.px4 else "Arm: waiting for home"
@@ -311,6 +312,8 @@ class Autopilot:
     def _setpoint(self, m: Any) -> None:
         c = self.copter
         self.setpoints += 1
+        if self.times is not None:
+            self.times.append(time.monotonic())
         ned, key = [m.x, m.y, m.z], (m.coordinate_frame, m.type_mask, m.x, m.y, m.z, m.vx, m.vy, m.vz)
         if key != self.last_setpoint:
             self.last_setpoint = key
@@ -338,8 +341,9 @@ class Autopilot:
 class Control:
     """Commands on standard input, a line each.
 
-    refuse 0|1; drop SECONDS (wall); freeze 0|1; jump NORTH EAST DOWN (0 0 0: back); mode NAME (a pilot);
-    disarm; battery SHARE; lose 0|1 (the estimate); late SECONDS (simulated); reboot; report; quit.
+    refuse 0|1 (to arm, and tells so before); balk 0|1 (to arm, without a warning); drop SECONDS (wall);
+    freeze 0|1; jump NORTH EAST DOWN (0 0 0: back); mode NAME (a pilot); disarm; battery SHARE; lose 0|1 (the
+    estimate); late SECONDS (simulated); reboot; times (of setpoints, from now on); report; quit.
     """
 
     def __init__(self, autopilot: Autopilot) -> None:
@@ -363,6 +367,8 @@ class Control:
         match verb:
             case "refuse":
                 c.refuses = words[0] == "1"
+            case "balk":
+                c.balks = words[0] == "1"
             case "drop":
                 self.dropped_until = time.monotonic() + float(words[0])
             case "freeze":
@@ -382,6 +388,8 @@ class Control:
             case "reboot":
                 c.__init__("px4" if c.px4 else "ardupilot", c.ready_s)  # type: ignore[misc]
                 a.forget_rates()
+            case "times":
+                a.times = []
             case "report":
                 tell(
                     "report",
@@ -394,6 +402,7 @@ class Control:
                     heartbeats=a.heartbeats,
                     landed=c.landed,
                     interrupted=a.interrupted,
+                    times=a.times,
                 )
             case "quit":
                 self.ended = True

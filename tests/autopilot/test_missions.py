@@ -11,7 +11,7 @@ from tests.autopilot.flight import KINDS, SCENARIO, WIRES, Flight, fake
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
 
-ARMING = Settings(arm=True, hold_s=0.5)
+ARMING = Settings(arm=True)
 SPEED = 100.0
 
 

@@ -63,7 +63,7 @@ class Bridge:
         self._asked: dict[Wish, float] = {}  # when a wish was last uttered, vehicle time
         self._since_s = 0.0  # vehicle time of the last change of phase
         self._there_since_s: float | None = None
-        self._fault_since_s = 0.0
+        self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
         self._down: Mode = settings.then  # how it descends
         self._tries = 0  # at having it descend so
@@ -154,10 +154,12 @@ class Bridge:
                 self._change(f"goes on after: {self.reason}")
             return
         if self.fault is None:
-            self._fault_since_s = now_s
+            self._fault_since_s = now_s, known.vehicle_s
             self.fault = fault
             self._change(f"holds: {fault}")
-        elif now_s - self._fault_since_s > settings.hold_s:
+            return
+        steady_s, vehicle_s = self._fault_since_s
+        if max(now_s - steady_s, known.vehicle_s - vehicle_s) > settings.hold_s:
             self._give_up(fault, known)
 
     def _give_up(self, why: str, known: Telemetry | None = None) -> None:

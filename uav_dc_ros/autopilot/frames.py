@@ -67,16 +67,9 @@ class Geodetic:
 
     def seen_from(self, datum: "Geodetic") -> Enu:
         """Position of this point in the ENU frame of a datum (exact on WGS84, not the flat Earth's)."""
-        return Enu(
-            *pymap3d.geodetic2enu(
-                self.latitude_deg,
-                self.longitude_deg,
-                self.altitude_m,
-                datum.latitude_deg,
-                datum.longitude_deg,
-                datum.altitude_m,
-            )
-        )
+        here = (self.latitude_deg, self.longitude_deg, self.altitude_m)
+        there = (datum.latitude_deg, datum.longitude_deg, datum.altitude_m)
+        return Enu(*(float(value) for value in pymap3d.geodetic2enu(*here, *there)))
 
     def at(self, offset: Enu) -> "Geodetic":
         """The point at an offset in this point's ENU frame."""
@@ -91,6 +84,8 @@ class Geodetic:
 @dataclass(frozen=True, kw_only=True)
 class LocalFrame:
     """Between the grid's ENU metres and an autopilot's local NED metres.
+
+    Their axes are taken as parallel: within a kilometre or two they differ by less than a third of a metre.
 
     Attributes:
         origin: where the autopilot counts from, in the grid's ENU frame.

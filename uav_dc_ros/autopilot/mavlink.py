@@ -88,6 +88,7 @@ class Mavlink:
         self._down: str | None = f"{self.address} is not open yet"
         self._failed: VehicleError | None = None
         self._link: Link | None = None
+        self._met_s = math.inf  # when the link that is open was opened; wishes wait until it was heard on it
         self._asked_s: dict[str, float] = {}
         self._wake_out, self._wake_in = os.pipe()
         os.set_blocking(self._wake_in, False)
@@ -222,7 +223,7 @@ class Mavlink:
             self._failed, self._ended = error, True
         else:
             with self._lock:
-                self._link, self._down = link, None
+                self._link, self._down, self._met_s = link, None, time.monotonic()
                 self._wishes.clear()  # uttered to a vehicle that may be another's by now
                 self._asked_s.clear()
 
@@ -278,8 +279,8 @@ class Mavlink:
     def _send_wish(self, wish: Wish) -> None:
         with self._lock:
             dialect, known = self._hearing.dialect, self._hearing.telemetry(time.monotonic())
-        if dialect is None:
-            return
+        if dialect is None or (known.heartbeat_s or -math.inf) < self._met_s:
+            return  # who knows what it does by now; a link may also keep things to deliver them late
         match wish:
             case SetMode(mode):
                 self._send_command(SET_MODE, CUSTOM_MODE, *dialect.mode_parameters(Mode(mode)))

@@ -21,7 +21,7 @@ class Settings:
         silent_steps: steps' time without a move after which the policy is given up.
         fastest_mps: no vehicle of this kind flies faster; a position that does has jumped.
         jump_m: how far a position may jump, metres, as estimates do now and then.
-        hold_s: how long a fault may last before the mission ends.
+        hold_s: how long a fault may last before the mission ends, steady or vehicle time.
         lost_s: time without a heartbeat after which nobody waits for the vehicle to land.
         least_battery: charge at which the mission ends, 0 to 1.
         then: what ends a mission that cannot go on. Without a position, and where the vehicle refuses to

@@ -1,0 +1,265 @@
+"""The transport: addresses, whom it listens to, the stream, links that break."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from tests.autopilot.flight import ROOT, Fake, fake, free_udp_port
+from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
+from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.hearing import Hearing
+from uav_dc_ros.autopilot.links import Address, LinkDown
+from uav_dc_ros.autopilot.mavlink import LIFE_S, Mavlink
+from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
+from uav_dc_ros.errors import VehicleError
+
+HOME = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("tcp:127.0.0.1:5760", Address("tcp", "127.0.0.1", 5760)),
+        ("udp:0.0.0.0:14540", Address("udpin", "0.0.0.0", 14540)),
+        ("udpin::14540", None),
+        ("udpout:10.0.0.2:14550", Address("udpout", "10.0.0.2", 14550)),
+        ("serial:/dev/ttyUSB0:57600", Address("serial", "/dev/ttyUSB0", 57600)),
+        ("/dev/ttyUSB0", None),
+        ("tcp:127.0.0.1", None),
+        ("tcp:127.0.0.1:0", None),
+        ("tcp:127.0.0.1:70000", None),
+        ("tcp:127.0.0.1:-5", None),
+        ("tcp:127.0.0.1:\u0665", None),
+        ("http://127.0.0.1:80", None),
+        ("", None),
+    ],
+)
+def test_addresses(text: str, expected: Address | None) -> None:
+    if expected is not None:
+        assert Address.parse(text) == expected
+        assert Address.parse(str(expected)) == expected
+    else:
+        with pytest.raises(VehicleError, match=r"^connect: .*; expected "):
+            Address.parse(text)
+
+
+def test_a_missing_package_is_told_with_its_extra() -> None:
+    code = (
+        "import sys; sys.modules['pymavlink.dialects.v20'] = None\n"
+        "from uav_dc_ros.autopilot.mavlink import Mavlink\n"
+        "from uav_dc_ros.errors import VehicleError\n"
+        "try: Mavlink('tcp:127.0.0.1:5760')\n"
+        "except VehicleError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("a vehicle on MAVLink needs pymavlink;")
+    assert "uav_dc_ros[mavlink]" in done.stdout
+
+
+def test_nothing_here_imports_pymavlink_unless_it_is_used() -> None:
+    code = "import sys, uav_dc_ros.autopilot.mavlink; print([m for m in sys.modules if 'pymavlink' in m])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("dialect", [ARDUCOPTER, PX4], ids=lambda dialect: dialect.name)
+def test_a_mode_that_is_asked_for_is_the_one_that_is_understood(dialect: Any) -> None:
+    for mode, custom_mode in dialect.asked.items():
+        assert dialect.mode(custom_mode) is mode
+        main, sub = dialect.mode_parameters(mode)
+        assert custom_mode in (int(main), int(main) << 16 | int(sub) << 24)
+        assert not dialect.mode_name(custom_mode).startswith("0x")
+    names = {value: entry.name for value, entry in mav.enums["COPTER_MODE"].items()}
+    if dialect is ARDUCOPTER:
+        for number, name in dialect.names.items():
+            assert names[number] == f"COPTER_MODE_{name}"
+
+
+def heartbeat(hearing: Hearing, system: int, component: int, autopilot: int, kind: int = 2) -> None:
+    codec = mav.MAVLink(None, system, component)
+    packed = codec.heartbeat_encode(kind, autopilot, 0, 4, 4).pack(codec)
+    hearing.hear(mav.MAVLink(None).parse_buffer(packed)[0], 1.0)
+
+
+def test_only_an_autopilot_is_listened_to() -> None:
+    hearing = Hearing(None, Enu(0.0, 0.0, 0.0))
+    heartbeat(hearing, 255, 190, 8, 6)  # a ground station
+    heartbeat(hearing, 1, 154, 8, 26)  # a gimbal
+    assert hearing.system is None
+    heartbeat(hearing, 7, 1, 3, 1)  # an aeroplane
+    assert hearing.telemetry(1.0).missing == ("system 7 is a vehicle of type 1; expected a multicopter")
+    heartbeat(hearing, 8, 1, 4)
+    assert "autopilot of kind 4; expected 3 (ArduCopter) or 12 (PX4)" in str(hearing.telemetry(1.0).missing)
+    heartbeat(hearing, 1, 1, 3)
+    heartbeat(hearing, 2, 1, 12)  # another aircraft
+    assert (hearing.system, hearing.dialect) == (1, ARDUCOPTER)
+
+
+def test_a_long_text_comes_in_parts() -> None:
+    hearing = Hearing(None, Enu(0.0, 0.0, 0.0))
+    heartbeat(hearing, 1, 1, 12)
+    codec, text = mav.MAVLink(None, 1, 1), "Preflight Fail: " + "x" * 60 + " the end"
+    for number in range(2):
+        part = text[number * 50 : number * 50 + 50].encode()
+        packed = codec.statustext_encode(2, part, 9, number).pack(codec)
+        hearing.hear(mav.MAVLink(None).parse_buffer(packed)[0], 1.0)
+    hearing.refused("arming", "failed", 1.5)
+    assert hearing.telemetry(1.5).refusal == f"arming refused: {text}"
+    hearing.granted("arming")
+    assert hearing.telemetry(1.5).refusal is None
+
+
+def until(vehicle: Mavlink, right: Callable[[Telemetry], bool], setpoint: Enu | None = None) -> Telemetry:
+    end = time.monotonic() + 15.0
+    while not right(known := vehicle.telemetry()):
+        assert time.monotonic() < end, known
+        vehicle.steer(setpoint)
+        time.sleep(0.005)
+    return known
+
+
+def hover(autopilot: Fake, vehicle: Mavlink, up_m: float = 10.0) -> Enu:
+    """Take off; where it is sent to."""
+    known = until(vehicle, lambda known: known.missing is None and known.estimate_ok)
+    assert known.position is not None
+    target = Enu(known.position.east_m, known.position.north_m, up_m)
+    for wish, right in [
+        (SetMode(Mode.COMMANDED), lambda known: known.mode is Mode.COMMANDED),
+        (Arm(), lambda known: known.armed),
+        (TakeOff(up_m), lambda known: known.on_ground is False),
+    ]:
+        vehicle.ask(wish)
+        until(vehicle, right)
+    autopilot.wait_for("taken off")
+    return target
+
+
+def test_where_the_grid_lies_is_what_the_datum_says() -> None:
+    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot:
+        corner = HOME.at(Enu(-300.0, -400.0, -8.0))  # the vehicle stands 300 m east and 400 m north of it
+        with Mavlink(autopilot.address, datum=corner) as vehicle:
+            known = until(vehicle, lambda known: known.missing is None)
+            assert known.position == pytest.approx((300.0, 400.0, 8.0), abs=0.05)
+            target = hover(autopilot, vehicle, up_m=30.0)
+            until(vehicle, lambda known: known.position is not None and known.position.up_m > 29.5, target)
+            assert autopilot.report()["ned"] == pytest.approx((0.0, 0.0, -22.0), abs=0.6), "22 m above home"
+            beside = target._replace(east_m=350.0)
+            until(vehicle, lambda known: known.position is not None and known.position.east_m > 349.0, beside)
+            assert autopilot.report()["ned"][:2] == pytest.approx((0.0, 50.0), abs=1.5)
+
+
+def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told() -> None:
+    place = Enu(300.0, 400.0, 0.0)
+    with (
+        fake("px4", speed=20.0, ready_s=1.0) as autopilot,
+        Mavlink(autopilot.address, place=place) as vehicle,
+    ):
+        known = until(vehicle, lambda known: known.missing is None)
+        # Not exactly: the plane at the grid's corner is no longer level half a kilometre away (0.02 m).
+        assert known.position == pytest.approx(place, abs=0.05)
+        assert vehicle.datum is not None
+        assert HOME.seen_from(vehicle.datum) == pytest.approx(place, abs=0.05)
+        assert vehicle.kind == "PX4"
+
+
+def test_the_stream_keeps_its_pace_and_ends_with_those_who_decide() -> None:
+    with fake("ardupilot", ready_s=0.5) as autopilot, Mavlink(autopilot.address) as vehicle:
+        known = until(vehicle, lambda known: known.missing is None and known.estimate_ok)
+        vehicle.ask(SetMode(Mode.COMMANDED))
+        vehicle.ask(Arm())
+        until(vehicle, lambda known: known.armed)
+        vehicle.ask(TakeOff(2.0))
+        autopilot.wait_for("taken off")
+        assert known.position is not None
+        until(vehicle, lambda known: known.on_ground is False)
+        autopilot.do("times")
+        vehicle.steer(target := Enu(0.0, 0.0, 2.0))
+        end = time.monotonic() + 3.0
+        while time.monotonic() < end:
+            vehicle.steer(target)
+            time.sleep(0.2)
+        last = time.monotonic()
+        time.sleep(LIFE_S + 0.5)
+        before = autopilot.report()["setpoints"]
+        times = np.array(autopilot.report()["times"])
+        time.sleep(0.5)
+        assert autopilot.report()["setpoints"] == before, "nobody decides any more"
+        gaps_s = np.diff(times)
+        assert np.median(gaps_s) == pytest.approx(0.05, abs=0.003)
+        assert 60 <= len(times) <= 92
+        assert last > 0.0
+
+
+def test_it_comes_back_to_a_vehicle_that_flies_and_repeats_no_wish() -> None:
+    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+        target = hover(autopilot, vehicle)
+        autopilot.do("drop 0.3")
+        until(vehicle, lambda known: (known.heartbeat_s or 0.0) < time.monotonic() - 0.2, target)
+        vehicle.ask(SetMode(Mode.RETURN))  # nobody hears it, and it is not kept for later
+        known = until(vehicle, lambda known: (known.heartbeat_s or 0.0) > time.monotonic() - 0.02, target)
+        assert known.armed
+        far = target._replace(north_m=20.0)
+        until(vehicle, lambda known: known.position is not None and known.position.north_m > 19.0, far)
+        assert [event["mode"] for event in autopilot.all("mode")] == ["GUIDED"]
+
+
+def test_a_vehicle_that_starts_anew_is_asked_again() -> None:
+    with fake("px4", "udp", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+        until(vehicle, lambda known: known.missing is None)
+        autopilot.do("reboot")
+        autopilot.wait_for("control")
+        until(vehicle, lambda known: (known.position_s or 0.0) < time.monotonic() - 1.0)
+        until(vehicle, lambda known: (known.position_s or 0.0) > time.monotonic() - 0.1)
+
+
+def test_the_time_of_a_vehicle_that_starts_anew_goes_on_and_its_position_is_forgotten() -> None:
+    hearing = Hearing(HOME, Enu(0.0, 0.0, 0.0))
+    heartbeat(hearing, 1, 1, 3)
+    codec = mav.MAVLink(None, 1, 1)
+
+    def hear(message: Any) -> Telemetry:
+        hearing.hear(mav.MAVLink(None).parse_buffer(message.pack(codec))[0], 1.0)
+        return hearing.telemetry(1.0)
+
+    hear(codec.gps_global_origin_encode(473977420, 85455940, 488000))
+    known = hear(codec.local_position_ned_encode(600_000, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0))
+    assert known.position == pytest.approx((2.0, 1.0, 3.0), abs=0.01)
+    assert known.vehicle_s == 600.0
+    known = hear(codec.system_time_encode(0, 599_900))
+    assert (known.vehicle_s, known.position is None) == (600.0, False), "a message that was overtaken"
+    known = hear(codec.system_time_encode(0, 2_000))
+    assert (known.vehicle_s, known.position is None) == (602.0, True)
+
+
+def test_a_link_that_cannot_be_opened_says_why() -> None:
+    with pytest.raises(LinkDown, match="does not answer: Connection refused"):
+        Address("tcp", "127.0.0.1", free_udp_port()).open()
+    with pytest.raises(LinkDown, match="does not answer: "):
+        Address("tcp", "no-such-host.invalid", 5760).open()
+    with Mavlink(f"tcp:127.0.0.1:{free_udp_port()}") as vehicle:
+        known = until(vehicle, lambda known: "refused" in str(known.missing))
+    assert known.heartbeat_s is None
+
+
+def test_a_serial_line() -> None:
+    pytest.importorskip("serial")
+    master, slave = os.openpty()
+    link = Address("serial", os.ttyname(slave), 57600).open()
+    os.write(master, b"\xfdhello")
+    time.sleep(0.05)
+    assert link.read() == b"\xfdhello"
+    assert link.read() == b""
+    link.write(b"\x00\xfd\n")
+    assert os.read(master, 10) == b"\x00\xfd\n", "raw: nothing is changed on the way"
+    os.close(slave)
+    os.close(master)
+    with pytest.raises(LinkDown, match="broke"):
+        link.read()
+    link.close()
