@@ -51,7 +51,7 @@ class Phase(StrEnum):
 
 
 class Payload(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What every payload has in common: no field missing, none unknown."""
+    """What every payload has in common: no field missing unless it has a default, none unknown."""
 
 
 class Stepped(Payload, frozen=True):
@@ -98,17 +98,25 @@ class Rates(Stepped, frozen=True):
         )
 
 
-class Mission(Stepped, frozen=True):
+class Mission(Stepped, frozen=True, kw_only=True):
     """What the vehicle says of its mission: which step it is ready for, or how it ended."""
 
     phase: Annotated[
         Phase,
         Meta(
-            description="ready: waiting for the move of this step; landed: over, at the dock; timeout: "
-            "over, out of steps elsewhere; aborted: stopped before its end"
+            description="idle, connecting, preflight, takeoff: before the first step; ready: waiting for the "
+            "move of this step; moving: flying it; landing: on its way down; landed: over, at the dock; "
+            "timeout: over, out of steps elsewhere; aborted: stopped before its end. A simulated vehicle is "
+            "ready, or over"
         ),
     ]
-    cell: Annotated[tuple[Index, Index, Index], Meta(description="the UAV's cell: indices east, north, up")]
+    reason: Annotated[
+        str, Meta(max_length=TOLD_MAX, description="why it is in this phase, or does not go on; may be empty")
+    ] = ""
+    cell: Annotated[
+        tuple[Index, Index, Index],
+        Meta(description="the cell that the UAV reached last: indices east, north, up"),
+    ]
     remaining_steps: Annotated[Index, Meta(description="steps that the battery still allows")]
     seed: Annotated[Seed, Meta(description="seed of this mission's users")]
     scenario: Annotated[Name, Meta(description="name of the scenario")]
@@ -158,7 +166,7 @@ def encode(payload: Payload) -> bytes:
         MessageError: a number that is not finite.
     """
     text = msgspec.json.encode(payload)
-    if b"null" in text:  # how a number that is none is written; no payload has this word elsewhere
+    if b"null" in text:  # how a number that is none is written; at most a reason has this word, too
         decode(text, type(payload))
     return text
 

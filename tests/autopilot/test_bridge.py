@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.autopilot.simulated import Vehicle
 from uav_dc_ros import scenarios
-from uav_dc_ros.autopilot.bridge import Bridge
+from uav_dc_ros.autopilot.bridge import Bridge, Standing
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode
 from uav_dc_ros.autopilot.watch import Settings
@@ -24,7 +25,7 @@ ARMING = Settings(arm=True)
 
 def way_home(bridge: Bridge) -> Action:
     """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.cell, SCENARIO.dock_cell
+    (x, y, _), (dock_x, dock_y) = bridge.goal, SCENARIO.dock_cell
     if x != dock_x:
         return Action.RIGHT if x < dock_x else Action.LEFT
     if y != dock_y:
@@ -216,9 +217,45 @@ def test_a_silent_policy_ends_the_mission_after_two_steps() -> None:
 
 def test_a_vehicle_that_flies_already_goes_on_where_it_was() -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
-    flight = Flight(Settings(), vehicle, step=7, cell=(3, 3, 1))
+    flight = Flight(Settings(), vehicle, standing=Standing(step=7, cell=(3, 3, 1), flies=True))
     flight.until(Phase.LANDED)
     assert flight.executed == list(range(7, SCENARIO.mission.max_steps))
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(at_s=st.floats(0.0, 1000.0), gone_s=st.floats(0.0, 60.0), falls=st.booleans(), pilot=st.booleans())
+def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bool, pilot: bool) -> None:
+    """Whenever it was killed, and whatever the vehicle, its failsafe or a pilot did meanwhile."""
+    first = Flight()
+    vehicle = first.vehicle
+    while vehicle.now_s < at_s and not first.bridge.is_over:
+        first.tick(0.2)
+    before = first.bridge.phase
+    standing = msgspec.json.decode(msgspec.json.encode(first.bridge.standing), type=Standing)
+    setpoint = first.bridge.setpoint
+    flew = vehicle.armed and not vehicle.on_ground
+    if flew and pilot:
+        vehicle.mode = Mode.OTHER
+    elif flew and falls:
+        vehicle.mode = Mode.LAND
+    vehicle.pass_time(0.1, setpoint)
+    for _ in range(round(gone_s)):
+        vehicle.pass_time(1.0, setpoint)  # it goes on to its last setpoint
+    asked = len(vehicle.asked)
+    second = Flight(ARMING, vehicle, standing=standing)
+    while not second.bridge.is_over and vehicle.now_s < 4000.0:
+        second.tick(0.2)
+    assert second.bridge.is_over, second.log[-3:]
+    flown = first.executed + second.executed
+    assert flown == sorted(set(flown)), "no step twice"
+    if flew:
+        assert Arm() not in vehicle.asked[asked:], "never armed a second time"
+        if pilot:
+            assert not vehicle.asked[asked:], "never a fight with the pilot"
+            assert second.bridge.phase is Phase.ABORTED
+        elif not falls and before in (Phase.TAKEOFF, Phase.READY, Phase.MOVING):
+            assert second.bridge.phase is Phase.LANDED, second.log[-3:]
+            assert flown == list(range(len(flown)))
 
 
 def test_a_vehicle_that_flies_already_lands_where_that_is_wanted() -> None:
@@ -231,12 +268,12 @@ def test_a_vehicle_that_flies_already_lands_where_that_is_wanted() -> None:
 
 def test_moves_out_of_turn_change_nothing() -> None:
     flight = fly_to_step(5)
-    before = flight.bridge.cell, flight.bridge.setpoint
+    before = flight.bridge.goal, flight.bridge.setpoint
     assert "expected it to be ready" in str(flight.bridge.move(5, Action.UPWARD))
     flight.policy = None
     flight.until(Phase.READY)
     assert flight.bridge.move(5, Action.UPWARD) == "a move for step 5; expected 6"
-    assert (flight.bridge.cell, flight.bridge.setpoint) == before
+    assert (flight.bridge.goal, flight.bridge.setpoint) == before
 
 
 FAULTS = st.sampled_from(

@@ -164,8 +164,8 @@ def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told
         known = until(vehicle, lambda known: known.missing is None)
         # Not exactly: the plane at the grid's corner is no longer level half a kilometre away (0.02 m).
         assert known.position == pytest.approx(place, abs=0.05)
-        assert vehicle.datum is not None
-        assert HOME.seen_from(vehicle.datum) == pytest.approx(place, abs=0.05)
+        assert vehicle.anchor
+        assert HOME.seen_from(Geodetic.parse(vehicle.anchor)) == pytest.approx(place, abs=0.05)
         assert vehicle.kind == "PX4"
 
 

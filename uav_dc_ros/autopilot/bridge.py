@@ -10,6 +10,7 @@ changes the mode has the vehicle at once: from then on there are no setpoints an
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 
 from uav_dc_ros.autopilot.fence import Fence
@@ -25,6 +26,23 @@ FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
 
 
+class Standing(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a mission stands, for a bridge that was killed and takes it up again.
+
+    Attributes:
+        step, cell: to go on with. A move that was begun is flown to its end, and not begun again.
+        flies: has the vehicle left the ground, or may it have?
+        outcome: of a mission that was on its way down, or over; None: it goes on.
+        reason: why it was.
+    """
+
+    step: int
+    cell: tuple[int, int, int]
+    flies: bool = False
+    outcome: Phase | None = None
+    reason: str = ""
+
+
 class Bridge:
     """One mission of one vehicle.
 
@@ -32,13 +50,14 @@ class Bridge:
         scenario: the world that is flown.
         settings: how carefully.
         on_change: called after each change of phase or step.
-        step, cell: where a mission that is resumed stands.
+        standing: of a mission that is taken up again.
 
     Attributes:
         phase: where the mission stands.
         reason: why it is in this phase, in words.
         step: steps flown.
-        cell: the cell that the vehicle is in, or flies to.
+        cell: the cell that the vehicle reached last.
+        goal: the cell that it is in, or flies to.
         fault: what keeps it from going on at the moment; None: nothing.
         setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
     """
@@ -48,14 +67,13 @@ class Bridge:
         scenario: Scenario,
         settings: Settings,
         on_change: Callable[[], None] = lambda: None,
-        *,
-        step: int = 0,
-        cell: tuple[int, int, int] | None = None,
+        standing: Standing | None = None,
     ) -> None:
         self.scenario, self.settings = scenario, settings
         self.fence = Fence.around(scenario)
         self.phase, self.reason = Phase.IDLE, "not started"
-        self.step, self.cell = step, cell or scenario.start_cell
+        self._standing = standing or Standing(step=0, cell=scenario.start_cell)
+        self.step, self.cell, self.goal = self._standing.step, self._standing.cell, self._standing.cell
         self.fault: str | None = None
         self.setpoint: Enu | None = None
         self._on_change = on_change
@@ -74,6 +92,20 @@ class Bridge:
         """Is there nothing left to do."""
         return self.phase.is_over
 
+    @property
+    def standing(self) -> Standing:
+        """Where the mission stands now."""
+        if self.phase in (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT):
+            return self._standing
+        over = self.phase is Phase.LANDING or self.is_over
+        return Standing(
+            step=self.step + (self.phase is Phase.MOVING),
+            cell=self.goal,
+            flies=True,
+            outcome=self._outcome if over else None,
+            reason=self.reason if over else "",
+        )
+
     def move(self, step: int, action: Action) -> str | None:
         """Fly a move; or why not. A move for another step, or at another time, changes nothing."""
         if self.phase is not Phase.READY or self.fault is not None:
@@ -84,9 +116,9 @@ class Bridge:
         breach = self.fence.breach(self._centre(tuple(cell.tolist())))
         if breach is not None:
             return f"the target is outside the fence: {breach}"
-        self.cell = tuple(cell.tolist())
-        self.setpoint = self._centre(self.cell)
-        self._enter(Phase.MOVING, f"{action.label} to cell {self.cell}", self._now_s)
+        self.goal = tuple(cell.tolist())
+        self.setpoint = self._centre(self.goal)
+        self._enter(Phase.MOVING, f"{action.label} to cell {self.goal}", self._now_s)
         return None
 
     def tick(self, now_s: float, known: Telemetry) -> list[Wish]:
@@ -179,6 +211,8 @@ class Bridge:
         if (breach := self.fence.breach(known.position)) is not None:
             self._change(f"the vehicle is outside the fence: {breach}")
             return []
+        if self._standing.flies and not self._is_still_ours(known):
+            return []
         self.setpoint = known.position  # an autopilot may want to see setpoints before it follows any
         flies = known.armed and known.on_ground is False
         if flies and known.mode is Mode.COMMANDED:
@@ -186,13 +220,33 @@ class Bridge:
                 self._outcome = Phase.ABORTED
                 self._descend(self.settings.then, "it flew already when the bridge came")
                 return []
-            self.setpoint = self._centre(self.cell)
+            self.setpoint = self._centre(self.goal)
             self._enter(
                 Phase.TAKEOFF, "it flies already: to the cell where the mission stands", known.vehicle_s
             )
             return []
         self._enter(Phase.PREFLIGHT, "connected", known.vehicle_s)
         return []
+
+    def _is_still_ours(self, known: Telemetry) -> bool:
+        """May a mission that was in the air be taken up again; if not, it ends, or goes on coming down."""
+        before = self._standing
+        if before.outcome is not None and known.armed:
+            self._outcome = before.outcome
+            down = known.mode if known.mode in (Mode.RETURN, Mode.LAND) else self.settings.then
+            self._descend(down, before.reason)
+        elif not known.armed:  # it is never armed a second time
+            why = before.reason or "on the ground and disarmed when the bridge came back"
+            self._end(before.outcome or Phase.ABORTED, why)
+        elif known.mode is not Mode.COMMANDED:
+            self._end(
+                Phase.ABORTED, f"in mode {known.mode_name or known.mode.value} when the bridge came back"
+            )
+        elif self._is_done():
+            self._finish("when the bridge came back")
+        else:
+            return True
+        return False
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
         fault = self._watched.fault(now_s, known)
@@ -203,8 +257,8 @@ class Bridge:
             self._enter(Phase.CONNECTING, fault, known.vehicle_s)
             return []
         if known.mode is Mode.COMMANDED and known.armed:
-            x_m, y_m, _ = known.position or self._centre(self.cell)
-            self.setpoint = Enu(x_m, y_m, self._centre(self.cell).up_m)
+            x_m, y_m, _ = known.position or self._centre(self.goal)
+            self.setpoint = Enu(x_m, y_m, self._centre(self.goal).up_m)
             if (breach := self.fence.breach(self.setpoint)) is not None:
                 self._give_up(f"the target is outside the fence: {breach}")
                 return []
@@ -227,7 +281,7 @@ class Bridge:
         return [Arm()] if known.mode is Mode.COMMANDED else [SetMode(Mode.COMMANDED)]
 
     def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
-        start, position = self._centre(self.cell), known.position
+        start, position = self._centre(self.goal), known.position
         assert position is not None, "a fault otherwise"
         if known.vehicle_s - self._since_s > self.settings.takeoff_s:
             self._give_up(f"not at the start after {self.settings.takeoff_s:g} s")
@@ -235,6 +289,7 @@ class Bridge:
         if position.up_m >= start.up_m - self.settings.tolerance_m:
             self.setpoint = start  # high enough to fly across
         if self._is_there(start, known):
+            self.cell = self.goal
             self._enter(Phase.READY, f"at the start, cell {self.cell}", known.vehicle_s)
             return []
         return [TakeOff(start.up_m)] if known.on_ground is not False else []
@@ -246,21 +301,31 @@ class Bridge:
         return []
 
     def _fly(self, now_s: float, known: Telemetry) -> list[Wish]:
-        there = self._is_there(self._centre(self.cell), known)
+        there = self._is_there(self._centre(self.goal), known)
         if not there and known.vehicle_s - self._since_s < self.scenario.mission.step_s:
             return []
-        self.step += 1
+        self.step, self.cell = self.step + 1, self.goal
         how = "there" if there else f"not there after {self.scenario.mission.step_s:g} s, which a step has"
-        terminated, truncated, landed = core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
-        if not (terminated or truncated):
+        if self._is_done():
+            self._finish(how)
+        else:
             self._enter(Phase.READY, f"step {self.step}: {how}", known.vehicle_s)
-        elif landed:
+        return []
+
+    def _is_done(self) -> bool:
+        """Are there no further steps."""
+        terminated, truncated, _ = core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
+        return self.step > 0 and bool(terminated or truncated)
+
+    def _finish(self, how: str) -> None:
+        """Come down after the last step."""
+        _, _, landed = core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
+        if landed:
             self._outcome = Phase.LANDED
-            self._descend(Mode.LAND, f"step {self.step}: at the dock")
+            self._descend(Mode.LAND, f"step {self.step}: at the dock ({how})")
         else:
             self._outcome = Phase.TIMEOUT
-            self._descend(self.settings.then, f"step {self.step}: out of steps away from the dock")
-        return []
+            self._descend(self.settings.then, f"step {self.step}: out of steps away from the dock ({how})")
 
     def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
         if self._watched.link_is_lost(now_s, known):  # who knows what mode it is in by now

@@ -6,9 +6,11 @@ An autopilot counts its local NED metres from an *origin* of its own, mostly whe
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import pymap3d
+
+from uav_dc_ros.errors import VehicleError
 
 
 class Enu(NamedTuple):
@@ -65,18 +67,40 @@ class Geodetic:
     longitude_deg: float
     altitude_m: float
 
-    def seen_from(self, datum: "Geodetic") -> Enu:
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read `LATITUDE,LONGITUDE,ALTITUDE`, degrees and metres.
+
+        Raises:
+            VehicleError: it is none.
+        """
+        try:
+            latitude_deg, longitude_deg, altitude_m = (float(part) for part in text.split(","))
+        except ValueError:
+            latitude_deg = math.nan
+        if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and math.isfinite(altitude_m)):
+            raise VehicleError(
+                f"datum: {text!r}; expected LATITUDE,LONGITUDE,ALTITUDE in degrees and metres, such as "
+                "47.397742,8.545594,488.0"
+            )
+        return cls(latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=altitude_m)
+
+    def __str__(self) -> str:
+        """As `parse` reads it, with all digits."""
+        return f"{self.latitude_deg!r},{self.longitude_deg!r},{self.altitude_m!r}"
+
+    def seen_from(self, datum: Self) -> Enu:
         """Position of this point in the ENU frame of a datum (exact on WGS84, not the flat Earth's)."""
         here = (self.latitude_deg, self.longitude_deg, self.altitude_m)
         there = (datum.latitude_deg, datum.longitude_deg, datum.altitude_m)
         return Enu(*(float(value) for value in pymap3d.geodetic2enu(*here, *there)))
 
-    def at(self, offset: Enu) -> "Geodetic":
+    def at(self, offset: Enu) -> Self:
         """The point at an offset in this point's ENU frame."""
         latitude_deg, longitude_deg, altitude_m = pymap3d.enu2geodetic(
             *offset, self.latitude_deg, self.longitude_deg, self.altitude_m
         )
-        return Geodetic(
+        return type(self)(
             latitude_deg=float(latitude_deg), longitude_deg=float(longitude_deg), altitude_m=float(altitude_m)
         )
 

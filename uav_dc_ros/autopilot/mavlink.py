@@ -62,6 +62,7 @@ class Mavlink:
         address: such as `tcp:127.0.0.1:5760`.
         datum: of the grid. None: the vehicle stands at `place` when its first position comes.
         place: in the grid's ENU frame, see `datum`.
+        anchor: of the same transport before it was started again: takes the place of a datum.
         system: whom to talk to; None: to the first autopilot that speaks.
 
     Raises:
@@ -74,8 +75,11 @@ class Mavlink:
         *,
         datum: Geodetic | None = None,
         place: Enu = ORIGIN,
+        anchor: str = "",
         system: int | None = None,
     ) -> None:
+        if anchor:
+            datum = Geodetic.parse(anchor)
         self.address = Address.parse(address)
         self._codec = load_codec()
         self._mav = self._codec.MAVLink(None, SYSTEM, COMPONENT)
@@ -98,12 +102,16 @@ class Mavlink:
 
     def __enter__(self) -> Self:
         """Begin to listen."""
-        self._thread.start()
+        self.open()
         return self
 
     def __exit__(self, *exception: object) -> None:
         """End the stream, and the link."""
         self.close()
+
+    def open(self) -> None:
+        """Begin to listen."""
+        self._thread.start()
 
     def close(self) -> None:
         """End the stream, and the link; more than once is as good as once."""
@@ -116,10 +124,10 @@ class Mavlink:
         os.close(self._wake_out)
 
     @property
-    def datum(self) -> Geodetic | None:
-        """Of the grid, once it is known: what a bridge that is started again has to be told."""
+    def anchor(self) -> str:
+        """The grid's datum, as `Geodetic.parse` reads it; empty until it is known."""
         with self._lock:
-            return self._hearing.datum
+            return str(self._hearing.datum or "")
 
     @property
     def kind(self) -> str:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 from uav_dc_ros.autopilot.frames import Enu
 
@@ -68,3 +69,38 @@ class TakeOff:
 
 
 Wish = SetMode | Arm | TakeOff
+
+
+class Vehicle(Protocol):
+    """A transport: a way to one vehicle. It hears, passes wishes on, streams setpoints, and decides nothing.
+
+    It works from `open` to `close`. Its stream is a sign of life of those who decide: it ends a second
+    after the last call of `steer`, and then the autopilot's own failsafes take over.
+    """
+
+    def open(self) -> None:
+        """Begin to listen."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the autopilot; empty until it is known."""
+
+    @property
+    def anchor(self) -> str:
+        """Where the grid lies, for a transport that is opened again in the air; empty until it is known."""
+
+    def telemetry(self) -> Telemetry:
+        """What is known of the vehicle now, times as of `time.monotonic`.
+
+        Raises:
+            VehicleError: this machine cannot reach it at all.
+        """
+
+    def steer(self, setpoint: Enu | None) -> None:
+        """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
+
+    def ask(self, wish: Wish) -> None:
+        """Pass a wish on, once; whether it was fulfilled, `telemetry` tells."""
+
+    def close(self) -> None:
+        """End the stream, and the link; more than once is as good as once."""
