@@ -26,6 +26,7 @@ from uav_dc_ros.messages import Phase
 __all__ = ["Bridge", "Standing"]
 
 FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
+DECIDED = (Phase.READY, Phase.MOVING)  # by a policy
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
 
 
@@ -37,6 +38,7 @@ class Bridge:
         settings: how carefully.
         on_change: called after each change of phase or step.
         standing: of a mission that is taken up again.
+        fence: around targets and poses; None: the one around the scenario.
 
     Attributes:
         phase: where the mission stands.
@@ -44,6 +46,7 @@ class Bridge:
         course: steps flown, the cell reached last, and the cell that it flies to.
         fault: what keeps it from going on at the moment; None: nothing.
         setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
+        policy_is_gone: to be set while nobody is there who would decide the next move: the vehicle stops.
     """
 
     def __init__(
@@ -52,17 +55,20 @@ class Bridge:
         settings: Settings,
         on_change: Callable[[], None] = lambda: None,
         standing: Standing | None = None,
+        fence: Fence | None = None,
     ) -> None:
         self.scenario, self.settings = scenario, settings
-        self.fence = Fence.around(scenario)
+        self.fence = fence or Fence.around(scenario)
         self.phase, self.reason = Phase.IDLE, "not started"
         self.course = Course(scenario, standing)
         self.fault: str | None = None
         self.setpoint: Enu | None = None
+        self.policy_is_gone = False
         self._on_change = on_change
         self._asked: dict[Wish, float] = {}  # when a wish was last uttered, vehicle time
         self._since_s = 0.0  # vehicle time of the last change of phase
         self._there_since_s: float | None = None
+        self._alone_since_s: float | None = None  # vehicle time since when the policy is gone
         self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
         self._descent = Descent()
@@ -117,6 +123,17 @@ class Bridge:
         self._enter(Phase.MOVING, f"{action.label} to cell {cell}", self._now_s)
         return None
 
+    def stop(self, why: str) -> None:
+        """End the mission, since nobody will steer any more; a vehicle that flies comes down."""
+        if self.phase in STEERED:
+            self._give_up(why)
+        elif self.phase is not Phase.LANDING and not self.is_over:
+            self._end(Phase.ABORTED, why)
+
+    def is_done_with(self, known: Telemetry) -> bool:
+        """Does the vehicle come to its end without any further word."""
+        return self.is_over or (self.phase is Phase.LANDING and self._descent.obeys(known))
+
     def tick(self, now_s: float, known: Telemetry) -> list[Wish]:
         """Go on.
 
@@ -138,6 +155,8 @@ class Bridge:
             self._watch(now_s, known)
         if self.fault is not None and self.phase in STEERED:
             return []  # hold: the setpoint stays
+        if self.phase in DECIDED and not self._policy_lives(known):
+            return []
         wishes = {
             Phase.CONNECTING: self._connect,
             Phase.PREFLIGHT: self._prepare,
@@ -189,6 +208,25 @@ class Bridge:
         steady_s, vehicle_s = self._fault_since_s
         if max(now_s - steady_s, known.vehicle_s - vehicle_s) > settings.hold_s:
             self._give_up(fault, known)
+
+    def _policy_lives(self, known: Telemetry) -> bool:
+        """Is there somebody who decides; until there is, the vehicle stops, and the step's time with it."""
+        patience_s = self.settings.silent_steps * self.scenario.mission.step_s
+        since_s = self._alone_since_s
+        if not self.policy_is_gone:
+            if since_s is not None:
+                self._alone_since_s = None
+                self._since_s += known.vehicle_s - since_s
+                self.setpoint = self.course.target
+                self._change(f"goes on after: {self.reason}")
+            return True
+        if since_s is None:
+            self._alone_since_s = known.vehicle_s
+            self.setpoint = known.position if self.phase is Phase.MOVING else self.setpoint
+            self._change("holds: the policy is gone")
+        elif known.vehicle_s - since_s > patience_s:
+            self._give_up(f"the policy has been gone for {patience_s:g} s")
+        return False
 
     def _give_up(self, why: str, known: Telemetry | None = None) -> None:
         """End the mission: bring the vehicle down. One that does not know where it is cannot return."""
@@ -300,7 +338,8 @@ class Bridge:
         self._enter(phase, why, self._now_s)
 
     def _enter(self, phase: Phase, why: str, vehicle_s: float) -> None:
-        self.phase, self._since_s, self._there_since_s = phase, vehicle_s, None
+        self.phase, self._since_s = phase, vehicle_s
+        self._there_since_s = self._alone_since_s = None
         self._asked.clear()
         self.reason = why
         self._on_change()

@@ -93,7 +93,7 @@ class AutopilotBridge(MissionNode):
         if self._begun and not bridge.is_over:
             bridge.stop("the bridge was stopped")
             deadline_s = time.monotonic() + OBEYS_S
-            while not (bridge.is_over or bridge.obeys(self._known)) and time.monotonic() < deadline_s:
+            while not (bridge.is_done_with(self._known)) and time.monotonic() < deadline_s:
                 self._tick()
                 time.sleep(TICK_LEAST_S)
         self.vehicle.close()
@@ -143,6 +143,7 @@ class AutopilotBridge(MissionNode):
 
     def on_move(self, payload: messages.Move) -> None:
         """Fly a move."""
+        self._policy.hear()
         if payload.mission != 0:
             raise MessageError("wrong_step", f"a move for mission {payload.mission}; expected mission 0")
         if (why := self.bridge.move(payload.step, Action[payload.action.upper()])) is not None:

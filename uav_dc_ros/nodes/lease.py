@@ -59,6 +59,10 @@ class Lease:
         self._was_there |= alive
         return self._was_there and not alive
 
+    def hear(self) -> None:
+        """Note that somebody has published: one that offers no lease, maybe, in place of one that did."""
+        self._was_there = False
+
     def close(self) -> None:
         """Look no more."""
         if self._event is not None:
