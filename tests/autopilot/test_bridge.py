@@ -110,7 +110,7 @@ def test_a_pilot_who_takes_over_has_it_at_once_and_for_good() -> None:
     flight.vehicle.mode = Mode.OTHER
     flight.run(0.1)
     assert flight.bridge.phase is Phase.ABORTED
-    assert "taken over" in flight.bridge.reason
+    assert "changed by a pilot or by the autopilot's failsafe" in flight.bridge.reason
     flight.vehicle.mode = Mode.COMMANDED
     flight.run(60.0)
     assert flight.bridge.setpoint is None

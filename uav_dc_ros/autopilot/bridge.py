@@ -5,7 +5,8 @@
 It decides, and does nothing itself: `tick` is called often with what is known of the vehicle, and returns
 wishes for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
 last good setpoint stays), then to *return* or *land*, and at last to `aborted` with its reason. A pilot who
-changes the mode has the vehicle at once: from then on there are no setpoints and no wishes.
+changes the mode has the vehicle at once: from then on there are no setpoints and no wishes. Where that mode
+brings it down (an autopilot's failsafe does that, too), it is watched until it stands.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from uav_dc_ros.autopilot.course import Cell, Course, Standing
-from uav_dc_ros.autopilot.descent import Descent
+from uav_dc_ros.autopilot.descent import DOWN, Descent
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.ground import Ground, Next
@@ -26,6 +27,7 @@ from uav_dc_ros.messages import Phase
 __all__ = ["Bridge", "Standing"]
 
 FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
+TAKEOFF_RETRIES = 2.5  # as many pauses between wishes to take off: motors need some seconds to lift it
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
 
 
@@ -65,6 +67,8 @@ class Bridge:
         self._there_since_s: float | None = None
         self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
+        self._steady_s = 0.0  # steady clock, at the last tick
+        self._since_steady_s = 0.0  # and at the last change of phase
         self._descent = Descent()
         self._watched = Watch(settings)
         self._ground = Ground(self.course, settings, self.fence, self._watched)
@@ -127,7 +131,7 @@ class Bridge:
         Returns:
             Wishes to be passed on now, at most one of each kind.
         """
-        self._now_s = known.vehicle_s
+        self._now_s, self._steady_s = known.vehicle_s, now_s
         if self.phase is Phase.IDLE:
             self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position", known.vehicle_s)
         if self.phase.is_over:
@@ -151,16 +155,24 @@ class Bridge:
     # What goes wrong.
 
     def _taken_over(self, known: Telemetry) -> bool:
-        """Has somebody else the vehicle now: a pilot who changed the mode, or whoever disarmed it."""
-        ours = (Mode.COMMANDED,) if self.phase in STEERED else (Mode.LAND, Mode.RETURN, Mode.COMMANDED)
-        if self.phase is Phase.LANDING and not known.armed:
+        """Has somebody else the vehicle now, who changed its mode or disarmed it."""
+        landing = self.phase is Phase.LANDING
+        if landing and not known.armed:
             return False  # it stands
+        why = self.fault or (self.reason if landing else None) or known.refusal
+        after = "".join(
+            f" ({word}: {what})" for word, what in (("after", why), ("it says", known.said)) if what
+        )
         if not known.armed:
-            self._end(Phase.ABORTED, f"disarmed by somebody else while it was {self.phase.value}")
-        elif known.mode not in ours:
-            why = self.fault or (self.reason if self.phase is Phase.LANDING else None)
-            after = f" (after: {why})" if why else ""  # maybe the autopilot's own answer to that
-            self._end(Phase.ABORTED, f"taken over: mode {known.mode_name or known.mode.value}{after}")
+            who = "disarmed by a pilot or by the autopilot itself"
+            self._end(Phase.ABORTED, f"{who} while it was {self.phase.value}{after}")
+        elif known.mode is not Mode.COMMANDED if not landing else not self._descent.is_ours(known.mode):
+            mode = known.mode_name or known.mode.value
+            changed = f"mode {mode}: changed by a pilot or by the autopilot's failsafe{after}"
+            if not landing and known.mode in DOWN:
+                self._descend(known.mode, Phase.ABORTED, changed)
+            else:
+                self._end(Phase.ABORTED, changed)
         return self.phase.is_over
 
     def _watch(self, now_s: float, known: Telemetry) -> None:
@@ -238,7 +250,8 @@ class Bridge:
 
     def _wait(self, now_s: float, known: Telemetry) -> list[Wish]:
         patience_s = self.settings.silent_steps * self.scenario.mission.step_s
-        if known.vehicle_s - self._since_s > patience_s:
+        silent_s = now_s - self._since_steady_s
+        if known.vehicle_s - self._since_s > patience_s and silent_s > self.settings.silent_s:
             self._give_up(f"no move from the policy for {patience_s:g} s")
         return []
 
@@ -301,6 +314,7 @@ class Bridge:
 
     def _enter(self, phase: Phase, why: str, vehicle_s: float) -> None:
         self.phase, self._since_s, self._there_since_s = phase, vehicle_s, None
+        self._since_steady_s = self._steady_s
         self._asked.clear()
         self.reason = why
         self._on_change()
@@ -314,7 +328,8 @@ class Bridge:
     def _may_ask(self, wish: Wish, vehicle_s: float) -> bool:
         """Utter a wish now: the first time, or long enough after the last."""
         last_s = self._asked.get(wish)
-        if last_s is not None and vehicle_s - last_s < self.settings.retry_s:
+        pause_s = self.settings.retry_s * (TAKEOFF_RETRIES if isinstance(wish, TakeOff) else 1.0)
+        if last_s is not None and vehicle_s - last_s < pause_s:
             return False
         self._asked[wish] = vehicle_s
         if isinstance(wish, SetMode):
