@@ -12,7 +12,7 @@ from uav_dc_ros.messages import Phase
 ON_THE_WAY = [
     ("ardupilot", "tcp", "freeze", "no position for 0.5 s"),
     ("px4", "udp", "jump away", "outside the fence"),
-    ("ardupilot", "udp", "jump", "jumped by 30"),
+    ("ardupilot", "udp", "jump", "jumped by 3"),
     ("px4", "tcp", "mode", "mode POSCTL: changed by a pilot or by the autopilot's failsafe"),
     ("ardupilot", "tcp", "mode", "mode ALT_HOLD: changed by a pilot or by the autopilot's failsafe"),
     ("px4", "udp", "lose", "lost its position estimate"),

@@ -206,6 +206,33 @@ def test_a_vehicle_that_starts_anew_is_asked_again() -> None:
         until(vehicle, lambda known: (known.position_s or 0.0) > time.monotonic() - 0.1)
 
 
+def test_px4_tells_its_origin_again_to_a_bridge_that_comes_back() -> None:
+    with fake("px4", "udp", speed=20.0, ready_s=0.5) as autopilot:
+        for _ in range(2):  # its streams go on meanwhile, and the origin does not change
+            with Mavlink(autopilot.address) as vehicle:
+                until(vehicle, lambda known: known.missing is None and known.estimate_ok)
+        assert autopilot.all("armed") == []
+
+
+def test_what_keeps_a_vehicle_on_the_ground_is_told_in_its_own_words() -> None:
+    with fake("ardupilot", speed=20.0, ready_s=30.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+        until(vehicle, lambda known: "has not sent" in str(known.missing))
+        waiting = "the autopilot is not ready to arm: PreArm: AHRS: waiting for home"
+        autopilot.do("lose", 1)  # the position comes, but nobody trusts it
+        until(vehicle, lambda known: known.missing == waiting)
+        autopilot.do("lose", 0)
+        until(vehicle, lambda known: known.missing is None and known.estimate_ok)
+
+
+def test_px4_is_ready_whatever_it_says_of_the_mode_that_it_is_in() -> None:
+    assert PX4.estimate_ok(0x37, 0, armed=False)
+    assert not PX4.estimate_ok(0x37 | 0x80, 0, armed=False)
+    assert not ARDUCOPTER.estimate_ok(0x33F, 0, armed=False)
+    assert ARDUCOPTER.estimate_ok(0x33F, 1 << 28, armed=False)
+    assert not ARDUCOPTER.estimate_ok(0x37, 1 << 28, armed=False), "not where it would arm"
+    assert ARDUCOPTER.estimate_ok(0x37, 0, armed=True), "what it predicts on the ground is gone in the air"
+
+
 def test_the_time_of_a_vehicle_that_starts_anew_goes_on_and_its_position_is_forgotten() -> None:
     hearing = Hearing(HOME, Enu(0.0, 0.0, 0.0))
     heartbeat(hearing, 1, 1, 3)
@@ -222,7 +249,7 @@ def test_the_time_of_a_vehicle_that_starts_anew_goes_on_and_its_position_is_forg
     known = hear(codec.system_time_encode(0, 599_900))
     assert (known.vehicle_s, known.position is None) == (600.0, False), "a message that was overtaken"
     known = hear(codec.system_time_encode(0, 2_000))
-    assert (known.vehicle_s, known.position is None) == (602.0, True)
+    assert (known.vehicle_s, known.position, known.position_s) == (602.0, None, None), "or it would be fresh"
 
 
 def test_a_link_that_cannot_be_opened_says_why() -> None:
