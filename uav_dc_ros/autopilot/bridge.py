@@ -5,18 +5,19 @@
 It decides, and does nothing itself: `tick` is called often with what is known of the vehicle, and returns
 wishes for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
 last good setpoint stays), then to *return* or *land*, and at last to `aborted` with its reason. A pilot who
-changes the mode has the vehicle at once: from then on there are no setpoints and no wishes.
+changes the mode has the vehicle at once: from then on there are no setpoints and no wishes. Where that mode
+brings it down (an autopilot's failsafe does that, too), it is watched until it stands.
 """
 
 from collections.abc import Callable
 
-import numpy as np
-
-from uav_dc_ros.autopilot.course import Cell, Course, Standing
-from uav_dc_ros.autopilot.descent import Descent
+from uav_dc_ros.autopilot.asking import Asked
+from uav_dc_ros.autopilot.course import Cell, Course, Dwell, Standing
+from uav_dc_ros.autopilot.descent import DOWN, Descent
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.ground import Ground, Next
+from uav_dc_ros.autopilot.patience import Patience
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.autopilot.watch import Settings, Watch
 from uav_dc_ros.core.grid import Action
@@ -65,12 +66,14 @@ class Bridge:
         self.setpoint: Enu | None = None
         self.policy_is_gone = False
         self._on_change = on_change
-        self._asked: dict[Wish, float] = {}  # when a wish was last uttered, vehicle time
+        self._asked = Asked(settings)
         self._since_s = 0.0  # vehicle time of the last change of phase
-        self._there_since_s: float | None = None
-        self._alone_since_s: float | None = None  # vehicle time since when the policy is gone
+        self._dwell = Dwell(settings)
+        self._patience = Patience(settings, scenario.mission.step_s)
         self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
+        self._steady_s = 0.0  # steady clock, at the last tick
+        self._since_steady_s = 0.0  # and at the last change of phase
         self._descent = Descent()
         self._watched = Watch(settings)
         self._ground = Ground(self.course, settings, self.fence, self._watched)
@@ -120,7 +123,7 @@ class Bridge:
         if (breach := self.fence.breach(target)) is not None:
             return f"the target is outside the fence: {breach}"
         self.course.goal, self.setpoint = cell, target
-        self._enter(Phase.MOVING, f"{action.label} to cell {cell}", self._now_s)
+        self._enter(Phase.MOVING, f"{action.label} to cell {cell}")
         return None
 
     def stop(self, why: str) -> None:
@@ -144,9 +147,9 @@ class Bridge:
         Returns:
             Wishes to be passed on now, at most one of each kind.
         """
-        self._now_s = known.vehicle_s
+        self._now_s, self._steady_s = known.vehicle_s, now_s
         if self.phase is Phase.IDLE:
-            self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position", known.vehicle_s)
+            self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
         if self.phase.is_over:
             return []
         if self.phase in FLYING:
@@ -165,21 +168,31 @@ class Bridge:
             Phase.MOVING: self._fly,
             Phase.LANDING: self._land,
         }[self.phase](now_s, known)
-        return [wish for wish in wishes if self._may_ask(wish, known.vehicle_s)]
+        uttered = [wish for wish in wishes if self._asked.may(wish, known.vehicle_s)]
+        self._descent.tries += sum(isinstance(wish, SetMode) for wish in uttered)
+        return uttered
 
     # What goes wrong.
 
     def _taken_over(self, known: Telemetry) -> bool:
-        """Has somebody else the vehicle now: a pilot who changed the mode, or whoever disarmed it."""
-        ours = (Mode.COMMANDED,) if self.phase in STEERED else (Mode.LAND, Mode.RETURN, Mode.COMMANDED)
-        if self.phase is Phase.LANDING and not known.armed:
+        """Has somebody else the vehicle now, who changed its mode or disarmed it."""
+        landing = self.phase is Phase.LANDING
+        if landing and not known.armed:
             return False  # it stands
+        why = self.fault or (self.reason if landing else None) or known.refusal
+        after = "".join(
+            f" ({word}: {what})" for word, what in (("after", why), ("it says", known.said)) if what
+        )
         if not known.armed:
-            self._end(Phase.ABORTED, f"disarmed by somebody else while it was {self.phase.value}")
-        elif known.mode not in ours:
-            why = self.fault or (self.reason if self.phase is Phase.LANDING else None)
-            after = f" (after: {why})" if why else ""  # maybe the autopilot's own answer to that
-            self._end(Phase.ABORTED, f"taken over: mode {known.mode_name or known.mode.value}{after}")
+            who = "disarmed by a pilot or by the autopilot itself"
+            self._end(Phase.ABORTED, f"{who} while it was {self.phase.value}{after}")
+        elif known.mode is not Mode.COMMANDED if not landing else not self._descent.is_ours(known.mode):
+            mode = known.mode_name or known.mode.value
+            changed = f"mode {mode}: changed by a pilot or by the autopilot's failsafe{after}"
+            if not landing and known.mode in DOWN:
+                self._descend(known.mode, Phase.ABORTED, changed)
+            else:
+                self._end(Phase.ABORTED, changed)
         return self.phase.is_over
 
     def _watch(self, now_s: float, known: Telemetry) -> None:
@@ -211,22 +224,19 @@ class Bridge:
 
     def _policy_lives(self, known: Telemetry) -> bool:
         """Is there somebody who decides; until there is, the vehicle stops, and the step's time with it."""
-        patience_s = self.settings.silent_steps * self.scenario.mission.step_s
-        since_s = self._alone_since_s
-        if not self.policy_is_gone:
-            if since_s is not None:
-                self._alone_since_s = None
-                self._since_s += known.vehicle_s - since_s
-                self.setpoint = self.course.target
-                self._change(f"goes on after: {self.reason}")
-            return True
-        if since_s is None:
-            self._alone_since_s = known.vehicle_s
+        since, now = self._patience.gone_since, (self._now_s, self._steady_s)
+        if self.policy_is_gone and since is None:
+            self._patience.gone_since = now
             self.setpoint = known.position if self.phase is Phase.MOVING else self.setpoint
             self._change("holds: the policy is gone")
-        elif known.vehicle_s - since_s > patience_s:
-            self._give_up(f"the policy has been gone for {patience_s:g} s")
-        return False
+        elif self.policy_is_gone and since is not None and self._patience.is_over(since, now):
+            self._give_up(f"the policy has been gone for {self._patience.limit_s:g} s")
+        elif not self.policy_is_gone and since is not None:
+            self._patience.gone_since = None
+            self._since_s += now[0] - since[0]
+            self.setpoint = self.course.target
+            self._change(f"goes on after: {self.reason}")
+        return not self.policy_is_gone
 
     def _give_up(self, why: str, known: Telemetry | None = None) -> None:
         """End the mission: bring the vehicle down. One that does not know where it is cannot return."""
@@ -240,24 +250,21 @@ class Bridge:
         return self._follow(self._ground.connect(now_s, known))
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
-        return self._follow(self._ground.prepare(now_s, known, Arm() in self._asked))
+        return self._follow(self._ground.prepare(now_s, known, Arm() in self._asked.last_s))
 
     def _follow(self, advice: Next) -> list[Wish]:
         """Do what a look at a vehicle on the ground led to."""
+        self.setpoint = advice.setpoint
         if advice.phase.is_over:
             self._end(advice.phase, advice.why)
         elif advice.phase is Phase.LANDING:
-            self.setpoint = advice.setpoint
             self._descend(advice.down, advice.outcome, advice.why)
         elif advice.phase is Phase.TAKEOFF and self.course.is_done:
-            self.setpoint = advice.setpoint
             self._finish("when the bridge came back")
+        elif advice.phase is self.phase:
+            self._change(advice.why)
         else:
-            self.setpoint = advice.setpoint
-            if advice.phase is self.phase:
-                self._change(advice.why)
-            else:
-                self._enter(advice.phase, advice.why, self._now_s)
+            self._enter(advice.phase, advice.why)
         return [] if advice.wish is None else [advice.wish]
 
     def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
@@ -268,20 +275,19 @@ class Bridge:
             return []
         if position.up_m >= start.up_m - self.settings.tolerance_m:
             self.setpoint = start  # high enough to fly across
-        if self._is_there(start, known):
+        if self._dwell.is_there(start, known):
             self.course.cell = self.course.goal
-            self._enter(Phase.READY, f"at the start, cell {self.cell}", known.vehicle_s)
+            self._enter(Phase.READY, f"at the start, cell {self.cell}")
             return []
         return [TakeOff(start.up_m)] if known.on_ground is not False else []
 
     def _wait(self, now_s: float, known: Telemetry) -> list[Wish]:
-        patience_s = self.settings.silent_steps * self.scenario.mission.step_s
-        if known.vehicle_s - self._since_s > patience_s:
-            self._give_up(f"no move from the policy for {patience_s:g} s")
+        if self._patience.is_over((self._since_s, self._since_steady_s), (known.vehicle_s, now_s)):
+            self._give_up(f"no move from the policy for {self._patience.limit_s:g} s")
         return []
 
     def _fly(self, now_s: float, known: Telemetry) -> list[Wish]:
-        there = self._is_there(self.course.target, known)
+        there = self._dwell.is_there(self.course.target, known)
         if not there and known.vehicle_s - self._since_s < self.scenario.mission.step_s:
             return []
         self.course.arrive()
@@ -289,7 +295,7 @@ class Bridge:
         if self.course.is_done:
             self._finish(how)
         else:
-            self._enter(Phase.READY, f"step {self.step}: {how}", known.vehicle_s)
+            self._enter(Phase.READY, f"step {self.step}: {how}")
         return []
 
     def _finish(self, how: str) -> None:
@@ -312,35 +318,29 @@ class Bridge:
         if descent.obeys(known):
             self.setpoint = None
             return []
-        if descent.lands_instead(self.settings, self._asked.get(SetMode(Mode.RETURN)), known.vehicle_s):
+        if descent.lands_instead(
+            self.settings, self._asked.last_s.get(SetMode(Mode.RETURN)), known.vehicle_s
+        ):
             self._change(f"{self.reason}; it does not return ({known.refusal or 'no answer'}): lands")
         return [descent.wish]
 
     # Small change.
 
-    def _is_there(self, target: Enu, known: Telemetry) -> bool:
-        """Has the vehicle been at a place for the dwell time; where it is must be known."""
-        assert known.position is not None, "a fault otherwise"
-        if float(np.linalg.norm(np.subtract(known.position, target))) > self.settings.tolerance_m:
-            self._there_since_s = None
-            return False
-        if self._there_since_s is None:
-            self._there_since_s = known.vehicle_s
-        return known.vehicle_s - self._there_since_s >= self.settings.dwell_s
-
     def _descend(self, how: Mode, outcome: Phase, why: str) -> None:
         """Bring it down; until it obeys, the setpoint holds it where it is."""
         self._descent = Descent(how, outcome)
-        self._enter(Phase.LANDING, why, self._now_s)
+        self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:
         self.setpoint, self.fault = None, None
-        self._enter(phase, why, self._now_s)
+        self._enter(phase, why)
 
-    def _enter(self, phase: Phase, why: str, vehicle_s: float) -> None:
-        self.phase, self._since_s = phase, vehicle_s
-        self._there_since_s = self._alone_since_s = None
-        self._asked.clear()
+    def _enter(self, phase: Phase, why: str) -> None:
+        self.phase, self._since_s = phase, self._now_s
+        self._dwell.begin()
+        self._patience.gone_since = None
+        self._since_steady_s = self._steady_s
+        self._asked.begin()
         self.reason = why
         self._on_change()
 
@@ -349,13 +349,3 @@ class Bridge:
         if why != self.reason:
             self.reason = why
             self._on_change()
-
-    def _may_ask(self, wish: Wish, vehicle_s: float) -> bool:
-        """Utter a wish now: the first time, or long enough after the last."""
-        last_s = self._asked.get(wish)
-        if last_s is not None and vehicle_s - last_s < self.settings.retry_s:
-            return False
-        self._asked[wish] = vehicle_s
-        if isinstance(wish, SetMode):
-            self._descent.tries += 1
-        return True

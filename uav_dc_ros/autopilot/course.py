@@ -4,6 +4,8 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.vehicle import Telemetry
+from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
@@ -78,3 +80,29 @@ class Course:
 
     def _ends(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
+
+
+class Dwell:
+    """Whether a vehicle is where it was sent, and stays there.
+
+    Args:
+        settings: how near, and for how long.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._since_s: float | None = None  # vehicle time
+
+    def begin(self) -> None:
+        """Forget what was: it is on its way to another place."""
+        self._since_s = None
+
+    def is_there(self, target: Enu, known: Telemetry) -> bool:
+        """Has it been at a place for the dwell time; where it is must be known."""
+        assert known.position is not None, "a fault otherwise"
+        if float(np.linalg.norm(np.subtract(known.position, target))) > self._settings.tolerance_m:
+            self._since_s = None
+            return False
+        if self._since_s is None:
+            self._since_s = known.vehicle_s
+        return known.vehicle_s - self._since_s >= self._settings.dwell_s

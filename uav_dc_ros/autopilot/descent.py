@@ -6,6 +6,8 @@ from uav_dc_ros.autopilot.vehicle import Mode, SetMode, Telemetry
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
 
+DOWN = (Mode.LAND, Mode.RETURN)
+
 
 @dataclass
 class Descent:
@@ -14,16 +16,23 @@ class Descent:
     Attributes:
         how: the mode that it is to come down in.
         outcome: of the mission, once the vehicle stands.
+        obeyed: was it seen coming down? From then on it is let alone: who changes the mode now is the pilot.
         tries: how often it was asked.
     """
 
     how: Mode = Mode.LAND
     outcome: Phase = Phase.ABORTED
+    obeyed: bool = False
     tries: int = 0
 
     def obeys(self, known: Telemetry) -> bool:
-        """Does it come down, as it was told or as its own failsafe knows better."""
-        return known.mode is self.how or (self.how is Mode.RETURN and known.mode is Mode.LAND)
+        """Does it come down, as it was told or as its own failsafe or a pilot knows better."""
+        self.obeyed = self.obeyed or known.mode in DOWN
+        return self.obeyed
+
+    def is_ours(self, mode: Mode) -> bool:
+        """Is a vehicle that shall come down in a mode that nobody else has chosen for something else."""
+        return mode in DOWN or (mode is Mode.COMMANDED and not self.obeyed)
 
     def lands_instead(self, settings: Settings, asked_s: float | None, vehicle_s: float) -> bool:
         """Has it to land now, as it was asked to return often enough.

@@ -6,6 +6,7 @@ Nothing here is done: each look ends in a `Next`, which the bridge carries out.
 from dataclasses import dataclass
 
 from uav_dc_ros.autopilot.course import Course
+from uav_dc_ros.autopilot.descent import DOWN
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
@@ -69,11 +70,14 @@ class Ground:
         """Why a mission that was in the air is not taken up again, or goes on coming down; None: it is."""
         before = self.course.standing
         if before.outcome is not None and known.armed:
-            down = known.mode if known.mode in (Mode.RETURN, Mode.LAND) else self.settings.then
+            down = known.mode if known.mode in DOWN else self.settings.then
             return Next(phase=Phase.LANDING, why=before.reason, down=down, outcome=before.outcome)
         if not known.armed:  # it is never armed a second time
             why = before.reason or "on the ground and disarmed when the bridge came back"
             return Next(phase=before.outcome or Phase.ABORTED, why=why)
+        if known.mode in DOWN:
+            why = f"in mode {known.mode_name or known.mode.value} when the bridge came back"
+            return Next(phase=Phase.LANDING, why=why, down=known.mode)
         if known.mode is not Mode.COMMANDED:
             why = f"in mode {known.mode_name or known.mode.value} when the bridge came back"
             return Next(phase=Phase.ABORTED, why=why)
@@ -91,7 +95,7 @@ class Ground:
         fault = self.watch.fault(now_s, known) or (self.fence.breach(here) if here is not None else None)
         ours = known.armed and known.mode is Mode.COMMANDED
         if fault is not None and not ours:
-            return Next(phase=Phase.CONNECTING, why=fault)
+            return Next(phase=Phase.CONNECTING, why=known.missing or fault)
         if ours:
             target = self.course.target
             above = Enu(here.east_m, here.north_m, target.up_m) if here is not None else target
@@ -101,7 +105,7 @@ class Ground:
             return Next(phase=Phase.TAKEOFF, why="armed, in the commanded mode", setpoint=above)
         mode = known.mode_name or known.mode.value
         if known.armed and begun:
-            return Next(phase=Phase.ABORTED, why=f"taken over: mode {mode}, before it took off")
+            return Next(phase=Phase.ABORTED, why=f"mode {mode} instead, before it took off: a pilot has it")
         if known.armed:
             why, wish = f"a pilot flies: mode {mode}", None
         elif (low := self.watch.battery_is_low(known)) is not None:

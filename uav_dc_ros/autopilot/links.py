@@ -84,7 +84,8 @@ class Address:
             return _Serial(self) if self.kind == "serial" else _Udp(self)
         except OSError as error:
             why = error.strerror or str(error)
-            raise LinkDown(f"{self} does not answer: {why}") from None
+            what = "does not answer" if self.kind == "tcp" else "cannot be opened"
+            raise LinkDown(f"{self} {what}: {why}") from None
 
 
 class _Tcp:

@@ -17,14 +17,14 @@ from collections import deque
 from typing import Any, Self
 
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, Hearing
+from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, ONCE, Hearing
 from uav_dc_ros.autopilot.links import Address, Link, LinkDown
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 
 SYSTEM, COMPONENT = 255, 191  # as what FS_GCS_ENABLE of ArduPilot looks after; MAV_COMP_ID_ONBOARD_COMPUTER
 ONBOARD_CONTROLLER, NO_AUTOPILOT, ACTIVE = 18, 8, 4  # MAV_TYPE, MAV_AUTOPILOT, MAV_STATE of this end
-SET_MODE, ARM, TAKE_OFF, SET_INTERVAL = 176, 400, 22, 511  # MAV_CMD
+SET_MODE, ARM, TAKE_OFF, SET_INTERVAL, REQUEST = 176, 400, 22, 511, 512  # MAV_CMD
 CUSTOM_MODE = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 LOCAL_NED = 1  # MAV_FRAME; the one that ArduPilot and PX4 both take
 POSITION_ONLY = 0xDF8  # POSITION_TARGET_TYPEMASK: ignore velocity, acceleration, yaw and its rate
@@ -279,6 +279,8 @@ class Mavlink:
                 self._asked_s[name] = now_s
                 number = getattr(self._codec, f"MAVLINK_MSG_ID_{name}")
                 self._send_command(SET_INTERVAL, float(number), 1e6 / rate_hz)
+                if name in ONCE:
+                    self._send_command(REQUEST, float(number))
 
     def _send_command(self, command: int, *parameters: float) -> None:
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]

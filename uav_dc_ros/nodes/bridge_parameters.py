@@ -48,6 +48,7 @@ SETTINGS = (
     _setting("position_age_s", "age of the position after which nobody flies by it", "s", 0.1, 10.0),
     _setting("link_age_s", "age of the last heartbeat after which the link is lost", "s", 1.5, 60.0),
     _setting("silent_steps", "steps' time without a move after which the policy is given up", "", 0.1, 100.0),
+    _setting("silent_s", "but not before this time by the clock", "s", 0.0, 600.0),
     _setting("fastest_mps", "no vehicle of this kind flies faster: what does, has jumped", "m/s", 1.0, 100.0),
     _setting("jump_m", "how far a position may jump, as estimates do now and then", "m", 0.1, 100.0),
     _setting("hold_s", "how long a fault may last before the mission ends", "s", 0.1, 600.0),

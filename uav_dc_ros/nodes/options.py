@@ -89,6 +89,11 @@ def check_vehicle(options: argparse.Namespace, nodes: list[str]) -> None:
 
 
 def check_writable(summary: Path, bag: Path | None) -> None:
+    """Refuse a file for the summary that could not be written.
+
+    Raises:
+        ParameterError: why.
+    """
     folder = summary.absolute().parent
     taken = summary.is_dir() or summary.absolute() == bag
     if taken or not folder.is_dir() or not os.access(folder, os.W_OK):
