@@ -72,8 +72,7 @@ class Bridge:
         self._patience = Patience(settings, scenario.mission.step_s)
         self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
-        self._steady_s = 0.0  # steady clock, at the last tick
-        self._since_steady_s = 0.0  # and at the last change of phase
+        self._steady_s = self._since_steady_s = 0.0  # steady clock: last tick, last change of phase
         self._descent = Descent()
         self._watched = Watch(settings)
         self._ground = Ground(self.course, settings, self.fence, self._watched)
