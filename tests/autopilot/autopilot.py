@@ -28,6 +28,7 @@ import math
 import os
 import select
 import socket
+import struct
 import sys
 import time
 from typing import Any
@@ -45,6 +46,7 @@ ADVICE_S = 30.0
 VELOCITY_S = 3.0  # GUID_TIMEOUT
 OFFBOARD_GAP_S, OFFBOARD_PROOF_S, OFFBOARD_LOSS_S = 0.5, 1.0, 1.0
 IDLE_DISARM_S, LANDED_DISARM_S = 10.0, 1.0
+SO_TIMESTAMPNS = 35  # of Linux: when a datagram came, however late this process reads it
 PATIENCE_S, AHEAD_S, LEAP_S = 0.25, 0.4, 0.4  # wall, simulated, simulated
 FLAGS, MADE_UP = 0x33F, 0x80
 HOME = (47.397742, 8.545594, 488.0)
@@ -219,7 +221,8 @@ class Autopilot:
         self.later: list[tuple[float, Any]] = []
         self.setpoints, self.last_setpoint, self.interrupted = 0, None, 0
         self.heartbeats = 0
-        self.times: list[float] | None = None  # when setpoints came, steady clock
+        self.came_s = 0.0
+        self.times: list[float] | None = None  # when setpoints came, as the system stamped them; UDP only
 
     def write(self, data: bytes) -> None:  # pymavlink calls it
         self.out += data
@@ -359,7 +362,7 @@ class Autopilot:
         c = self.copter
         self.setpoints += 1
         if self.times is not None:
-            self.times.append(time.monotonic())
+            self.times.append(self.came_s)
         ned, key = [m.x, m.y, m.z], (m.coordinate_frame, m.type_mask, m.x, m.y, m.z, m.vx, m.vy, m.vz)
         if key != self.last_setpoint:
             self.last_setpoint = key
@@ -472,6 +475,7 @@ class Wire:
         else:
             self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self.udp.setblocking(False)
+            self.udp.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self.peer = ("127.0.0.1", udp)
             port = udp
         self.met = False
@@ -483,19 +487,20 @@ class Wire:
 
     def exchange(self, autopilot: Autopilot, dropped: bool) -> bool:
         """Pass bytes both ways; did a message come."""
-        data, out = b"", bytes(autopilot.out)
+        data, out, met = b"", bytes(autopilot.out), False
         autopilot.out.clear()
         if self.udp is not None:
             self.met = True
-            try:
-                while True:
-                    data += self.udp.recv(65536)
-            except OSError:
-                pass
+            with contextlib.suppress(OSError):
+                while True:  # a datagram is a message or several, and came when the system says
+                    data, more, _, _ = self.udp.recvmsg(65536, 64)
+                    seconds, nanoseconds = struct.unpack("@ll", more[0][2])
+                    autopilot.came_s = seconds + nanoseconds * 1e-9
+                    met = (not dropped and autopilot.hear(data)) or met
             if out and not dropped:
                 with contextlib.suppress(OSError):
                     self.udp.sendto(out, self.peer)
-            return not dropped and autopilot.hear(data)
+            return met
         if dropped:
             self._hang_up()
             return False

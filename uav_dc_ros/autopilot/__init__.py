@@ -8,6 +8,7 @@ watch    how carefully to fly, and what keeps a vehicle from going on
 course   where a mission stands on the grid
 ground   before the first step
 descent  what brings a vehicle down
+priority running when it is due
 bridge   from connecting to landing: phases, steps, faults
 mavlink  a transport: an autopilot on MAVLink, over TCP, UDP or a serial line
 """

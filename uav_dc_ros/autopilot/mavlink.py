@@ -1,6 +1,7 @@
 """MAVLink with an autopilot: hears what it tells, passes wishes on, streams setpoints. It decides nothing.
 
-A thread of its own reads and writes, so that the stream keeps its pace whatever the rest of the process does.
+A thread of its own reads and writes, before all others where the system allows that, so that the stream keeps
+its pace. (Who holds Python's lock holds it up: the rest of the process should run when it is due, too.)
 It is a sign of life of those who decide all the same: heartbeats and setpoints end `LIFE_S` after the last
 call of `steer`, and then the autopilot's own failsafes take over, as they do when the process is gone.
 """
@@ -19,6 +20,7 @@ from typing import Any, Self
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, ONCE, Hearing
 from uav_dc_ros.autopilot.links import Address, Link, LinkDown
+from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 
@@ -170,6 +172,7 @@ class Mavlink:
             os.write(self._wake_in, b"\0")
 
     def _run(self) -> None:
+        run_when_due()
         heartbeat_s = stream_s = time.monotonic()
         streamed_vehicle_s, streamed, opened_s = 0.0, None, -math.inf
         heard_s = 0.0
