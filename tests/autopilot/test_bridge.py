@@ -332,6 +332,21 @@ def test_a_vehicle_that_flies_already_lands_where_that_is_wanted() -> None:
     assert not vehicle.armed
 
 
+@pytest.mark.parametrize("mode", [Mode.RETURN, Mode.OTHER])
+def test_a_vehicle_that_somebody_else_flew_is_not_armed_again(mode: Mode) -> None:
+    """One that returns, say, while a bridge is started anew: it must not take off again by itself."""
+    vehicle = Vehicle(position=Enu(300.0, 300.0, 50.0), mode=mode, armed=True)
+    flight = Flight(ARMING, vehicle)
+    flight.run(20.0)
+    vehicle.mode = Mode.LAND
+    flight.run(60.0)
+    assert not vehicle.armed
+    assert vehicle.asked == []
+    assert flight.bridge.reason == "a pilot had it: waiting for a pilot to set the mode and arm"
+    vehicle.mode, vehicle.armed = Mode.COMMANDED, True
+    flight.until(Phase.LANDED)
+
+
 def test_moves_out_of_turn_change_nothing() -> None:
     flight = fly_to_step(5)
     before = flight.bridge.goal, flight.bridge.setpoint

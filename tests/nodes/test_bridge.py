@@ -297,7 +297,7 @@ def test_a_pilot_who_takes_over_keeps_the_vehicle(ros: Ros, low: tuple[object, .
 @pytest.mark.long
 def test_the_stream_keeps_its_pace_while_policies_load_and_die(ros: Ros, low: tuple[object, ...]) -> None:
     """20 Hz, measured where it arrives; 99 of 100 setpoints within 10 ms of their time."""
-    with fake("ardupilot", speed=1.0, ready_s=1.0) as autopilot:
+    with fake("ardupilot", "udp", speed=1.0, ready_s=1.0) as autopilot:
         given = (*low, *beside(autopilot, "--arm", "--no-record"))
         process = ros.start("uav_dc_ros.run_all", *given)
         until(lambda: flies_east(autopilot, 1), process)
@@ -308,7 +308,11 @@ def test_the_stream_keeps_its_pace_while_policies_load_and_die(ros: Ros, low: tu
         times = autopilot.report()["times"]
         process.send_signal(signal.SIGINT)
         finish(process)
-    gaps_ms = np.diff(times) * 1e3
+    beats = [times[0]]
+    for time_s in times:
+        if time_s - beats[-1] > 0.04:  # another goal goes out at once, between the beats
+            beats.append(time_s)
+    gaps_ms = np.diff(beats) * 1e3
     assert len(gaps_ms) > 200
     off_ms = np.percentile(np.abs(gaps_ms - 50.0), 99)
     assert off_ms < 10.0, np.sort(gaps_ms)[-5:]

@@ -47,9 +47,11 @@ class Ground:
 
     def __init__(self, course: Course, settings: Settings, fence: Fence, watch: Watch) -> None:
         self.course, self.settings, self.fence, self.watch = course, settings, fence, watch
+        self._is_a_pilots = False  # somebody else had it armed: who lands it does not want it to start again
 
     def connect(self, now_s: float, known: Telemetry) -> Next:
         """Look at a vehicle that nothing is known of yet, at a steady time."""
+        self._is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
         fault = self.watch.fault(now_s, known)
         if known.missing is not None or fault is not None or known.position is None:
             return Next(phase=Phase.CONNECTING, why=known.missing or fault or "no position yet")
@@ -91,6 +93,7 @@ class Ground:
             known: of the vehicle.
             begun: was it asked to arm?
         """
+        self._is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
         here = known.position
         fault = self.watch.fault(now_s, known) or (self.fence.breach(here) if here is not None else None)
         ours = known.armed and known.mode is Mode.COMMANDED
@@ -110,6 +113,8 @@ class Ground:
             why, wish = f"a pilot flies: mode {mode}", None
         elif (low := self.watch.battery_is_low(known)) is not None:
             why, wish = low, None
+        elif self._is_a_pilots:
+            why, wish = "a pilot had it: waiting for a pilot to set the mode and arm", None
         elif not self.settings.arm:
             why, wish = "waiting for a pilot to set the mode and arm (--arm does it here)", None
         else:
