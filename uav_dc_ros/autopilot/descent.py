@@ -1,0 +1,45 @@
+"""What brings a vehicle down: return or land, asked for until it obeys, and then let alone."""
+
+from dataclasses import dataclass
+
+from uav_dc_ros.autopilot.vehicle import Mode, SetMode, Telemetry
+from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.messages import Phase
+
+
+@dataclass
+class Descent:
+    """One way down.
+
+    Attributes:
+        how: the mode that it is to come down in.
+        outcome: of the mission, once the vehicle stands.
+        tries: how often it was asked.
+    """
+
+    how: Mode = Mode.LAND
+    outcome: Phase = Phase.ABORTED
+    tries: int = 0
+
+    def obeys(self, known: Telemetry) -> bool:
+        """Does it come down, as it was told or as its own failsafe knows better."""
+        return known.mode is self.how or (self.how is Mode.RETURN and known.mode is Mode.LAND)
+
+    def lands_instead(self, settings: Settings, asked_s: float | None, vehicle_s: float) -> bool:
+        """Has it to land now, as it was asked to return often enough.
+
+        Args:
+            settings: how often is enough.
+            asked_s: when it was asked last, vehicle time; None: never.
+            vehicle_s: now.
+        """
+        answered = asked_s is None or vehicle_s - asked_s >= settings.retry_s
+        if self.how is not Mode.RETURN or self.tries < settings.returning_tries or not answered:
+            return False
+        self.how = Mode.LAND
+        return True
+
+    @property
+    def wish(self) -> SetMode:
+        """What to ask for."""
+        return SetMode(self.how)
