@@ -342,7 +342,7 @@ class Control:
     """Commands on standard input, a line each.
 
     refuse 0|1 (to arm, and tells so before); balk 0|1 (to arm, without a warning); drop SECONDS (wall);
-    freeze 0|1; jump NORTH EAST DOWN (0 0 0: back); mode NAME (a pilot); disarm; battery SHARE; lose 0|1 (the
+    freeze 0|1; jump NORTH EAST DOWN (0 0 0: back); mode NAME, arm, disarm (a pilot); battery SHARE; lose 0|1 (the
     estimate); late SECONDS (simulated); reboot; times (of setpoints, from now on); report; quit.
     """
 
@@ -377,8 +377,8 @@ class Control:
                 a.offset = [float(word) for word in words]
             case "mode":
                 c.set_mode(words[0], "pilot")
-            case "disarm":
-                c.arm(False, "pilot")
+            case "arm" | "disarm":
+                c.arm(verb == "arm", "pilot")
             case "battery":
                 c.battery = float(words[0])
             case "lose":
