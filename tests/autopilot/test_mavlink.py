@@ -1,10 +1,13 @@
 """The transport: addresses, whom it listens to, the stream, links that break."""
 
+import math
 import os
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,6 +30,7 @@ HOME = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0
     [
         ("tcp:127.0.0.1:5760", Address("tcp", "127.0.0.1", 5760)),
         ("udp:0.0.0.0:14540", Address("udpin", "0.0.0.0", 14540)),
+        ("tcp:[::1]:5760", Address("tcp", "::1", 5760)),
         ("udpin::14540", None),
         ("udpout:10.0.0.2:14550", Address("udpout", "10.0.0.2", 14550)),
         ("serial:/dev/ttyUSB0:57600", Address("serial", "/dev/ttyUSB0", 57600)),
@@ -49,16 +53,65 @@ def test_addresses(text: str, expected: Address | None) -> None:
             Address.parse(text)
 
 
-def test_a_missing_package_is_told_with_its_extra() -> None:
+@pytest.mark.parametrize("text", ["tcp:..:5760", f"tcp:{'a' * 300}:5760", "serial:a\0b:57600"])
+def test_a_name_that_nothing_can_have_is_refused_and_not_tried_again(text: str) -> None:
+    with Mavlink(text) as vehicle, pytest.raises(VehicleError, match=r"^connect: .*; expected "):
+        until(vehicle, lambda known: False)
+
+
+def test_what_cannot_be_opened_now_is_told_and_tried_again(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        with Mavlink(f"udpin:127.0.0.1:{port}") as vehicle:
+            taken = f"udpin:127.0.0.1:{port} cannot be opened: Address already in use"
+            until(vehicle, lambda known: known.missing == taken)
+            other.close()
+            until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot")
+    device = tmp_path / "ttyUSB0"
+    with Mavlink(f"serial:{device}:57600") as vehicle:
+        until(vehicle, lambda known: "cannot be opened: " in str(known.missing))
+        assert "No such file or directory" in str(vehicle.telemetry().missing)
+        master, slave = os.openpty()
+        device.symlink_to(os.ttyname(slave))  # somebody plugs it in
+        until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot")
+    os.close(slave)
+    os.close(master)
+
+
+def test_messages_that_make_no_sense_change_nothing() -> None:
+    hearing = Hearing(HOME, Enu(0.0, 0.0, 0.0))
+    heartbeat(hearing, 1, 1, 3)
+    codec = mav.MAVLink(None, 1, 1)
+    for number, message in enumerate(
+        [
+            codec.gps_global_origin_encode(2_000_000_000, 85455940, 488000),
+            codec.gps_global_origin_encode(473977420, 85455940, 488000),
+            codec.local_position_ned_encode(1000, math.nan, 2.0, -3.0, 0.0, 0.0, 0.0),
+            codec.local_position_ned_encode(2000, 1.0, 2.0, math.inf, 0.0, 0.0, 0.0),
+            codec.sys_status_encode(0, 0, 0, 0, 65535, -1, -1, 0, 0, 0, 0, 0, 0),
+        ]
+    ):
+        hearing.hear(mav.MAVLink(None).parse_buffer(message.pack(codec))[0], float(number))
+    known = hearing.telemetry(5.0)
+    assert (known.position, known.position_s, known.battery, known.battery_v) == (None, None, None, None)
+    assert hearing.frame is not None
+
+
+@pytest.mark.parametrize(
+    ("package", "address"),
+    [("pymavlink.dialects.v20", "tcp:127.0.0.1:5760"), ("serial", "serial:/dev/ttyUSB0:57600")],
+)
+def test_a_missing_package_is_told_with_its_extra(package: str, address: str) -> None:
     code = (
-        "import sys; sys.modules['pymavlink.dialects.v20'] = None\n"
+        f"import sys; sys.modules['{package}'] = None\n"
         "from uav_dc_ros.autopilot.mavlink import Mavlink\n"
         "from uav_dc_ros.errors import VehicleError\n"
-        "try: Mavlink('tcp:127.0.0.1:5760')\n"
+        f"try: Mavlink('{address}')\n"
         "except VehicleError as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("a vehicle on MAVLink needs pymavlink;")
+    assert f" needs py{package.removeprefix('py').partition('.')[0]}; expected" in done.stdout
     assert "uav_dc_ros[mavlink]" in done.stdout
 
 

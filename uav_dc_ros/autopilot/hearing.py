@@ -1,5 +1,6 @@
 """What is known of the vehicle, from the MAVLink messages that came. No input or output."""
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -169,6 +170,8 @@ class Hearing:
             self.granted("arming")
 
     def _on_gps_global_origin(self, message: Any, now_s: float) -> None:
+        if abs(message.latitude) > 90e7 or abs(message.longitude) > 180e7:
+            return  # nowhere on the Earth
         self._origin = Geodetic(
             latitude_deg=message.latitude / 1e7,
             longitude_deg=message.longitude / 1e7,
@@ -181,6 +184,8 @@ class Hearing:
     def _on_local_position_ned(self, message: Any, now_s: float) -> None:
         if message.time_boot_ms == self._position_ms:
             return  # the same again
+        if not all(map(math.isfinite, (message.x, message.y, message.z))):
+            return  # no position
         self._position_ms = message.time_boot_ms
         self._ned, self._position_s = Ned(message.x, message.y, message.z), now_s
         self._place()

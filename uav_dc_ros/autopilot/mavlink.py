@@ -19,7 +19,7 @@ from typing import Any, Self
 
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, ONCE, Hearing
-from uav_dc_ros.autopilot.links import Address, Link, LinkDown
+from uav_dc_ros.autopilot.links import Address, Link, LinkDown, load_serial
 from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
@@ -84,6 +84,8 @@ class Mavlink:
             datum = Geodetic.parse(anchor)
         self.address = Address.parse(address)
         self._codec = load_codec()
+        if self.address.kind == "serial":
+            load_serial(self.address)
         self._mav = self._codec.MAVLink(None, SYSTEM, COMPONENT)
         self._mav.robust_parsing = True  # skips bytes that are no message
         self._hearing = Hearing(datum, place, system)
