@@ -96,7 +96,7 @@ def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario:
         ("world", {"missions": "many"}, "missions: 'many'; expected a whole number"),
         ("world", {"pace": "slow"}, "pace: 'slow'; expected 'lockstep' or a number above 0"),
         ("world", {"pace": -3}, "pace: '-3'; expected 'lockstep' or a number above 0"),
-        ("world", {"peers": ["pilot"]}, "peers: 'pilot'; expected some of world, channel_monitor"),
+        ("world", {"peers": ["pilot"]}, "peers: 'pilot'; expected some of world, bridge, channel_monitor"),
         ("channel_monitor", {"scenario": "mars"}, "scenario 'mars'"),
         ("policy", {"policy": "nobody"}, "policy 'nobody': no such name or folder"),
         ("policy", {"policy": "five_clusters_dueling", "scenario": "three_clusters"}, "does not fit"),

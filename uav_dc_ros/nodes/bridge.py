@@ -74,6 +74,8 @@ class AutopilotBridge(MissionNode):
         self._begun = False
         self._known = Telemetry()
         self._told: messages.Mission | None = None
+        self._news: list[str] = []  # changes since the last diagnostics
+        self._changes = 0
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
@@ -96,6 +98,7 @@ class AutopilotBridge(MissionNode):
             while not (bridge.is_done_with(self._known)) and time.monotonic() < deadline_s:
                 self._tick()
                 time.sleep(TICK_LEAST_S)
+        self._tell_diagnostics()  # the last changes, too
         self.vehicle.close()
         self.journal.close()
         self._policy.close()
@@ -220,6 +223,7 @@ class AutopilotBridge(MissionNode):
         )
         if status != self._told:
             self._told = status
+            self._news.append(f"{status.phase}, step {status.step}: {status.reason}")
             self.say("mission", status)
             if not self.is_supervised and bridge.phase not in (Phase.READY, Phase.MOVING):
                 self.get_logger().info(f"{status.phase}: {status.reason}")
@@ -244,6 +248,10 @@ class AutopilotBridge(MissionNode):
         }
         for name, at_s in (("position", known.position_s), ("heartbeat", known.heartbeat_s)):
             values[f"{name} age [s]"] = "" if at_s is None else f"{now_s - at_s:.2f}"
+        for news in self._news:
+            self._changes += 1
+            values[f"change {self._changes}"] = news
+        self._news.clear()
         return warnings, values
 
 
