@@ -1,6 +1,6 @@
 """One mission against the fake autopilot, in a process of its own, with a fault on the way or without one.
 
-    python -m tests.autopilot.faulty --kind px4 --wire udp --fault "jump away" --step 1
+    python -m tests.autopilot.faulty --kind px4 --wire udp --fault "jump away"
 
 A process per flight, as on a companion computer: several bridges in one would starve one another's streams.
 It prints one line of JSON when the mission is over: what the bridge decided, and what the autopilot saw.
@@ -14,12 +14,15 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from tests.autopilot.flight import KINDS, ROOT, WIRES, Flight, fake
+import msgspec
+
+from tests.autopilot.flight import KINDS, ROOT, SCENARIO, WIRES, Flight, fake
 from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 
 SPEED = 100.0
-AT_ONCE = 2
+AT_ONCE = 4  # each takes a third of a core
 LIMIT_S = 120.0
 # The clock runs a hundredth as fast as the vehicle's: what is a blink of it is half a minute of a flight.
 CAREFUL = Settings(arm=True, position_age_s=0.5, link_age_s=0.8, hold_s=10.0, lost_s=2.0, silent_s=1.0)
@@ -51,19 +54,26 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
 }
 
 
-def fly(kind: str, wire: str, name: str, step: int, at_s: float) -> dict[str, Any]:
+def low() -> Scenario:
+    """The same world, flown near the ground: a climb of 20 m instead of 200."""
+    grid = msgspec.structs.replace(SCENARIO.grid, altitude_min_m=10.0, altitude_step_m=5.0)
+    mission = msgspec.structs.replace(SCENARIO.mission, start_m=(*SCENARIO.mission.start_m[:2], 20.0))
+    return msgspec.structs.replace(SCENARIO, grid=grid, mission=mission)
+
+
+def fly(kind: str, wire: str, name: str, at_s: float | None) -> dict[str, Any]:
     """Fly one mission.
 
     Args:
         kind: of the autopilot.
         wire: to it.
         name: of the fault.
-        step, at_s: it begins when the vehicle moves at this step, or at this time of the vehicle's; the first
-            of the two.
+        at_s: the vehicle's time at which it begins. None: while the vehicle moves at its second step, in a
+            world that is flown near the ground.
     """
     line, ending, _ = FAULTS[name]
     with fake(kind, wire, speed=SPEED) as autopilot:
-        flight = Flight(autopilot, CAREFUL)
+        flight = Flight(autopilot, CAREFUL, low() if at_s is None else SCENARIO)
         bridge = flight.bridge
         begun_s: float | None = None
         ended = False
@@ -71,8 +81,11 @@ def fly(kind: str, wire: str, name: str, step: int, at_s: float) -> dict[str, An
         def meddle() -> None:
             nonlocal begun_s, ended
             now_s = time.monotonic()
-            due = bridge.step >= step and bridge.phase is Phase.MOVING
-            if begun_s is None and line and (due or flight.vehicle.telemetry().vehicle_s >= at_s):
+            if at_s is None:
+                due = bridge.step >= 1 and bridge.phase is Phase.MOVING
+            else:
+                due = flight.vehicle.telemetry().vehicle_s >= at_s
+            if begun_s is None and line and due:
                 begun_s = now_s
                 if line == "policy":
                     flight.policy = None
@@ -113,13 +126,15 @@ def fly(kind: str, wire: str, name: str, step: int, at_s: float) -> dict[str, An
         }
 
 
-def flown(
-    kind: str, wire: str, name: str = "none", step: int = 1, at_s: float = float("inf")
-) -> dict[str, Any]:
-    """The same, in a process of its own."""
-    options = ["--kind", kind, "--wire", wire, "--fault", name, "--step", str(step), "--at", str(at_s)]
+def flown(kind: str, wire: str, name: str = "none", at_s: float | None = None) -> dict[str, Any]:
+    """The same, in a process of its own; without a fault, in the whole world."""
+    at_s = 0.0 if name == "none" else at_s
+    options = ["--kind", kind, "--wire", wire, "--fault", name]
     done = subprocess.run(
-        [sys.executable, "-m", "tests.autopilot.faulty", *options],
+        [
+            *(sys.executable, "-m", "tests.autopilot.faulty", *options),
+            *(() if at_s is None else ("--at", str(at_s))),
+        ],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -130,8 +145,8 @@ def flown(
     return dict(json.loads(done.stdout))
 
 
-def all_flown(cases: list[tuple[Any, ...]]) -> dict[tuple[Any, ...], dict[str, Any]]:
-    """Many of them, a few at a time."""
+def all_flown(cases: list[tuple[str, ...]]) -> dict[tuple[str, ...], dict[str, Any]]:
+    """Many of them, a few at a time: kind and wire, or kind, wire and fault."""
     with ThreadPoolExecutor(AT_ONCE) as threads:
         return dict(zip(cases, threads.map(lambda case: flown(*case), cases), strict=True))
 
@@ -158,10 +173,9 @@ def main() -> None:
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--wire", choices=WIRES, required=True)
     parser.add_argument("--fault", choices=FAULTS, default="none")
-    parser.add_argument("--step", type=int, default=1)
-    parser.add_argument("--at", type=float, default=float("inf"))
+    parser.add_argument("--at", type=float)
     options = parser.parse_args()
-    print(json.dumps(fly(options.kind, options.wire, options.fault, options.step, options.at)))
+    print(json.dumps(fly(options.kind, options.wire, options.fault, options.at)))
 
 
 if __name__ == "__main__":
