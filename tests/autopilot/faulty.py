@@ -1,12 +1,11 @@
-"""One mission against the fake autopilot, in a process of its own, with a fault on the way or without one.
+"""Missions against the fake autopilot, in a process of their own, with a fault on the way or without one.
 
-    python -m tests.autopilot.faulty --kind px4 --wire udp --fault "jump away"
+    python -m tests.autopilot.faulty "px4,udp,jump away" "ardupilot,tcp,freeze,250.0"
 
-A process per flight, as on a companion computer: several bridges in one would starve one another's streams.
-It prints one line of JSON when the mission is over: what the bridge decided, and what the autopilot saw.
+One flight at a time in a process, as on a companion computer: several bridges in one would starve one another's
+streams. It prints one line of JSON when a mission is over: what the bridge decided, and what the autopilot saw.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -16,13 +15,13 @@ from typing import Any
 
 import msgspec
 
-from tests.autopilot.flight import KINDS, ROOT, SCENARIO, WIRES, Flight, fake
+from tests.autopilot.flight import ROOT, SCENARIO, Flight, fake
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 
 SPEED = 100.0
-AT_ONCE = 4  # each takes a third of a core
+AT_ONCE = 4
 LIMIT_S = 120.0
 # The clock runs a hundredth as fast as the vehicle's: what is a blink of it is half a minute of a flight.
 CAREFUL = Settings(arm=True, position_age_s=0.5, link_age_s=0.8, hold_s=10.0, lost_s=2.0, silent_s=1.0)
@@ -103,12 +102,14 @@ def fly(kind: str, wire: str, name: str, at_s: float | None) -> dict[str, Any]:
 
         with flight.vehicle:
             flight.until(lambda: bridge.is_over, LIMIT_S, meddle)
-            first = autopilot.report()
-            end_s = time.monotonic() + 0.2
-            while time.monotonic() < end_s:  # the node goes on a while, and nothing must come of it
-                flight.tick()
-                time.sleep(0.01)
-            last = autopilot.report()
+            looks = []
+            for _ in range(2):  # the node goes on a while, and nothing must come of it but what is on its way
+                end_s = time.monotonic() + 0.2
+                while time.monotonic() < end_s:
+                    flight.tick()
+                    time.sleep(0.01)
+                looks.append(autopilot.report())
+            first, last = looks
         return {
             "phase": bridge.phase,
             "reason": bridge.reason,
@@ -126,29 +127,30 @@ def fly(kind: str, wire: str, name: str, at_s: float | None) -> dict[str, Any]:
         }
 
 
-def flown(kind: str, wire: str, name: str = "none", at_s: float | None = None) -> dict[str, Any]:
-    """The same, in a process of its own; without a fault, in the whole world."""
-    at_s = 0.0 if name == "none" else at_s
-    options = ["--kind", kind, "--wire", wire, "--fault", name]
+def flown(cases: list[tuple[Any, ...]]) -> list[dict[str, Any]]:
+    """One after the other, in a process of their own: kind, wire, fault and time, or fewer of them."""
     done = subprocess.run(
-        [
-            *(sys.executable, "-m", "tests.autopilot.faulty", *options),
-            *(() if at_s is None else ("--at", str(at_s))),
-        ],
+        [sys.executable, "-m", "tests.autopilot.faulty", *(",".join(map(str, case)) for case in cases)],
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=LIMIT_S + 30.0,
+        timeout=(LIMIT_S + 30.0) * len(cases),
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    return dict(json.loads(done.stdout))
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def all_flown(cases: list[tuple[str, ...]]) -> dict[tuple[str, ...], dict[str, Any]]:
-    """Many of them, a few at a time: kind and wire, or kind, wire and fault."""
+def all_flown(cases: list[tuple[Any, ...]]) -> dict[tuple[Any, ...], dict[str, Any]]:
+    """Many of them, a few at a time."""
+    shares = [cases[number::AT_ONCE] for number in range(AT_ONCE)]
     with ThreadPoolExecutor(AT_ONCE) as threads:
-        return dict(zip(cases, threads.map(lambda case: flown(*case), cases), strict=True))
+        told = threads.map(flown, shares)
+        return {
+            case: one
+            for share, ones in zip(shares, told, strict=True)
+            for case, one in zip(share, ones, strict=True)
+        }
 
 
 def check(name: str, told: dict[str, Any]) -> None:
@@ -168,14 +170,12 @@ def check(name: str, told: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Fly, and tell."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--kind", choices=KINDS, required=True)
-    parser.add_argument("--wire", choices=WIRES, required=True)
-    parser.add_argument("--fault", choices=FAULTS, default="none")
-    parser.add_argument("--at", type=float)
-    options = parser.parse_args()
-    print(json.dumps(fly(options.kind, options.wire, options.fault, options.at)))
+    """Fly, and tell. Without a fault, in the whole world."""
+    for case in sys.argv[1:]:
+        kind, wire, name, at_s, *_ = (*case.split(","), *[""] * 3)
+        name = name or "none"
+        at_s = at_s or ("0" if name == "none" else "")
+        print(json.dumps(fly(kind, wire, name, float(at_s) if at_s else None)), flush=True)
 
 
 if __name__ == "__main__":

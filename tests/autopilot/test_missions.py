@@ -99,4 +99,4 @@ def test_any_fault_at_any_moment(number: int) -> None:
     dice = random.Random(number)
     name = list(FAULTS)[number % len(FAULTS)]
     kind, wire, at_s = dice.choice(KINDS), dice.choice(WIRES), dice.uniform(0.0, 1000.0)
-    check(name, flown(kind, wire, name, at_s))
+    check(name, flown([(kind, wire, name, at_s)])[0])

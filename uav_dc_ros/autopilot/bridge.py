@@ -13,11 +13,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from uav_dc_ros.autopilot.asking import Asking
 from uav_dc_ros.autopilot.course import Cell, Course, Standing
 from uav_dc_ros.autopilot.descent import DOWN, Descent
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.ground import Ground, Next
+from uav_dc_ros.autopilot.hold import Hold
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.autopilot.watch import Settings, Watch
 from uav_dc_ros.core.grid import Action
@@ -27,7 +29,6 @@ from uav_dc_ros.messages import Phase
 __all__ = ["Bridge", "Standing"]
 
 FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
-TAKEOFF_RETRIES = 2.5  # as many pauses between wishes to take off: motors need some seconds to lift it
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
 
 
@@ -44,7 +45,6 @@ class Bridge:
         phase: where the mission stands.
         reason: why it is in this phase, in words.
         course: steps flown, the cell reached last, and the cell that it flies to.
-        fault: what keeps it from going on at the moment; None: nothing.
         setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
     """
 
@@ -59,18 +59,17 @@ class Bridge:
         self.fence = Fence.around(scenario)
         self.phase, self.reason = Phase.IDLE, "not started"
         self.course = Course(scenario, standing)
-        self.fault: str | None = None
         self.setpoint: Enu | None = None
         self._on_change = on_change
-        self._asked: dict[Wish, float] = {}  # when a wish was last uttered, vehicle time
+        self._asking = Asking(settings.retry_s)
         self._since_s = 0.0  # vehicle time of the last change of phase
         self._there_since_s: float | None = None
-        self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
         self._steady_s = 0.0  # steady clock, at the last tick
         self._since_steady_s = 0.0  # and at the last change of phase
         self._descent = Descent()
         self._watched = Watch(settings)
+        self._hold = Hold(self._watched)
         self._ground = Ground(self.course, settings, self.fence, self._watched)
 
     @property
@@ -92,6 +91,11 @@ class Bridge:
     def goal(self) -> Cell:
         """The cell that it is in, or flies to."""
         return self.course.goal
+
+    @property
+    def fault(self) -> str | None:
+        """What keeps it from going on at the moment; None: nothing."""
+        return self._hold.fault
 
     @property
     def standing(self) -> Standing:
@@ -150,7 +154,9 @@ class Bridge:
             Phase.MOVING: self._fly,
             Phase.LANDING: self._land,
         }[self.phase](now_s, known)
-        return [wish for wish in wishes if self._may_ask(wish, known.vehicle_s)]
+        uttered = [wish for wish in wishes if self._asking.may(wish, known.vehicle_s)]
+        self._descent.tries += any(isinstance(wish, SetMode) for wish in uttered)
+        return uttered
 
     # What goes wrong.
 
@@ -177,7 +183,6 @@ class Bridge:
 
     def _watch(self, now_s: float, known: Telemetry) -> None:
         """Find what keeps the vehicle from going on; what lasts too long ends the mission."""
-        settings = self.settings
         if self.phase is Phase.LANDING:
             return
         if (low := self._watched.battery_is_low(known)) is not None:
@@ -187,24 +192,17 @@ class Bridge:
         if position is not None and (breach := self.fence.breach(position)) is not None:
             self._give_up(f"the vehicle is outside the fence: {breach}")
             return
-        fault = self._watched.fault(now_s, known)
-        if fault is None:
-            if self.fault is not None:
-                self.fault = None
+        match self._hold.look(now_s, known):
+            case "begins":
+                self._change(f"holds: {self.fault}")
+            case "passes":
                 self._change(f"goes on after: {self.reason}")
-            return
-        if self.fault is None:
-            self._fault_since_s = now_s, known.vehicle_s
-            self.fault = fault
-            self._change(f"holds: {fault}")
-            return
-        steady_s, vehicle_s = self._fault_since_s
-        if max(now_s - steady_s, known.vehicle_s - vehicle_s) > settings.hold_s:
-            self._give_up(fault, known)
+            case "ends":
+                self._give_up(str(self.fault), known)
 
     def _give_up(self, why: str, known: Telemetry | None = None) -> None:
         """End the mission: bring the vehicle down. One that does not know where it is cannot return."""
-        self.fault = None
+        self._hold.fault = None
         lost = known is not None and not known.estimate_ok
         self._descend(Mode.LAND if lost else self.settings.then, Phase.ABORTED, why)
 
@@ -214,7 +212,7 @@ class Bridge:
         return self._follow(self._ground.connect(now_s, known))
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
-        return self._follow(self._ground.prepare(now_s, known, Arm() in self._asked))
+        return self._follow(self._ground.prepare(now_s, known, Arm() in self._asking.asked_s))
 
     def _follow(self, advice: Next) -> list[Wish]:
         """Do what a look at a vehicle on the ground led to."""
@@ -287,7 +285,9 @@ class Bridge:
         if descent.obeys(known):
             self.setpoint = None
             return []
-        if descent.lands_instead(self.settings, self._asked.get(SetMode(Mode.RETURN)), known.vehicle_s):
+        if descent.lands_instead(
+            self.settings, self._asking.asked_s.get(SetMode(Mode.RETURN)), known.vehicle_s
+        ):
             self._change(f"{self.reason}; it does not return ({known.refusal or 'no answer'}): lands")
         return [descent.wish]
 
@@ -309,13 +309,13 @@ class Bridge:
         self._enter(Phase.LANDING, why, self._now_s)
 
     def _end(self, phase: Phase, why: str) -> None:
-        self.setpoint, self.fault = None, None
+        self.setpoint, self._hold.fault = None, None
         self._enter(phase, why, self._now_s)
 
     def _enter(self, phase: Phase, why: str, vehicle_s: float) -> None:
         self.phase, self._since_s, self._there_since_s = phase, vehicle_s, None
         self._since_steady_s = self._steady_s
-        self._asked.clear()
+        self._asking.asked_s.clear()
         self.reason = why
         self._on_change()
 
@@ -324,14 +324,3 @@ class Bridge:
         if why != self.reason:
             self.reason = why
             self._on_change()
-
-    def _may_ask(self, wish: Wish, vehicle_s: float) -> bool:
-        """Utter a wish now: the first time, or long enough after the last."""
-        last_s = self._asked.get(wish)
-        pause_s = self.settings.retry_s * (TAKEOFF_RETRIES if isinstance(wish, TakeOff) else 1.0)
-        if last_s is not None and vehicle_s - last_s < pause_s:
-            return False
-        self._asked[wish] = vehicle_s
-        if isinstance(wish, SetMode):
-            self._descent.tries += 1
-        return True
