@@ -2,8 +2,9 @@
 
     python -m tests.autopilot.faulty "px4,udp,jump away" "ardupilot,tcp,freeze,250.0"
 
-One flight at a time in a process, as on a companion computer: several bridges in one would starve one another's
-streams. It prints one line of JSON when a mission is over: what the bridge decided, and what the autopilot saw.
+One flight at a time in a process, as on a companion computer: several bridges in one would starve one
+another's streams. It prints one line of JSON when a mission is over: what the bridge decided, and what the
+autopilot saw.
 """
 
 import json

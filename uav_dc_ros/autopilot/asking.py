@@ -2,9 +2,7 @@
 
 from uav_dc_ros.autopilot.vehicle import TakeOff, Wish
 
-TAKEOFF_PAUSES = (
-    2.5  # as long a pause before the next wish to take off: motors need seconds to lift a vehicle
-)
+TAKEOFF_PAUSES = 2.5  # as long a pause after a wish to take off: motors need seconds to lift a vehicle
 
 
 class Asking:

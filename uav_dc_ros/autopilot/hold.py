@@ -22,9 +22,9 @@ class Hold:
         self._since_s = 0.0, 0.0  # steady clock, vehicle time
 
     def look(self, now_s: float, known: Telemetry) -> Literal["begins", "lasts", "passes", "ends"] | None:
-        """What has become of it, at a steady time: `ends` is the mission's end, after `hold_s` of either clock.
+        """What has become of it, at a steady time; None: nothing is wrong, and nothing was.
 
-        None: nothing is wrong, and nothing was.
+        `ends` is the end of the mission: it has lasted for `hold_s`, on either clock.
         """
         before, fault = self.fault, self.watch.fault(now_s, known)
         if fault is None:
