@@ -13,7 +13,7 @@ from tests.autopilot.simulated import Vehicle
 from uav_dc_ros import scenarios
 from uav_dc_ros.autopilot.bridge import Bridge, Standing
 from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode
+from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
@@ -103,6 +103,16 @@ def fly_to_step(step: int, how: Settings = ARMING) -> Flight:
     while flight.bridge.step < step or flight.bridge.phase is not Phase.MOVING:
         flight.tick()
     return flight
+
+
+def test_a_vehicle_whose_motors_need_their_time_is_not_told_to_take_off_anew() -> None:
+    flight = Flight()
+    flight.until(Phase.TAKEOFF)
+    flight.vehicle.deaf = True  # it has heard, and is still on the ground
+    flight.run(4.5)
+    assert sum(isinstance(wish, TakeOff) for wish in flight.vehicle.asked) == 1
+    flight.run(1.0)
+    assert sum(isinstance(wish, TakeOff) for wish in flight.vehicle.asked) == 2
 
 
 def test_a_pilot_who_takes_over_has_it_at_once_and_for_good() -> None:
