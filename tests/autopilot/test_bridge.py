@@ -238,8 +238,8 @@ def test_a_vehicle_that_is_never_heard_of_again_ends_the_mission_without_a_wish(
     flight = fly_to_step(5)
     flight.vehicle.asked.clear()
     flight.vehicle.silent = True
-    flight.until(Phase.ABORTED, 200.0)
-    assert "not heard of for 120 s" in flight.bridge.reason
+    flight.until(Phase.ABORTED, 400.0)
+    assert "not heard of for 300 s" in flight.bridge.reason
     assert flight.vehicle.asked == []
 
 
