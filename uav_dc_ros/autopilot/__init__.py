@@ -4,7 +4,10 @@ frames   ENU and NED, yaw, and the grid around a datum on the Earth
 fence    where the vehicle may be, and be sent
 vehicle  what passes between the bridge and a transport
 battery  is the battery low
-watch    how carefully to fly, and what keeps a vehicle from going on
+watch    how carefully to fly, and what is wrong
+hold     what keeps a vehicle from going on, for a while
+patience how long a policy is waited for
+asking   when to utter a wish
 course   where a mission stands on the grid
 ground   before the first step
 descent  what brings a vehicle down

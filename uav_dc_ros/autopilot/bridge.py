@@ -17,6 +17,7 @@ from uav_dc_ros.autopilot.descent import DOWN, Descent
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.ground import Ground, Next
+from uav_dc_ros.autopilot.hold import Hold
 from uav_dc_ros.autopilot.patience import Patience
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.autopilot.watch import Settings, Watch
@@ -45,7 +46,6 @@ class Bridge:
         phase: where the mission stands.
         reason: why it is in this phase, in words.
         course: steps flown, the cell reached last, and the cell that it flies to.
-        fault: what keeps it from going on at the moment; None: nothing.
         setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
         policy_is_gone: to be set while nobody is there who would decide the next move: the vehicle stops.
     """
@@ -62,7 +62,6 @@ class Bridge:
         self.fence = fence or Fence.around(scenario)
         self.phase, self.reason = Phase.IDLE, "not started"
         self.course = Course(scenario, standing)
-        self.fault: str | None = None
         self.setpoint: Enu | None = None
         self.policy_is_gone = False
         self._on_change = on_change
@@ -70,11 +69,11 @@ class Bridge:
         self._since_s = 0.0  # vehicle time of the last change of phase
         self._dwell = Dwell(settings)
         self._patience = Patience(settings, scenario.mission.step_s)
-        self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
         self._steady_s = self._since_steady_s = 0.0  # steady clock: last tick, last change of phase
         self._descent = Descent()
         self._watched = Watch(settings)
+        self._hold = Hold(self._watched)
         self._ground = Ground(self.course, settings, self.fence, self._watched)
 
     @property
@@ -96,6 +95,11 @@ class Bridge:
     def goal(self) -> Cell:
         """The cell that it is in, or flies to."""
         return self.course.goal
+
+    @property
+    def fault(self) -> str | None:
+        """What keeps it from going on at the moment; None: nothing."""
+        return self._hold.fault
 
     @property
     def standing(self) -> Standing:
@@ -196,7 +200,6 @@ class Bridge:
 
     def _watch(self, now_s: float, known: Telemetry) -> None:
         """Find what keeps the vehicle from going on; what lasts too long ends the mission."""
-        settings = self.settings
         if self.phase is Phase.LANDING:
             return
         if (low := self._watched.battery_is_low(known)) is not None:
@@ -206,20 +209,13 @@ class Bridge:
         if position is not None and (breach := self.fence.breach(position)) is not None:
             self._give_up(f"the vehicle is outside the fence: {breach}")
             return
-        fault = self._watched.fault(now_s, known)
-        if fault is None:
-            if self.fault is not None:
-                self.fault = None
+        match self._hold.look(now_s, known):
+            case "begins":
+                self._change(f"holds: {self.fault}")
+            case "passes":
                 self._change(f"goes on after: {self.reason}")
-            return
-        if self.fault is None:
-            self._fault_since_s = now_s, known.vehicle_s
-            self.fault = fault
-            self._change(f"holds: {fault}")
-            return
-        steady_s, vehicle_s = self._fault_since_s
-        if max(now_s - steady_s, known.vehicle_s - vehicle_s) > settings.hold_s:
-            self._give_up(fault, known)
+            case "ends":
+                self._give_up(str(self.fault), known)
 
     def _policy_lives(self, known: Telemetry) -> bool:
         """Is there somebody who decides; until there is, the vehicle stops, and the step's time with it."""
@@ -239,7 +235,7 @@ class Bridge:
 
     def _give_up(self, why: str, known: Telemetry | None = None) -> None:
         """End the mission: bring the vehicle down. One that does not know where it is cannot return."""
-        self.fault = None
+        self._hold.fault = None
         lost = known is not None and not known.estimate_ok
         self._descend(Mode.LAND if lost else self.settings.then, Phase.ABORTED, why)
 
@@ -331,7 +327,7 @@ class Bridge:
         self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:
-        self.setpoint, self.fault = None, None
+        self.setpoint, self._hold.fault = None, None
         self._enter(phase, why)
 
     def _enter(self, phase: Phase, why: str) -> None:

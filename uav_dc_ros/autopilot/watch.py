@@ -25,7 +25,8 @@ class Settings:
         fastest_mps: no vehicle of this kind flies faster; a position that does has jumped.
         jump_m: how far a position may jump, metres, as estimates do now and then.
         hold_s: how long a fault may last before the mission ends, steady or vehicle time.
-        lost_s: time without a heartbeat after which nobody waits for the vehicle to land.
+        lost_s: time without a heartbeat after which nobody waits for the vehicle to land; from 200 m that
+            takes two and a half minutes.
         least_battery: charge at which the mission ends, 0 to 1; 0: the battery is the autopilot's business.
         then: what ends a mission that cannot go on. Without a position, and where the vehicle refuses to
             return, it is to land.
@@ -45,7 +46,7 @@ class Settings:
     fastest_mps: float = 20.0
     jump_m: float = 5.0
     hold_s: float = 5.0
-    lost_s: float = 120.0
+    lost_s: float = 300.0
     least_battery: float = 0.2
     then: Literal[Mode.RETURN, Mode.LAND] = Mode.RETURN
     flying_at_start: Literal["resume", "land"] = "resume"
@@ -88,6 +89,8 @@ class Watch:
     def _jumped(self, known: Telemetry) -> str | None:
         """Is the vehicle where it cannot have flown since it was somewhere believable."""
         last = self._believed
+        if last is not None and known.position_s == last.position_s:
+            return None  # no other position has come; that one is from when it came
         if last is not None and last.position is not None and known.position is not None:
             passed_s = max(0.0, known.vehicle_s - last.vehicle_s)
             moved_m = float(np.linalg.norm(np.subtract(known.position, last.position)))
