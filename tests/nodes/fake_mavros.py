@@ -2,13 +2,13 @@
 
     python -m tests.nodes.fake_mavros --kind px4 --speed 4 [ROS arguments]
 
-It publishes as MAVROS does (its plugins local_position, sys_status and global_position; names, types, QoS, frames,
-texts): poses at 30 Hz, best effort, in the ENU frame of the EKF's origin, stamped with the autopilot's time;
-diagnostics once a second, a battery, and a fix. It follows `mavros/setpoint_position/local`, best effort. The
-flight is that of tests/autopilot. It tells in lines of JSON what happened, and takes commands on standard
-input, see `do`. Not imitated: services (mavros_msgs cannot be installed where this is tested), MAVLink. Unlike
-any real one, its time waits (half a second at most) for setpoints that are late: the machine that tests run
-on has other work to do.
+It publishes as MAVROS does (its plugins local_position, sys_status and global_position; names, types, QoS,
+frames, texts): poses at 30 Hz, best effort, in the ENU frame of the EKF's origin, stamped with the
+autopilot's time; diagnostics once a second, a battery, and a fix. It follows
+`mavros/setpoint_position/local`, best effort. The flight is that of tests/autopilot. It tells in lines of
+JSON what happened, and takes commands on standard input, see `do`. Not imitated: services (mavros_msgs
+cannot be installed where this is tested), MAVLink. Unlike any real one, its time waits (half a second at
+most) for setpoints that are late: the machine that x
 """
 
 import argparse
@@ -19,7 +19,6 @@ import os
 import select
 import sys
 import time
-from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -32,7 +31,7 @@ from tests.autopilot.autopilot import FOLLOWS, OFFBOARD_GAP_S, OFFBOARD_PROOF_S,
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned, to_enu, to_ned
 from uav_dc_ros.nodes import convert
 
-POSE_S, STATUS_S, WALL_STATUS_S = 1 / 30, 0.2, 1.0
+POSE_S = 1 / 30
 LATE_S, PATIENCE_S = 0.1, 0.5  # of setpoints, by the clock
 ORIGIN = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
 KINDS = {"px4": "PX4 Autopilot", "ardupilot": "ArduPilot", "generic": "Generic autopilot"}
@@ -48,12 +47,13 @@ class FakeMavros:
         self.stands = Enu(*(float(part) for part in options.stands.split(",")))
         self.yaw_rad = math.radians(options.yaw)
         self.vehicle, self.name, self.frame = "Quadrotor", "mavros", "map"
-        self.frozen, self.again, self.silent, self.critical, self.lost = False, False, False, False, False
+        self.frozen, self.again, self.critical, self.link_lost = False, False, False, False
         self.beats, self.setpoints, self.last, self.heard_s = 0, 0, None, -math.inf
         self.times: list[float] = []
-        self.began_ns = time.time_ns()
+        self.began_ns = self.stamp_ns = time.time_ns()
         self.node = node = rclpy.create_node("fake_mavros")
-        self.pose = node.create_publisher(PoseStamped, "mavros/local_position/pose", qos_profile_sensor_data)
+        pose_qos = 10 if options.reliable else qos_profile_sensor_data
+        self.pose = node.create_publisher(PoseStamped, "mavros/local_position/pose", pose_qos)
         self.battery = node.create_publisher(BatteryState, "mavros/battery", qos_profile_sensor_data)
         self.fix = node.create_publisher(NavSatFix, "mavros/global_position/global", qos_profile_sensor_data)
         self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 1)
@@ -95,6 +95,8 @@ class FakeMavros:
                 c.taking_off_to_m = float(words[0])
             case "battery":
                 c.battery = float(words[0])
+            case "estimate_lost":
+                c.lost = words[0] == "1"
             case "report":
                 enu = [e + s for e, s in zip(to_enu(Ned(*c.ned)), self.stands, strict=True)]
                 tell("report", c.t_s, enu=enu, mode=c.mode, armed=c.armed, landed=c.landed)
@@ -103,20 +105,19 @@ class FakeMavros:
                 self.times = []
             case _:
                 kind = type(getattr(self, verb))
-                setattr(self, verb, kind(float(words[0])) if kind in (bool, float, int) else " ".join(words))
+                setattr(self, verb, words[0] == "1" if kind is bool else " ".join(words))
 
     # Out.
 
     def tell_pose(self) -> None:
         c = self.copter
-        if self.frozen or self.silent:
+        if self.frozen:
             return
         message = PoseStamped()
         message.header.frame_id = self.frame
-        stamp_ns = self.began_ns + (0 if self.again else round(c.t_s * 1e9))
-        message.header.stamp = convert.stamp(stamp_ns)
-        if self.again:  # the same over and over
-            self.began_ns = stamp_ns
+        if not self.again:  # otherwise the same over and over
+            self.stamp_ns = self.began_ns + round(c.t_s * 1e9)
+        message.header.stamp = convert.stamp(self.stamp_ns)
         enu = to_enu(Ned(*c.ned))
         point, q = message.pose.position, message.pose.orientation
         point.x, point.y, point.z = (e + s for e, s in zip(enu, self.stands, strict=True))
@@ -125,9 +126,7 @@ class FakeMavros:
 
     def tell_status(self) -> None:
         c = self.copter
-        if self.silent:
-            return
-        self.beats += not self.lost
+        self.beats += not self.link_lost
         flying = c.armed and (c.px4 or not c.landed)
         state = "Critical" if self.critical else "Active" if flying else "Standby"
         heartbeat = {
@@ -174,12 +173,13 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=1.0)
     parser.add_argument("--stands", default="0,0,0")
     parser.add_argument("--yaw", type=float, default=90.0)
+    parser.add_argument("--beat-s", type=float, default=0.2)  # a real one: once a second
+    parser.add_argument("--reliable", action="store_true")  # poses: as those of other drivers may be
     options, ros = parser.parse_known_args()
     rclpy.init(args=["fake_mavros", *ros])
     fake = FakeMavros(options)
     executor = SingleThreadedExecutor()
     executor.add_node(fake.node)
-    status_s = min(WALL_STATUS_S, STATUS_S) if options.speed != 1.0 else WALL_STATUS_S
     before_s = time.monotonic()
     pose_s = beat_s = before_s
     owed_s, pending = 0.0, b""
@@ -196,7 +196,7 @@ def main() -> None:
             pose_s = max(pose_s + POSE_S, now_s - POSE_S)
             fake.tell_pose()
         if now_s >= beat_s:
-            beat_s += status_s
+            beat_s += options.beat_s
             fake.tell_status()
         while select.select([sys.stdin.fileno()], [], [], 0)[0]:
             data = os.read(sys.stdin.fileno(), 4096)

@@ -104,14 +104,23 @@ def node_in(ros: Ros, *arguments: str) -> Iterator[tuple[rclpy.node.Node, Direct
         for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOG_DIR"):
             patch.setenv(name, ros.environment[name])
         rclpy.init(args=["--ros-args", *arguments] if arguments else None)
+        node = rclpy.create_node("bridge")
         try:
-            node = rclpy.create_node("bridge")
             executor = DirectExecutor()
             executor.add_node(node)
             yield node, executor
-            node.destroy_node()
         finally:
+            node.destroy_node()
             rclpy.shutdown()
+
+
+@contextlib.contextmanager
+def mavros_of(node: rclpy.node.Node, **how: Any) -> Iterator[Mavros]:
+    """The transport, open, for the time of a block."""
+    vehicle = Mavros(node, place=START, **how)
+    vehicle.open()
+    with contextlib.closing(vehicle):
+        yield vehicle
 
 
 def way_home(bridge: Bridge) -> Action:
@@ -127,7 +136,7 @@ class Flight:
 
     Attributes:
         log: each change of phase or reason, with the step.
-        cells: the cells that were flown to.
+        executed, cells: the step of each move that was flown, and the cell that it led to.
     """
 
     def __init__(
@@ -135,12 +144,14 @@ class Flight:
     ) -> None:
         self.executor, self.vehicle, self.mavros = executor, vehicle, mavros
         self.log: list[tuple[Phase, int, str]] = []
+        self.executed: list[int] = []
         self.cells: list[tuple[int, int, int]] = []
         self.bridge = Bridge(SCENARIO, how, self._note, **bridge)
 
     def _note(self) -> None:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
+            self.executed.append(bridge.step)
             self.cells.append(bridge.goal)
         self.log.append((bridge.phase, bridge.step, bridge.reason))
 

@@ -4,8 +4,12 @@ Standard messages are enough to fly: poses, setpoints, MAVROS's diagnostics, bat
 services of mavros_msgs, which is used where it is installed. Without it nobody is armed, no mode is changed,
 and ArduPilot is not told to take off: a pilot does all that, lands it, too, and takes over at any time; the
 bridge sees it. What it cannot ask for is in the telemetry's `refusal`, and in the node's log.
+
+When this process is gone, MAVROS lives on, and no failsafe for a lost ground station notices. PX4 misses the
+setpoints (COM_OF_LOSS_T); ArduPilot stays at the last one until this process, started again, or a pilot, has it.
 """
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -153,7 +157,7 @@ class Mavros:
         if known.missing is not None or self._met:
             return known
         if (others := self._others()) is not None:
-            return Telemetry(**{**vars(known), "missing": others})
+            return dataclasses.replace(known, missing=others)
         self._met = True
         return known
 
