@@ -132,8 +132,9 @@ def test_what_goes_wrong_is_seen(ros: Ros) -> None:
             assert later.vehicle_s > before.vehicle_s, "the vehicle's time does not stand still with it"
             mavros.do(f"{fault} 0")
             until(executor, vehicle, lambda known: age(known) < 0.1)
+        time.sleep(0.2)  # poses come, and wait for the executor
         mavros.do("frozen 1")
-        time.sleep(0.5)  # the last pose waits for the executor, and does not become younger
+        time.sleep(0.5)  # the last one does not become younger by that
         spin(executor, 0.05)
         assert age(vehicle.telemetry()) > 0.45
         mavros.do("frozen 0")
@@ -192,6 +193,9 @@ def test_names_can_be_remapped_and_others_who_fly_the_same_are_told(ros: Ros) ->
         until(executor, vehicle, lambda known: known.missing is None)
         vehicle.steer(START)
         mavros.wait_for("setpoint")
+        restarted = stack.enter_context(mavros_of(node, anchor=vehicle.anchor))
+        until(executor, restarted, lambda known: known.missing is None)  # its predecessor is still there
+        assert node.count_publishers("/uav2/goal") == 2
 
 
 def test_nobody_who_hears_setpoints_is_told(ros: Ros) -> None:

@@ -6,7 +6,7 @@ and ArduPilot is not told to take off: a pilot does all that, lands it, too, and
 bridge sees it. What it cannot ask for is in the telemetry's `refusal`, and in the node's log.
 
 When this process is gone, MAVROS lives on, and no failsafe for a lost ground station notices. PX4 misses the
-setpoints (COM_OF_LOSS_T); ArduPilot stays at the last one until this process, started again, or a pilot, has it.
+setpoints (COM_OF_LOSS_T); ArduPilot stays at the last one until this process, started again, or a pilot acts.
 """
 
 import dataclasses
@@ -89,7 +89,7 @@ class Mavros:
         self._node = node
         self._package = mavros_messages.load(needed_for="arming" if arms else "")
         self._hearing = Hearing(place, datum, anchor, full=self._package is not None)
-        self._met = bool(anchor)  # are others who publish the same looked for no more
+        self._restarted = bool(anchor)
         self._yaw_rad: float | None = None
         self._stream: Stream[Target] = Stream(self._publish, "mavros")
         self._publisher: Any = None
@@ -154,12 +154,9 @@ class Mavros:
         if hearing.armed:
             self._commands.granted("arming")
         known = hearing.telemetry(now_s, self._commands.refusal)
-        if known.missing is not None or self._met:
+        if known.missing is not None or self._restarted:
             return known
-        if (others := self._others()) is not None:
-            return dataclasses.replace(known, missing=others)
-        self._met = True
-        return known
+        return dataclasses.replace(known, missing=self._others())
 
     def steer(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more.
@@ -216,17 +213,15 @@ class Mavros:
         self._hearing.on_fix(has_fix, message.latitude, message.longitude, _arrived_s(info))
 
     def _others(self) -> str | None:
-        """Is MAVROS the only one there, and does it hear setpoints; looked at before the first flight only.
+        """Who else publishes the same, or that nobody hears setpoints; None: all is well.
 
-        (The graph remembers a bridge that was killed in the air for a while: its successor does not ask.)
+        The graph remembers a bridge that was killed in the air for a while: its successor does not ask.
         """
         if self._publisher.get_subscription_count() == 0:
             return f"nobody hears {self._publisher.topic_name}; expected MAVROS to"
-        for topic, most, what in (
-            (self._subscriptions[POSE].topic_name, 1, "vehicle"),
-            (self._publisher.topic_name, 1, "bridge"),
-        ):
-            if (count := self._node.count_publishers(topic)) > most:
+        names = {"vehicle": self._subscriptions[POSE].topic_name, "bridge": self._publisher.topic_name}
+        for what, topic in names.items():
+            if (count := self._node.count_publishers(topic)) > 1:
                 return f"{count} nodes publish {topic}; expected one {what} only"
         return None
 

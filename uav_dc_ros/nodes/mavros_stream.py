@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from uav_dc_ros.autopilot.priority import run_when_due
+
 STREAM_S = 0.05
 LIFE_S = 1.0  # after the last sign of life of those who decide
 
@@ -55,6 +57,7 @@ class Stream(Generic[Target]):
             self._thread.join()
 
     def _run(self) -> None:
+        run_when_due()
         due_s, sent = time.monotonic(), None
         while True:
             with self._changed:
