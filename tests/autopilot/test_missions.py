@@ -1,58 +1,102 @@
-"""Whole missions: bridge, MAVLink, and a fake autopilot in a process of its own."""
+"""Missions, whole or with a fault: bridge, MAVLink, a fake autopilot; each flight in processes of its own."""
 
-from concurrent.futures import ThreadPoolExecutor
+import random
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.autopilot.faulty import CAREFUL, FAULTS, PILOT, SPEED, all_flown, check, flown
 from tests.autopilot.flight import KINDS, SCENARIO, WIRES, Flight, fake
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
 
-ARMING = Settings(arm=True)
-SPEED = 100.0
+CASES = list(product(KINDS, WIRES))
+SHORT = [("ardupilot", "tcp"), ("px4", "udp")]
+ON_THE_WAY = [
+    ("ardupilot", "tcp", "freeze", "no position for 0.5 s"),
+    ("px4", "udp", "jump away", "outside the fence"),
+    ("ardupilot", "udp", "jump", "jumped by 3"),
+    ("px4", "tcp", "mode", "mode POSCTL: changed by a pilot or by the autopilot's failsafe"),
+    ("ardupilot", "tcp", "mode", "mode ALT_HOLD: changed by a pilot or by the autopilot's failsafe"),
+    ("px4", "udp", "lose", "lost its position estimate"),
+    ("ardupilot", "udp", "battery", "% at 10.1 V; expected at least 20%"),
+    ("px4", "udp", "drop", "mode AUTO.RTL: changed by"),
+]
 
 
-def fly(kind: str, wire: str) -> tuple[Flight, dict[str, Any]]:
-    """A whole mission, and how the autopilot is then."""
-    with fake(kind, wire, speed=SPEED) as autopilot:
-        flight = Flight(autopilot, ARMING)
-        with flight.vehicle:
-            flight.until(lambda: flight.bridge.is_over, 120.0)
-        return flight, autopilot.report()
-
-
-def expected_cells() -> list[tuple[int, int, int]]:
+def expected_cells() -> list[list[int]]:
     """Ten cells east, ten north, and the rest of the steps at the dock, in the layer of the start."""
-    east = [(x, 0, 2) for x in range(1, 11)]
-    north = [(10, y, 2) for y in range(1, 11)]
-    return east + north + [(10, 10, 2)] * (SCENARIO.mission.max_steps - 20)
+    east = [[x, 0, 2] for x in range(1, 11)]
+    north = [[10, y, 2] for y in range(1, 11)]
+    return east + north + [[10, 10, 2]] * (SCENARIO.mission.max_steps - 20)
 
 
-@pytest.fixture(scope="module")
-def flights() -> dict[tuple[str, str], tuple[Flight, dict[str, Any]]]:
-    """Every kind on every wire, at once: they wait for one another's time most of theirs."""
-    cases = list(product(KINDS, WIRES))
-    with ThreadPoolExecutor(len(cases)) as threads:
-        return dict(zip(cases, threads.map(lambda case: fly(*case), cases), strict=True))
-
-
-@pytest.mark.parametrize("wire", WIRES)
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_whole_mission(flights: dict[Any, Any], kind: str, wire: str) -> None:
-    flight, report = flights[kind, wire]
-    assert flight.bridge.phase is Phase.LANDED, flight.log[-5:]
-    phases = list(dict.fromkeys(phase for phase, _, _ in flight.log))
-    assert phases == [
+def check_whole(told: dict[str, Any]) -> None:
+    """It took off, flew the cells of the simulation, and landed at the dock."""
+    check("none", told)
+    assert told["phase"] == Phase.LANDED, told["log"]
+    assert told["phases"] == [
         *(Phase.CONNECTING, Phase.PREFLIGHT, Phase.TAKEOFF, Phase.READY, Phase.MOVING),
         *(Phase.LANDING, Phase.LANDED),
     ]
-    assert flight.executed == list(range(SCENARIO.mission.max_steps))
-    assert flight.cells == expected_cells()
-    north_m, east_m, down_m = report["ned"]
-    assert np.allclose((east_m, north_m), SCENARIO.mission.dock_m, atol=ARMING.tolerance_m)
-    assert (down_m, report["landed"], report["armed"]) == (0.0, True, False)
-    assert report["interrupted"] == 0, "no setpoint while it took off"
-    flight.check_setpoints()
+    assert told["executed"] == list(range(SCENARIO.mission.max_steps))
+    assert told["cells"] == expected_cells()
+    north_m, east_m, down_m = told["then"]["ned"][1]
+    assert np.allclose((east_m, north_m), SCENARIO.mission.dock_m, atol=CAREFUL.tolerance_m)
+    assert down_m == 0.0
+    assert told["then"]["landed"][1], told["log"]
+    assert not told["then"]["armed"][1]
+    assert told["interrupted"] == 0, "no setpoint while it took off"
+
+
+@pytest.fixture(scope="module")
+def flights() -> dict[tuple[Any, ...], dict[str, Any]]:
+    """They wait for one another's time most of theirs."""
+    return all_flown([*SHORT, *(case[:3] for case in ON_THE_WAY)])
+
+
+@pytest.mark.parametrize("case", SHORT)
+def test_a_whole_mission(flights: dict[Any, dict[str, Any]], case: tuple[str, str]) -> None:
+    check_whole(flights[case])
+
+
+@pytest.mark.long
+def test_a_whole_mission_of_every_kind_on_every_wire() -> None:
+    for told in all_flown(CASES).values():
+        check_whole(told)
+
+
+@pytest.mark.parametrize(("kind", "wire", "name", "reason"), ON_THE_WAY)
+def test_a_fault_on_the_way(flights: Any, kind: str, wire: str, name: str, reason: str) -> None:
+    told = flights[kind, wire, name]
+    check(name, told)
+    assert told["phase"] == Phase.ABORTED
+    assert reason in told["reason"], told["log"]
+    if name == "mode":  # the pilot's from then on
+        assert told["then"]["mode"] == [PILOT[kind]] * 2
+        assert told["then"]["armed"] == [True, True]
+        assert told["modes"][-1] == PILOT[kind]
+    else:
+        assert not told["then"]["armed"][1], "it stands"
+
+
+def test_arming_that_is_refused_is_told_in_the_autopilots_own_words() -> None:
+    with fake("ardupilot", speed=SPEED) as autopilot:
+        autopilot.do("balk 1")
+        flight = Flight(autopilot, CAREFUL)
+        with flight.vehicle:
+            flight.until(lambda: "refused" in flight.bridge.reason)
+            assert flight.bridge.reason == "arming refused: Arm: Motors: check frame class"
+            assert autopilot.all("armed") == []
+            autopilot.do("balk 0")
+            flight.until(lambda: flight.bridge.phase is Phase.TAKEOFF)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", range(100))
+def test_any_fault_at_any_moment(number: int) -> None:
+    dice = random.Random(number)
+    name = list(FAULTS)[number % len(FAULTS)]
+    kind, wire, at_s = dice.choice(KINDS), dice.choice(WIRES), dice.uniform(0.0, 1000.0)
+    check(name, flown(kind, wire, name, at_s))

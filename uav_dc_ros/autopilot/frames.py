@@ -12,6 +12,8 @@ import pymap3d
 
 from uav_dc_ros.errors import VehicleError
 
+HIGHEST_M = 10_000.0
+
 
 class Enu(NamedTuple):
     """East, north, up, metres."""
@@ -78,7 +80,8 @@ class Geodetic:
             latitude_deg, longitude_deg, altitude_m = (float(part) for part in text.split(","))
         except ValueError:
             latitude_deg = math.nan
-        if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and math.isfinite(altitude_m)):
+        right = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and abs(altitude_m) <= HIGHEST_M
+        if not right:
             raise VehicleError(
                 f"datum: {text!r}; expected LATITUDE,LONGITUDE,ALTITUDE in degrees and metres, such as "
                 "47.397742,8.545594,488.0"
