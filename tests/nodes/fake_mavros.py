@@ -92,7 +92,7 @@ class FakeMavros:
             case "arm" | "disarm":
                 c.arm(verb == "arm", "pilot")
             case "takeoff":
-                c.taking_off_to_m = float(words[0])
+                c.taking_off_to_m, c.take_off_s = float(words[0]), c.t_s
             case "battery":
                 c.battery = float(words[0])
             case "estimate_lost":
@@ -157,7 +157,7 @@ class FakeMavros:
                 ]
             )
         )
-        self.battery.publish(BatteryState(percentage=float(c.battery), location="id0", present=True))
+        self.battery.publish(BatteryState(voltage=c.volts, percentage=c.charge, location="id0", present=True))
         enu = to_enu(Ned(*c.ned))
         here = ORIGIN.at(Enu(*(e + s for e, s in zip(enu, self.stands, strict=True))))
         fix = NavSatFix(
@@ -185,7 +185,7 @@ def main() -> None:
     owed_s, pending = 0.0, b""
     tell("ready", 0.0)
     for _ in itertools.count():
-        executor.spin_once(timeout_sec=0.005)
+        executor.spin_once(timeout_sec=0.01)
         now_s = time.monotonic()
         late_s, passed_s, before_s = now_s - fake.heard_s, now_s - before_s, now_s
         owed_s += 0.0 if LATE_S < late_s < PATIENCE_S else passed_s * fake.speed

@@ -30,7 +30,7 @@ from uav_dc_ros.nodes.mavros_time import PATIENCE_S, VehicleTime
 
 PLACE = Enu(20.0, 0.0, 0.0)
 LINK = "uas:///uas1"
-HEALTHY = (1 << 21) | (1 << 28)
+HEALTHY = (1 << 21) | (1 << 25) | (1 << 28)  # estimate, battery, would arm
 
 
 def heartbeat(
@@ -90,7 +90,7 @@ def test_in_the_air_or_without_an_estimate_nothing_is_the_place() -> None:
         known = hearing.telemetry(1.0)
         assert (known.position, hearing.may_steer) == (None, False)
         assert known.missing is not None
-        assert "expected it" in known.missing or "no estimate" in known.missing
+        assert "expected it" in known.missing or "not ready to arm" in known.missing
 
 
 def test_an_anchor_needs_no_ground() -> None:
@@ -212,24 +212,35 @@ def test_garbage_in_the_diagnostics_changes_nothing() -> None:
 
 def test_batteries_tell_the_least_or_nothing() -> None:
     hearing = met()
-    for where, charge, expected in [
-        ("", -0.01, None),
-        ("", math.nan, None),
-        ("", 0.9, 0.9),
-        ("id0", 0.5, 0.5),
-        ("id1", 0.3, 0.3),
-        ("id1", 0.7, 0.5),
+    assert hearing.telemetry(1.0).battery is None
+    for where, charge, volts, expected in [
+        ("", -0.01, 12.0, (None, 12.0)),
+        ("", math.nan, 65.535, (None, None)),
+        ("", 0.9, 0.0, (0.9, None)),
+        ("id0", 0.5, 11.5, (0.5, 11.5)),
+        ("id1", 0.3, 11.3, (0.3, 11.3)),
+        ("id1", 0.7, 11.7, (0.5, 11.5)),
+        ("id0", -0.01, 11.5, (0.7, 11.7)),
     ]:
-        hearing.on_battery(where, charge)
-        assert hearing.telemetry(1.0).battery == expected, (where, charge)
+        hearing.on_battery(where, charge, volts)
+        known = hearing.telemetry(1.0)
+        assert (known.battery, known.battery_v) == expected, (where, charge)
+    assert not known.battery_fails
+    heartbeat(hearing, 4, health=HEALTHY & ~(1 << 25))
+    assert hearing.telemetry(1.0).battery_fails
 
 
 def test_an_estimate_that_is_lost_is_told() -> None:
-    hearing = met()
-    heartbeat(hearing, 4, "OFFBOARD", "Active", health=1 << 21)
-    assert hearing.telemetry(1.0).estimate_ok, "what it checks before arming says nothing in the air"
-    heartbeat(hearing, 5, "OFFBOARD", "Active", health=1 << 28)
-    assert not hearing.telemetry(1.0).estimate_ok
+    for kind, mode in [("ArduPilot", "GUIDED"), ("PX4 Autopilot", "OFFBOARD")]:
+        hearing = met(kind)
+        heartbeat(hearing, 4, mode, "Active", kind, health=1 << 21)
+        assert hearing.telemetry(1.0).estimate_ok, "what it checks before arming says nothing in the air"
+        heartbeat(hearing, 5, mode, "Active", kind, health=1 << 28)
+        assert not hearing.telemetry(1.0).estimate_ok
+        heartbeat(hearing, 6, mode, "Standby", kind, health=1 << 21)
+        known = hearing.telemetry(1.0)
+        assert known.estimate_ok == (kind != "ArduPilot"), "PX4 tells that of the mode that it is in"
+        assert (known.missing is None) == known.estimate_ok
 
 
 # Time.

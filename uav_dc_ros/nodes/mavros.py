@@ -33,7 +33,6 @@ from uav_dc_ros.nodes import mavros_messages
 from uav_dc_ros.nodes.convert import FRAME, position_m, stamp_ns
 from uav_dc_ros.nodes.mavros_commands import Commands
 from uav_dc_ros.nodes.mavros_hearing import (
-    BATTERY,
     ESTIMATOR_STATUS,
     EXTENDED_STATE,
     FIX,
@@ -47,7 +46,7 @@ from uav_dc_ros.nodes.mavros_stream import Stream
 
 SETPOINT = "mavros/setpoint_position/local"
 DIAGNOSTICS = "/diagnostics"  # absolute, as diagnostic_updater publishes it
-STATUSTEXT = "mavros/statustext/recv"
+BATTERY, STATUSTEXT = "mavros/battery", "mavros/statustext/recv"
 
 # Best effort hears publishers of either kind (MAVROS's sensor data are best effort), and reliable is heard by
 # subscriptions of either kind. Nothing latched is asked for: an old state is no sign of life.
@@ -153,7 +152,7 @@ class Mavros:
         )
         if hearing.armed:
             self._commands.granted("arming")
-        known = hearing.telemetry(now_s, self._commands.refusal)
+        known = hearing.telemetry(now_s, self._commands.refusal, self._commands.said)
         if known.missing is not None or self._restarted:
             return known
         return dataclasses.replace(known, missing=self._others())
@@ -206,7 +205,7 @@ class Mavros:
             self._hearing.diagnostics.on_status(status.name, status.hardware_id, values, now_s)
 
     def _on_battery(self, message: BatteryState, _: Any) -> None:
-        self._hearing.on_battery(message.location, message.percentage)
+        self._hearing.on_battery(message.location, message.percentage, message.voltage)
 
     def _on_fix(self, message: NavSatFix, info: Any) -> None:
         has_fix = message.status.status >= NavSatStatus.STATUS_FIX

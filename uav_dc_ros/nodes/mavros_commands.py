@@ -136,11 +136,20 @@ class Commands:
     def _refused(self, what: str, why: str) -> None:
         self._refusals[what] = self._clock(), why
 
+    def _said(self, from_s: float, to_s: float) -> str:
+        """What the autopilot warned of between two times, each of it once."""
+        return "; ".join(dict.fromkeys(text for text_s, text in self._texts if from_s <= text_s <= to_s))
+
+    @property
+    def said(self) -> str:
+        """What the autopilot warned of lately, in its own words; empty: nothing."""
+        now_s = self._clock()
+        return self._said(now_s - TEXT_S, now_s)
+
     @property
     def refusal(self) -> str | None:
         """What was refused last, and why."""
         if not self._refusals:
             return None
         what, (at_s, why) = max(self._refusals.items(), key=lambda refusal: refusal[1][0])
-        said = dict.fromkeys(text for text_s, text in self._texts if abs(text_s - at_s) <= TEXT_S)
-        return f"{what} refused: {'; '.join(said) or why}"
+        return f"{what} refused: {self._said(at_s - TEXT_S, at_s + TEXT_S) or why}"

@@ -11,6 +11,7 @@ from typing import Any
 
 from uav_dc_ros.autopilot.dialects import (
     ARDUCOPTER,
+    BATTERY,
     FLYABLE,
     IN_AIR,
     MADE_UP,
@@ -25,7 +26,7 @@ from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.nodes.mavros_diagnostics import Diagnostics
 from uav_dc_ros.nodes.mavros_time import VehicleTime
 
-POSE, FIX, BATTERY = "mavros/local_position/pose", "mavros/global_position/global", "mavros/battery"
+POSE, FIX = "mavros/local_position/pose", "mavros/global_position/global"
 STATE, EXTENDED_STATE = "mavros/state", "mavros/extended_state"
 SYS_STATUS, ESTIMATOR_STATUS = "mavros/sys_status", "mavros/estimator_status"
 ESTIMATOR_FLAGS = (  # fields of EstimatorStatus: the bits of ESTIMATOR_STATUS_FLAGS, from the least on
@@ -35,6 +36,7 @@ ESTIMATOR_FLAGS = (  # fields of EstimatorStatus: the bits of ESTIMATOR_STATUS_F
 )
 CUSTOM_MODE = re.compile(r"CMODE\((\d+)\)")  # how MAVROS writes a mode that it has no name for
 AHRS = 1 << 21  # MAV_SYS_STATUS_AHRS
+NO_VOLTAGE = 65.535  # MAVLink's UINT16_MAX millivolts
 
 STALE_S = 3.0  # age after which the last report on an estimate says nothing
 FIX_S = 2.0  # age of a fix that still belongs to a vehicle on the ground
@@ -75,10 +77,8 @@ class Hearing:
         self._local: Enu | None = None
         self._refused = ""  # why the last pose was not taken
         self._fix: Geodetic | None = None
-        self._batteries: dict[str, float | None] = {}
+        self._batteries: dict[str, tuple[float | None, float | None]] = {}  # charge, volts
         self._time = VehicleTime()
-
-    # What follows from it.
 
     @property
     def dialect(self) -> Dialect | None:
@@ -115,10 +115,8 @@ class Hearing:
         """MAV_LANDED_STATE, as it is told, or as it follows from the rest; None: not known."""
         if self.full:
             return self._landed_state or None
-        if self.armed is None:
-            return None
         if not self.armed:
-            return ON_GROUND
+            return None if self.armed is None else ON_GROUND
         if self.dialect is ARDUCOPTER:
             return IN_AIR
         position = self.position
@@ -143,10 +141,12 @@ class Hearing:
             self.origin is not None and self.dialect is not None and self.dialect.may_steer(self.landed_state)
         )
 
-    def telemetry(self, now_s: float, refusal: str | None = None) -> Telemetry:
-        """What is known now, with what was refused last."""
+    def telemetry(self, now_s: float, refusal: str | None = None, said: str = "") -> Telemetry:
+        """What is known now, with what was refused last, and what the autopilot said lately."""
         landed_state = self.landed_state
-        charges = [charge for charge in self._batteries.values() if charge is not None]
+        enabled, health = self._sensors
+        told = [battery for battery in self._batteries.values() if battery[0] is not None]
+        charge, volts = min(told or self._batteries.values(), key=lambda b: b[0] or 0.0, default=(None, None))
         return Telemetry(
             heartbeat_s=self.heard.get(STATE) if self.full else self.diagnostics.heartbeat_s,
             mode=self.mode,
@@ -156,10 +156,13 @@ class Hearing:
             position=self.position,
             position_s=self.heard.get(POSE),
             estimate_ok=self._estimate_ok(now_s),
-            battery=min(charges) if charges else None,
+            battery=charge,
+            battery_v=volts,
+            battery_fails=bool(BATTERY & enabled & ~health),
             vehicle_s=self._time.at(now_s),
             missing=self._missing(now_s),
             refusal=refusal,
+            said=said,
         )
 
     def wanted(self) -> list[str]:
@@ -186,23 +189,28 @@ class Hearing:
             return (
                 "the autopilot tells of a failsafe, and not whether it is armed; expected it in order first"
             )
+        if not self.armed and not self._estimate_ok(now_s):
+            return "the autopilot is not ready to arm, or has no position estimate yet"
         if self.origin is not None:
             return None
         where = "where the grid lies is not known"
         if self.landed_state != ON_GROUND:
             return f"{where}, and the vehicle does not stand on the ground; expected it to stand there first"
-        return f"{where}: no fix on {FIX}, or no estimate" if self.datum else f"{where}: no estimate yet"
+        return f"{where}: no fix on {FIX}" if self.datum else f"{where} yet"
+
+    @property
+    def _sensors(self) -> tuple[int, int]:
+        """MAV_SYS_STATUS_SENSOR bits: what is enabled, and what of it is well; all ill before any came."""
+        if self.full and self._sys_status is not None:
+            return self._sys_status.sensors_enabled, self._sys_status.sensors_health
+        enabled, health = self.diagnostics.enabled, self.diagnostics.health
+        return (AHRS, 0) if enabled is None or health is None else (enabled, health)
 
     def _estimate_ok(self, now_s: float) -> bool:
         """Does the autopilot trust its estimate: without one it sends no local position at all."""
-        if self.full and self._sys_status is not None:
-            enabled, health = self._sys_status.sensors_enabled, self._sys_status.sensors_health
-        else:
-            enabled, health = self.diagnostics.enabled, self.diagnostics.health
-        if enabled is None or health is None:
-            return False
-        needed = AHRS if self.armed else AHRS | PREARM_CHECK
-        if needed & enabled & ~health:
+        enabled, health = self._sensors
+        arms = not self.armed and self.dialect is not None and self.dialect.tells_readiness
+        if (AHRS | (PREARM_CHECK if arms else 0)) & enabled & ~health:
             return False
         if self._flags is None:
             return True
@@ -235,7 +243,7 @@ class Hearing:
         self._anchor(now_s)
 
     def on_bad_pose(self, why: str) -> None:
-        """A pose that nobody flies by."""
+        """A pose that nobody flies by, and why."""
         self._refused = why
 
     def on_fix(self, has_fix: bool, latitude_deg: float, longitude_deg: float, now_s: float) -> None:
@@ -246,11 +254,12 @@ class Hearing:
                 latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=self.datum.altitude_m
             )
 
-    def on_battery(self, where: str, charge: float) -> None:
-        """A battery's charge, 0 to 1; anything else: it does not tell."""
+    def on_battery(self, where: str, charge: float, volts: float) -> None:
+        """A battery's charge, 0 to 1, and voltage; anything else: it does not tell."""
         if where:
             self._batteries.pop("", None)  # what stood for all of them before one was told by itself
-        self._batteries[where] = charge if 0.0 <= charge <= 1.0 else None
+        known = charge if 0.0 <= charge <= 1.0 else None
+        self._batteries[where] = known, volts if 0.0 < volts < NO_VOLTAGE else None
 
     # What it says: messages of mavros_msgs.
 
