@@ -171,9 +171,9 @@ def test_the_stream_is_20_hz_without_the_executor_and_ends_a_second_after_the_la
             time.sleep(0.5)
         time.sleep(LIFE_S + 0.3)
         times = np.array(mavros.report()["times"])
-        assert times[-1] - last_s == pytest.approx(LIFE_S, abs=0.1)
+        assert LIFE_S - 0.1 < times[-1] - last_s < LIFE_S + 0.25, "as the other process heard it"
         assert np.median(np.diff(times)) == pytest.approx(0.05, abs=0.003)
-        assert len(times) == pytest.approx((last_s + LIFE_S - began_s) / 0.05, abs=6)
+        assert len(times) == pytest.approx((last_s + LIFE_S - began_s) / 0.05, abs=10)
         assert mavros.all("setpoint")[-1]["enu"] == [-7.0, 16.0, 13.0]
 
 
