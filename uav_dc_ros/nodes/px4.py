@@ -96,6 +96,10 @@ class Px4:
         self._alive_s = -math.inf  # last sign of life of those who decide
         self._streamed_vehicle_s = 0.0
         self._urgent = False
+        self._sent: Ned | None = None
+        heartbeat = self._class("offboard_control_mode")()
+        heartbeat.position = True
+        self._stream = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
         self._silent = set(NEEDED)
         self._looked_s, self._seen = -math.inf, ""
         self._ended = False
@@ -249,11 +253,11 @@ class Px4:
 
     def _send(self, ned: Ned) -> None:
         """Send a setpoint, then the heartbeat that has PX4 follow it."""
-        setpoint = self._class("trajectory_setpoint")()
-        setpoint.position = list(ned)
-        setpoint.velocity = setpoint.acceleration = setpoint.jerk = NOT_CONTROLLED
-        setpoint.yaw = setpoint.yawspeed = math.nan
-        self._publishers["trajectory_setpoint"].publish(setpoint)
-        heartbeat = self._class("offboard_control_mode")()
-        heartbeat.position = True
-        self._publishers["offboard_control_mode"].publish(heartbeat)
+        if ned != self._sent:  # made anew only then: the less there is to do, the better the pace
+            setpoint, self._sent = self._class("trajectory_setpoint")(), ned
+            setpoint.position = list(ned)
+            setpoint.velocity = setpoint.acceleration = setpoint.jerk = NOT_CONTROLLED
+            setpoint.yaw = setpoint.yawspeed = math.nan
+            self._stream["trajectory_setpoint"] = setpoint
+        for name, message in self._stream.items():
+            self._publishers[name].publish(message)

@@ -196,6 +196,8 @@ class Px4Hearing:
 
     def _pass_time(self, stamp_us: int) -> None:
         """Let its time go on. Its stamps leap where it agrees on a clock with the agent, or boots."""
+        if not stamp_us:
+            return  # without a stamp
         passed_s = (stamp_us - self._stamp_us) / 1e6
         if 0 < passed_s <= CLOCK_S:
             self.vehicle_s += passed_s
