@@ -21,15 +21,14 @@ import threading
 import time
 from typing import Any
 
-SPEED = float(sys.argv[2])
 sys.path.insert(0, sys.argv[1])
 
-import px4_msgs.msg as px4  # noqa: E402
-import rclpy  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+import px4_msgs.msg as px4
+import rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from uav_dc_ros.nodes import fastdds  # noqa: E402
-from uav_dc_ros.nodes.executor import DirectExecutor  # noqa: E402
+from uav_dc_ros.nodes import fastdds
+from uav_dc_ros.nodes.executor import DirectExecutor
 
 State = px4.VehicleStatus
 WALL_S, TICK_S = 0.01, 0.02
@@ -60,12 +59,12 @@ class Px4:
     """Where it is, and what it does. NED metres."""
 
     def __init__(self, node: Any) -> None:
-        self.t_s, self.ned = 0.0, list(START)
+        self.t_s, self.ned, self.speed = 0.0, list(START), float(sys.argv[2])
         self.mode, self.armed, self.landed, self.failsafe = State.NAVIGATION_STATE_POSCTL, False, True, False
         self.target: list[float] | None = None
         self.since_s, self.streamed_s, self.heard_wall_s = math.inf, -math.inf, -math.inf
         self.ground_s, self.status_s = 0.0, -math.inf
-        self.charge, self.frozen, self.lost, self.refuses = 1.0, False, False, False
+        self.frozen, self.refuses, self.lost, self.lost_s = False, False, False, math.inf
         self.told: Any = None
         self.last: Any = None
         self.out = {}
@@ -90,7 +89,7 @@ class Px4:
     @property
     def offboard(self) -> bool:
         """Is there a stream to be followed."""
-        return self.t_s - self.streamed_s < LOSS_S and not self.lost
+        return self.t_s - self.streamed_s < LOSS_S and self.t_s - self.lost_s < LOSS_S
 
     def on_heartbeat(self, message: Any) -> None:
         asked = [name for name in message.get_fields_and_field_types() if getattr(message, name)]
@@ -148,23 +147,25 @@ class Px4:
         return True
 
     def obey(self, line: str) -> None:
-        """freeze 0|1, lose 0|1, refuse 0|1, charge C, mode NAV_STATE (as a pilot), report."""
-        what, *rest = line.split()
-        value = float(rest[0]) if rest else 0.0
-        if what == "report":
-            tell("report", self.t_s, ned=self.ned, armed=self.armed, landed=self.landed, mode=self.mode)
-        elif what == "mode":
-            self.switch(int(value), "pilot")
-        elif what == "charge":
-            self.charge = value
-        else:
-            setattr(self, {"freeze": "frozen", "lose": "lost", "refuse": "refuses"}[what], bool(value))
+        """freeze 0|1, lose 1, refuse 0|1, speed TIMES, mode NAV_STATE (as a pilot)."""
+        what, value = line.split()[0], float(line.split()[1])
+        match what:
+            case "freeze":
+                self.frozen = bool(value)
+            case "lose":
+                self.lost, self.lost_s = True, self.t_s
+            case "refuse":
+                self.refuses = bool(value)
+            case "speed":
+                self.speed = value
+            case "mode":
+                self.switch(int(value), "pilot")
 
     # What it does.
 
     def turn(self) -> None:
         """Let simulated time pass for one turn, then tell where it is."""
-        for _ in range(max(1, round(WALL_S * SPEED / TICK_S))):
+        for _ in range(max(1, round(WALL_S * self.speed / TICK_S))):
             late = self.t_s - self.streamed_s
             if late > AHEAD_S and time.monotonic() - self.heard_wall_s < PATIENCE_S:
                 break
@@ -174,7 +175,8 @@ class Px4:
     def tick(self) -> None:
         self.t_s += TICK_S
         if self.mode == State.NAVIGATION_STATE_OFFBOARD and self.armed and not self.offboard:
-            self.switch(State.NAVIGATION_STATE_AUTO_RTL, "failsafe")
+            blind = self.lost and State.NAVIGATION_STATE_DESCEND
+            self.switch(blind or State.NAVIGATION_STATE_AUTO_RTL, "failsafe")
         if not self.armed:
             return
         if self.landed and self.mode == State.NAVIGATION_STATE_OFFBOARD and self.target is not None:
@@ -192,7 +194,7 @@ class Px4:
         ground_m = START[2]
         if self.mode == State.NAVIGATION_STATE_OFFBOARD and self.target is not None:
             return self.target
-        if self.mode == State.NAVIGATION_STATE_AUTO_LAND:
+        if self.mode in (State.NAVIGATION_STATE_AUTO_LAND, State.NAVIGATION_STATE_DESCEND):
             return [*self.ned[:2], ground_m]
         if self.mode == State.NAVIGATION_STATE_AUTO_RTL:
             home = math.dist(self.ned[:2], START[:2]) < 0.1
@@ -236,7 +238,7 @@ class Px4:
         self.out["vehicle_land_detected"].publish(
             px4.VehicleLandDetected(timestamp=stamp, landed=self.landed)
         )
-        battery = px4.BatteryStatus(timestamp=stamp, id=1, connected=True, remaining=self.charge)
+        battery = px4.BatteryStatus(timestamp=stamp, id=1, connected=True, remaining=0.9)
         self.out["battery_status"].publish(battery)
         flags = px4.FailsafeFlags(timestamp=stamp, offboard_control_signal_lost=not self.offboard)
         self.out["failsafe_flags"].publish(flags)

@@ -9,6 +9,7 @@ constants, in their order, without what is not used. It needs compilers for C an
 
 import contextlib
 import io
+import logging
 import os
 import shutil
 import subprocess
@@ -162,6 +163,7 @@ def compilers() -> tuple[str, str] | None:
 def build(folder: Path) -> Path:
     """Make the package; the folder that has to be on Python's path."""
     os.environ.setdefault("AMENT_PREFIX_PATH", str(PREFIX))  # where the generators look for their templates
+    logging.getLogger("rosidl_cli").setLevel(logging.ERROR)  # wheels list each of their entry points twice
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         _generate(folder)
     _compile(folder)
@@ -170,6 +172,7 @@ def build(folder: Path) -> Path:
 
 def _generate(folder: Path) -> None:
     """Write the sources, those of each generator into a folder of its own: names of files recur."""
+    from rosidl_cli.command.translate.api import translate
     from rosidl_generator_c.cli import GenerateC
     from rosidl_generator_py.cli import GeneratePython
     from rosidl_typesupport_c.cli import GenerateCTypesupport
@@ -179,7 +182,13 @@ def _generate(folder: Path) -> None:
     (folder / "msg").mkdir(parents=True)
     for name, text in DEFINITIONS.items():
         (folder / "msg" / f"{name}.msg").write_text(text.lstrip())
-    files = [f"{folder}:msg/{name}.msg" for name in DEFINITIONS]
+    files = translate(
+        package_name=PACKAGE,
+        interface_files=[f"{folder}:msg/{name}.msg" for name in DEFINITIONS],
+        include_paths=[],
+        output_format="idl",
+        output_path=folder / "idl",
+    )
     supports = ["rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c"]
     generators = {
         "c": GenerateC("c"),
@@ -206,13 +215,14 @@ def _compile(folder: Path) -> None:
     flags = ["-O0", "-w", "-fPIC", *(f"-I{path}" for path in includes)]
 
     def compiled(part: str) -> list[Path]:
-        objects = []
         for command, suffix in zip(found, (".c", ".cpp"), strict=True):
             sources = sorted((folder / part).rglob(f"*{suffix}"))
-            if sources:
-                _run(folder / part, command, *flags, "-c", *sources)
-        objects += sorted((folder / part).glob("*.o"))
-        return objects
+            if sources:  # all in one, so that headers are read once, but for those whose names recur
+                whole = folder / part / f"{part}{suffix}"
+                apart = [source for source in sources if source.stem.endswith("__description")]
+                whole.write_text("".join(f'#include "{each}"\n' for each in sources if each not in apart))
+                _run(folder / part, command, *flags, "-c", whole, *apart)
+        return sorted((folder / part).glob("*.o"))
 
     with ThreadPoolExecutor(2) as threads:
         parts = ("c", "py", "fastrtps", "introspection", "dispatch")

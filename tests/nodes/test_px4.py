@@ -22,7 +22,6 @@ from tests.nodes import px4_messages
 from tests.nodes.conftest import SMALL
 from uav_dc_ros import scenarios
 from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.dialects import PX4
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned, to_enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
 from uav_dc_ros.autopilot.watch import Settings
@@ -208,8 +207,9 @@ def test_without_px4_msgs_one_line_says_what_to_install(monkeypatch: pytest.Monk
     monkeypatch.delitem(sys.modules, "px4_msgs.msg", raising=False)
     monkeypatch.setitem(sys.modules, "px4_msgs", None)
     node: Any = None
-    with pytest.raises(VehicleError, match="needs the ROS package px4_msgs.*github.com/PX4/px4_msgs") as told:
+    with pytest.raises(VehicleError, match="needs the ROS package px4_msgs") as told:
         px4.Px4(node, place=PLACE)
+    assert str(told.value).endswith("its workspace sourced: https://github.com/PX4/px4_msgs")
     assert "\n" not in str(told.value)
 
 
@@ -342,26 +342,26 @@ def gaps_s(messages: list[tuple[int, Any]]) -> Any:
 
 
 def test_the_stream_keeps_its_pace(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+    """While positions come at 50 Hz, and the node's own thread is held up now and then."""
     goal = Enu(0.0, 0.0, 50.0)
-    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(goal)))
+
+    def beat() -> None:
+        hand.say()
+        vehicle.steer(goal)
+        spun.pass_time(0.02)
+
+    spun.until(lambda: len(hand.setpoints) > 3, beat)
     hand.heartbeats.clear()
-    stop = threading.Event()
-
-    def toil() -> None:
-        """Keep Python busy, as a node with a lot to do does."""
-        while not stop.is_set():
-            sum(range(2000))
-
-    busy = threading.Thread(target=toil)
-    busy.start()
-    spun.pass_time(3.0, lambda: (hand.say(), vehicle.steer(goal)))
-    stop.set()
-    busy.join()
+    for i in range(75):
+        beat()
+        if i % 25 == 24:
+            time.sleep(0.3)  # a callback that takes its time
     gaps = gaps_s(hand.heartbeats)
-    assert len(gaps) == pytest.approx(3.0 / px4.STREAM_S, abs=3)
-    assert np.median(gaps) == pytest.approx(px4.STREAM_S, abs=0.005)
-    late = np.abs(gaps - px4.STREAM_S)
-    assert np.quantile(late, 0.95) < 0.02, "on a machine that does other things, too"
+    print(f"late by, ms: p50 {1e3 * np.quantile(abs(gaps - px4.STREAM_S), 0.5):.2f}", end=", ")
+    print(f"p99 {1e3 * np.quantile(abs(gaps - px4.STREAM_S), 0.99):.2f}, of {len(gaps)}")
+    assert np.mean(gaps) == pytest.approx(px4.STREAM_S, rel=0.05)
+    assert np.median(abs(gaps - px4.STREAM_S)) < 0.003
+    assert max(gaps) < 0.5, "PX4 wants more than 2 Hz"
 
 
 def test_the_stream_ends_a_second_after_those_who_decide(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
@@ -608,11 +608,11 @@ class Flight:
         self.cells: list[tuple[int, int, int]] = []
         scenario = scenarios.load(path)
         self.place = Enu(*scenario.mission.start_m[:2], 0.0)
-        self.bridge = Bridge(scenario, Settings(arm=True), self._note)
+        self.bridge = Bridge(scenario, Settings(arm=True), self.note)
         self.vehicle = px4.Px4(spun.node("bridge"), place=self.place)
         self.vehicle.open()
 
-    def _note(self) -> None:
+    def note(self) -> None:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and self.log[-1][0] is not Phase.MOVING:
             self.cells.append(bridge.goal)
@@ -671,12 +671,13 @@ def test_a_whole_mission(flight: Flight) -> None:
     assert math.dist(flight.grid(landed["ned"])[:2], (200.0, 200.0)) <= flight.bridge.settings.tolerance_m
     offboard, landing = [told["mode"] for told in flight.fake.all("mode")]
     assert (offboard, landing) == (14, 18)
-    assert flight.vehicle.telemetry().armed is False
+    known = flight.vehicle.telemetry()
+    assert (known.armed, known.on_ground, known.battery) == (False, True, pytest.approx(0.9))
 
 
 def test_a_pilot_who_takes_over_has_it_at_once(flight: Flight) -> None:
     flight.until(lambda: flight.bridge.step == 2)
-    flight.fake.do("mode", 2)
+    flight.fake.do("mode 2")
     flight.until(lambda: flight.bridge.is_over)
     assert flight.log[-1][0] is Phase.ABORTED
     assert flight.log[-1][2].startswith("taken over: mode POSCTL")
@@ -698,33 +699,50 @@ def test_when_nobody_decides_any_more_px4_takes_it_home(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "reason", "ends"),
+    ("fault", "reason", "mode"),
     [
-        # PX4 is the first to give up: there is no stream without a position.
-        ("freeze 1", "holds: no position for 0.5 s", ("AUTO_RTL", "failsafe")),
-        ("lose 1", "holds: the autopilot has lost its position estimate", ("AUTO_RTL", "failsafe")),
-        ("charge 0.1", "battery 10%; expected at least 20%", ("AUTO_RTL", "command")),
+        ("freeze 1", "no position for 0.5 s", "AUTO_RTL"),
+        ("lose 1", "the autopilot has lost its position estimate", "DESCEND"),
     ],
-    ids=lambda value: value.split()[0] if isinstance(value, str) else "",
+    ids=["freeze", "lose"],
 )
-def test_faults_in_the_air_have_a_defined_end(
-    flight: Flight, fault: str, reason: str, ends: tuple[str, str]
+def test_without_a_position_it_holds_until_px4_gives_up(
+    flight: Flight, fault: str, reason: str, mode: str
 ) -> None:
     flight.until(lambda: flight.bridge.step == 2)
+    flight.fake.do("speed 1")
     flight.fake.do(fault)
     flight.until(lambda: flight.bridge.is_over)
-    assert flight.log[-1][0] is Phase.ABORTED
-    assert reason in [told for _, _, told in flight.log], flight.log[-4:]
-    last = flight.fake.all("mode")[-1]
-    assert (px4_hearing.MODE_NAMES[last["mode"]], last["why"]) == ends
+    ends = flight.log[-2:]
+    assert ends[0][2] == f"holds: {reason}"
+    assert ends[1] == (Phase.ABORTED, 2, f"taken over: mode {mode} (failsafe) (after: {reason})")
+    assert flight.fake.all("mode")[-1]["why"] == "failsafe"
+
+
+def test_a_bridge_that_was_killed_comes_back_to_the_same_grid(flight: Flight) -> None:
+    flight.until(lambda: flight.bridge.step == 2)
+    flight.fake.do("speed 1")  # PX4 waits a second, and no more
+    standing, anchor, place = flight.bridge.standing, flight.vehicle.anchor, Enu(7.0, 7.0, 7.0)
+    flight.vehicle.close()
+    flight.bridge = Bridge(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
+    flight.vehicle = px4.Px4(flight.spun.nodes[0], place=place, anchor=anchor)
+    flight.vehicle.open()
+    flight.until(lambda: flight.bridge.step == 3)
+    flight.fake.do("speed", SPEED)
+    flight.until(lambda: flight.bridge.is_over)
+    assert flight.bridge.phase is Phase.LANDED, flight.log[-3:]
+    assert flight.cells == [(1, 0, 0), (2, 0, 0), (2, 1, 0), *[(2, 2, 0)] * 3]
+    assert [told["mode"] for told in flight.fake.all("mode")] == [14, 18]
+    (landed,) = flight.fake.all("landed")
+    assert math.dist(flight.grid(landed["ned"])[:2], (200.0, 200.0)) <= flight.bridge.settings.tolerance_m
 
 
 def test_a_vehicle_that_refuses_is_not_flown_and_says_why(flight: Flight) -> None:
-    flight.fake.do("refuse", 1)
+    flight.fake.do("refuse 1")
     flight.until(lambda: any("refused" in reason for _, _, reason in flight.log))
     phase, step, reason = flight.log[-1]
     assert (phase, step) == (Phase.PREFLIGHT, 0)
     assert reason.startswith("the change of mode refused: temporarily rejected")
-    flight.fake.do("refuse", 0)
+    flight.fake.do("refuse 0")
     flight.until(lambda: flight.bridge.phase is Phase.TAKEOFF)
     assert flight.fake.all("mode")[0]["mode"] == 14
