@@ -3,6 +3,7 @@
 No PX4 has been flown here. What a stand-in cannot tell is whether it is one.
 """
 
+import itertools
 import json
 import math
 import sys
@@ -38,7 +39,8 @@ pytestmark = pytest.mark.xdist_group("px4")
 ZURICH = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
 START = Ned(3.0, -2.0, 0.5)  # of the stand-in
 PLACE = Enu(0.0, 0.0, 0.0)
-SPEED = 20.0
+SPEED = 30.0
+NUMBERS = itertools.count()
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +103,9 @@ class Spun:
 
 
 @pytest.fixture
-def spun(domain: Ros, request: pytest.FixtureRequest) -> Iterator[Spun]:
+def spun(domain: Ros) -> Iterator[Spun]:
     """See there."""
-    made = Spun(f"/t{abs(hash(request.node.name)) % 10**9}")
+    made = Spun(f"/t{next(NUMBERS)}")
     yield made
     for node in made.nodes:
         node.destroy_node()
@@ -475,12 +477,14 @@ def test_wishes_as_commands(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
 def test_a_refusal_is_told_until_it_is_granted(msg: Any) -> None:
     hearing = standing(msg)
 
-    def answer(result: int, command: int = 400, component: int = 191) -> str | None:
-        message = msg.VehicleCommandAck(command=command, result=result, target_component=component)
+    def answer(result: int, command: int = 400, component: int = 191, system: int = 7) -> str | None:
+        message = msg.VehicleCommandAck(command=command, result=result)
+        message.target_system, message.target_component = system, component
         hearing.on_vehicle_command_ack(message, 1.0)
         return hearing.telemetry().refusal
 
     assert answer(1, component=190) is None, "somebody else was refused"
+    assert answer(1, system=255) is None, "likewise"
     assert answer(5) is None, "it is being done"
     assert answer(1, command=511) is None, "never asked"
     assert answer(1) == "arming refused: temporarily rejected"

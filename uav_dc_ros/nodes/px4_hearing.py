@@ -168,7 +168,9 @@ class Px4Hearing:
     def on_vehicle_command_ack(self, message: Any, now_s: float) -> None:
         """Take in the answer to a command; somebody else's come here, too."""
         what = COMMANDS.get(message.command)
-        if what is None or message.target_component != COMPANION or message.result == IN_PROGRESS:
+        system = None if self.status is None else self.status.system_id
+        ours = (message.target_system, message.target_component) == (system, COMPANION)
+        if what is None or not ours or message.result == IN_PROGRESS:
             return
         self._refusals.pop(what, None)
         if message.result != ACCEPTED:
@@ -229,11 +231,10 @@ class Px4Hearing:
 
 def _reference(message: Any) -> Geodetic | None:
     """Where on the Earth a local position is counted from; None: PX4 does not know."""
-    if not (message.xy_global and message.z_global):
+    where = message.ref_lat, message.ref_lon, float(message.ref_alt)
+    if not (message.xy_global and message.z_global and all(map(math.isfinite, where))):
         return None
-    return Geodetic(
-        latitude_deg=message.ref_lat, longitude_deg=message.ref_lon, altitude_m=float(message.ref_alt)
-    )
+    return Geodetic(latitude_deg=where[0], longitude_deg=where[1], altitude_m=where[2])
 
 
 def _parse_local(anchor: str) -> Enu:
