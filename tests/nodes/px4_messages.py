@@ -17,8 +17,8 @@ import sys
 import sysconfig
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest import mock
 
-PREFIX = Path(sys.prefix)  # where the wheels of ROS 2 put headers and libraries
 PACKAGE = "px4_msgs"
 
 # Some have no version, some have 0, some a higher one: what the names of topics are made from.
@@ -162,11 +162,12 @@ def compilers() -> tuple[str, str] | None:
 
 def build(folder: Path) -> Path:
     """Make the package; the folder that has to be on Python's path."""
-    os.environ.setdefault("AMENT_PREFIX_PATH", str(PREFIX))  # where the generators look for their templates
     logging.getLogger("rosidl_cli").setLevel(logging.ERROR)  # wheels list each of their entry points twice
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        _generate(folder)
-    _compile(folder)
+    with mock.patch.dict(os.environ):
+        os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # where wheels have what apt has elsewhere
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            _generate(folder)
+        _compile(folder)
     return folder / "py"
 
 
@@ -206,11 +207,13 @@ def _generate(folder: Path) -> None:
 def _compile(folder: Path) -> None:
     """Compile them: two libraries that ROS loads by their names, and the extension that brings them along."""
     import numpy as np
+    from ament_index_python import get_package_prefix
 
     found = compilers()
     assert found is not None
+    prefix = Path(get_package_prefix("rosidl_runtime_c"))
     includes = [folder / part for part in ("c", "fastrtps", "introspection", "dispatch")]
-    includes += [PREFIX / "include", *(PREFIX / "include").iterdir()]
+    includes += [prefix / "include", *(prefix / "include").iterdir()]
     includes += [Path(sysconfig.get_paths()["include"]), Path(np.get_include())]
     flags = ["-O0", "-w", "-fPIC", *(f"-I{path}" for path in includes)]
 
@@ -228,7 +231,7 @@ def _compile(folder: Path) -> None:
         parts = ("c", "py", "fastrtps", "introspection", "dispatch")
         objects = dict(zip(parts, threads.map(compiled, parts), strict=True))
     target = folder / "py" / PACKAGE
-    ros = [f"-L{PREFIX / 'lib'}", f"-Wl,-rpath,{PREFIX / 'lib'}", "-Wl,-rpath,$ORIGIN", f"-L{target}"]
+    ros = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-Wl,-rpath,$ORIGIN", f"-L{target}"]
     ros += ["-Wl,--no-as-needed", "-lrosidl_runtime_c", "-lrcutils", "-lfastcdr", "-lrosidl_typesupport_c"]
     ros += ["-lrosidl_typesupport_fastrtps_c", "-lrosidl_typesupport_fastrtps_cpp"]
     ros += ["-lrosidl_typesupport_introspection_c"]

@@ -53,6 +53,8 @@ def messages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv("ROS_PYTHON_CHECK_FIELDS", "1")
         patch.syspath_prepend(folder)
         yield folder
+    for name in [name for name in sys.modules if name.partition(".")[0] == px4_messages.PACKAGE]:
+        del sys.modules[name]
 
 
 @pytest.fixture
@@ -213,6 +215,12 @@ def test_without_px4_msgs_one_line_says_what_to_install(monkeypatch: pytest.Monk
         px4.Px4(node, place=PLACE)
     assert str(told.value).endswith("its workspace sourced: https://github.com/PX4/px4_msgs")
     assert "\n" not in str(told.value)
+
+
+def test_px4_msgs_of_an_older_px4_are_refused(msg: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(msg, "FailsafeFlags")
+    with pytest.raises(VehicleError, match=r"px4_msgs has no FailsafeFlags; expected that of PX4 1\.15"):
+        px4.load_messages()
 
 
 @pytest.mark.parametrize(("version", "name"), [(None, "t"), (0, "t"), (1, "t_v1"), (12, "t_v12")])

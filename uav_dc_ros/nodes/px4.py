@@ -57,15 +57,19 @@ def load_messages() -> Any:
     """The module of PX4's message classes.
 
     Raises:
-        VehicleError: it is not there.
+        VehicleError: it is not there, or not of a PX4 that can be flown.
     """
     try:
-        return importlib.import_module("px4_msgs.msg")
+        messages = importlib.import_module("px4_msgs.msg")
     except ImportError as error:
         raise VehicleError(
             f"a vehicle on PX4's topics needs the ROS package px4_msgs ({error}); expected it built from the "
             "branch of PX4's release, and its workspace sourced: https://github.com/PX4/px4_msgs"
         ) from None
+    lacking = [kind for kind in (*HEARD.values(), *SENT.values()) if not hasattr(messages, kind)]
+    if lacking:
+        raise VehicleError(f"px4_msgs has no {', '.join(lacking)}; expected that of PX4 1.15 or later")
+    return messages
 
 
 def versioned(name: str, kind: Any) -> str:
@@ -146,7 +150,7 @@ class Px4:
     def telemetry(self) -> Telemetry:
         """What is known of the vehicle now, times as of `time.monotonic`."""
         with self._changed:
-            known, silent = self._hearing.telemetry(), sorted(self._silent, reverse=True)
+            known, silent = self._hearing.telemetry(), [name for name in NEEDED if name in self._silent]
         if not silent:
             return known
         topics = ", ".join(self._topic(name) for name in silent)
