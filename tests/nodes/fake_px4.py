@@ -59,7 +59,7 @@ class Px4:
     """Where it is, and what it does. NED metres."""
 
     def __init__(self, node: Any) -> None:
-        self.t_s, self.ned, self.speed = 0.0, list(START), float(sys.argv[2])
+        self.t_s, self.owed_s, self.speed, self.ned = 0.0, 0.0, float(sys.argv[2]), list(START)
         self.mode, self.armed, self.landed, self.failsafe = State.NAVIGATION_STATE_POSCTL, False, True, False
         self.target: list[float] | None = None
         self.since_s, self.streamed_s, self.heard_wall_s = math.inf, -math.inf, -math.inf
@@ -160,16 +160,18 @@ class Px4:
                 self.speed = value
             case "mode":
                 self.switch(int(value), "pilot")
+        tell("obeyed", self.t_s, line=line)
 
     # What it does.
 
     def turn(self) -> None:
         """Let simulated time pass for one turn, then tell where it is."""
-        for _ in range(max(1, round(WALL_S * self.speed / TICK_S))):
-            late = self.t_s - self.streamed_s
-            if late > AHEAD_S and time.monotonic() - self.heard_wall_s < PATIENCE_S:
-                break
-            self.tick()
+        self.owed_s += WALL_S * self.speed
+        while self.owed_s >= TICK_S:
+            self.owed_s -= TICK_S
+            late = self.t_s - self.streamed_s > AHEAD_S
+            if not late or time.monotonic() - self.heard_wall_s >= PATIENCE_S:
+                self.tick()
         self.publish()
 
     def tick(self) -> None:
