@@ -1,0 +1,267 @@
+"""PX4 over uXRCE-DDS: hears its topics, passes wishes on, streams setpoints. It decides nothing.
+
+A thread of its own streams, so that the stream keeps its pace whatever the node's callbacks do. It ends
+`LIFE_S` after the last call of `steer`, and while no position has come for `POSE_S` that PX4 trusts; then its
+own failsafe takes over (COM_OF_LOSS_T, COM_OBL_RC_ACT), as it does when the process is gone.
+
+What is sent has the time 0: PX4 puts that of its arrival there, so nobody has to agree about clocks.
+"""
+
+import dataclasses
+import importlib
+import math
+import re
+import threading
+import time
+from functools import partial
+from typing import Any
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from uav_dc_ros.autopilot import dialects
+from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned
+from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
+from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.nodes.px4_hearing import COMPANION, Px4Hearing
+
+STREAM_S = 0.05
+STREAM_VEHICLE_S = 0.2  # of a simulated vehicle whose time runs faster; PX4 wants more than 2 Hz of that
+LIFE_S = 1.0
+POSE_S = 0.5
+LOOK_S = 1.0  # between two looks at which topics there are
+NOT_CONTROLLED = [math.nan] * 3
+RETURN, LAND, SET_MODE, ARM = 20, 21, 176, 400  # VEHICLE_CMD
+CUSTOM_MODE = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+HEARD = {  # in fmu/out
+    "vehicle_status": "VehicleStatus",
+    "vehicle_local_position": "VehicleLocalPosition",
+    "vehicle_land_detected": "VehicleLandDetected",
+    "battery_status": "BatteryStatus",
+    "failsafe_flags": "FailsafeFlags",
+    "vehicle_command_ack": "VehicleCommandAck",
+}
+NEEDED = ("vehicle_status", "vehicle_local_position")  # PX4 1.15 does not send all of the others
+SENT = {  # in fmu/in
+    "trajectory_setpoint": "TrajectorySetpoint",
+    "offboard_control_mode": "OffboardControlMode",
+    "vehicle_command": "VehicleCommand",
+}
+QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+
+
+def load_messages() -> Any:
+    """The module of PX4's message classes.
+
+    Raises:
+        VehicleError: it is not there, or not of a PX4 that can be flown.
+    """
+    try:
+        messages = importlib.import_module("px4_msgs.msg")
+    except ImportError as error:
+        raise VehicleError(
+            f"a vehicle on PX4's topics needs the ROS package px4_msgs ({error}); expected it built from the "
+            "branch of PX4's release, and its workspace sourced: https://github.com/PX4/px4_msgs"
+        ) from None
+    lacking = [kind for kind in (*HEARD.values(), *SENT.values()) if not hasattr(messages, kind)]
+    if lacking:
+        raise VehicleError(f"px4_msgs has no {', '.join(lacking)}; expected that of PX4 1.15 or later")
+    return messages
+
+
+def versioned(name: str, kind: Any) -> str:
+    """Name of the topic of a message class: PX4 appends the version of the definition, if that is not 0."""
+    version = getattr(kind, "MESSAGE_VERSION", 0)
+    return f"{name}_v{version}" if version else name
+
+
+class Px4:
+    """One vehicle on the topics `fmu/in/...` and `fmu/out/...` of a node's namespace.
+
+    Args:
+        node: that hears and sends; somebody else spins it.
+        place: where the vehicle stands when its first position comes, in the grid's ENU frame.
+        anchor: of the same transport before it was started again: takes the place of a datum.
+        datum: of the grid, for a PX4 that knows where on the Earth it is; None: see `place`.
+
+    Raises:
+        VehicleError: px4_msgs is missing, or the anchor is none.
+    """
+
+    def __init__(self, node: Node, *, place: Enu, anchor: str = "", datum: Geodetic | None = None) -> None:
+        self._messages = load_messages()
+        self._node = node
+        self._hearing = Px4Hearing(place=place, anchor=anchor, datum=datum)
+        self._changed = threading.Condition()  # its lock is that of all below, and of `_hearing`
+        self._setpoint: Enu | None = None
+        self._alive_s = -math.inf  # last sign of life of those who decide
+        self._streamed_vehicle_s = 0.0
+        self._urgent = False
+        self._sent: Ned | None = None
+        heartbeat = self._class("offboard_control_mode")()
+        heartbeat.position = True
+        self._stream = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
+        self._silent = set(NEEDED)
+        self._looked_s, self._seen = -math.inf, ""
+        self._ended = False
+        self._subscriptions: list[Any] = []
+        self._publishers: dict[str, Any] = {}
+        self._thread = threading.Thread(target=self._run, name="px4", daemon=True)
+
+    def open(self) -> None:
+        """Begin to listen."""
+        for name in HEARD:
+            self._subscriptions.append(
+                self._node.create_subscription(
+                    self._class(name), self._topic(name), partial(self._hear, name), QOS
+                )
+            )
+        for name in SENT:
+            self._publishers[name] = self._node.create_publisher(self._class(name), self._topic(name), QOS)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the stream, and hear no more; more than once is as good as once."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+        while self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop())
+        while self._publishers:
+            self._node.destroy_publisher(self._publishers.popitem()[1])
+
+    @property
+    def kind(self) -> str:
+        """Name of the autopilot; empty until it has spoken."""
+        with self._changed:
+            return dialects.PX4.name if self._hearing.status is not None else ""
+
+    @property
+    def anchor(self) -> str:
+        """Where the grid lies: its datum, or else PX4's origin in it; empty until it is known."""
+        with self._changed:
+            return self._hearing.anchor
+
+    def telemetry(self) -> Telemetry:
+        """What is known of the vehicle now, times as of `time.monotonic`."""
+        with self._changed:
+            known, silent = self._hearing.telemetry(), [name for name in NEEDED if name in self._silent]
+        if not silent:
+            return known
+        topics = ", ".join(self._topic(name) for name in silent)
+        return dataclasses.replace(known, missing=f"nothing came on {topics} yet{self._others(silent)}")
+
+    def steer(self, setpoint: Enu | None) -> None:
+        """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
+        with self._changed:
+            if setpoint != self._setpoint:
+                self._hurry()
+            self._setpoint, self._alive_s = setpoint, time.monotonic()
+
+    def ask(self, wish: Wish) -> None:
+        """Pass a wish on, once; whether it was fulfilled, `telemetry` tells. PX4 takes off by setpoints."""
+        match wish:
+            case SetMode(Mode.RETURN):
+                self._command(RETURN)
+            case SetMode(Mode.LAND):  # here, heading as it does
+                self._command(LAND, param4=math.nan, param5=math.nan, param6=math.nan, param7=math.nan)
+            case SetMode(mode):
+                main, sub = dialects.PX4.mode_parameters(mode)
+                self._command(SET_MODE, param1=CUSTOM_MODE, param2=main, param3=sub)
+            case Arm():
+                self._command(ARM, param1=1.0)
+
+    # Topics.
+
+    def _class(self, name: str) -> Any:
+        return getattr(self._messages, HEARD.get(name) or SENT[name])
+
+    def _topic(self, name: str) -> str:
+        return versioned(f"fmu/{'out' if name in HEARD else 'in'}/{name}", self._class(name))
+
+    def _hear(self, name: str, message: Any) -> None:
+        with self._changed:
+            self._silent.discard(name)
+            getattr(self._hearing, f"on_{name}")(message, time.monotonic())
+            if self._hearing.vehicle_s - self._streamed_vehicle_s >= STREAM_VEHICLE_S:
+                self._hurry()
+
+    def _others(self, silent: list[str]) -> str:
+        """What a PX4 of another release publishes instead, in words."""
+        if time.monotonic() - self._looked_s >= LOOK_S:
+            self._looked_s = time.monotonic()
+            bases = [self._node.resolve_topic_name(f"fmu/out/{name}") for name in silent]
+            pattern = re.compile(f"({'|'.join(map(re.escape, bases))})(_v[0-9]+)?")
+            ours = {self._node.resolve_topic_name(self._topic(name)) for name in silent}
+            there = {name for name, _ in self._node.get_topic_names_and_types() if pattern.fullmatch(name)}
+            others = sorted(name for name in there - ours if self._node.count_publishers(name))
+            self._seen = (
+                f", but {', '.join(others)} exists; expected px4_msgs of PX4's release" if others else ""
+            )
+        return self._seen
+
+    # Sending.
+
+    def _command(self, command: int, **parameters: float) -> None:
+        status = self._hearing.status
+        if status is None or "vehicle_command" not in self._publishers:
+            return  # who knows whom it would reach
+        message = self._class("vehicle_command")()
+        for name, value in parameters.items():
+            setattr(message, name, value)
+        message.command = command
+        message.target_system, message.target_component = status.system_id, status.component_id
+        message.source_system, message.source_component = status.system_id, COMPANION
+        message.from_external = True
+        self._publishers["vehicle_command"].publish(message)
+
+    def _hurry(self) -> None:
+        """Have the stream go on before its next beat."""
+        self._urgent = True
+        self._changed.notify()
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        while True:
+            with self._changed:
+                while not (self._ended or self._urgent or (left_s := due_s - time.monotonic()) <= 0):
+                    self._changed.wait(left_s)
+                if self._ended:
+                    return
+                now_s = time.monotonic()
+                self._urgent, self._streamed_vehicle_s = False, self._hearing.vehicle_s
+                ned = self._wanted(now_s)
+            if now_s >= due_s:  # on the beat, and without catching up on beats that were missed
+                due_s = due_s + STREAM_S if now_s < due_s + STREAM_S else now_s + STREAM_S
+            try:
+                if ned is not None:
+                    self._send(ned)
+            except (InvalidHandle, _rclpy.RCLError):
+                if self._node.context.ok():
+                    raise
+                return  # ROS has been shut down under it
+
+    def _wanted(self, now_s: float) -> Ned | None:
+        """The setpoint to be sent now, in PX4's frame; None: there is none, or nobody may fly by it."""
+        hearing = self._hearing
+        if self._setpoint is None or hearing.frame is None or hearing.position_s is None:
+            return None
+        if now_s - self._alive_s > LIFE_S or now_s - hearing.position_s > POSE_S:
+            return None
+        return hearing.frame.to_autopilot(self._setpoint)
+
+    def _send(self, ned: Ned) -> None:
+        """Send a setpoint, then the heartbeat that has PX4 follow it."""
+        if ned != self._sent:  # made anew only then: the less there is to do, the better the pace
+            setpoint, self._sent = self._class("trajectory_setpoint")(), ned
+            setpoint.position = list(ned)
+            setpoint.velocity = setpoint.acceleration = setpoint.jerk = NOT_CONTROLLED
+            setpoint.yaw = setpoint.yawspeed = math.nan
+            self._stream["trajectory_setpoint"] = setpoint
+        for name, message in self._stream.items():
+            self._publishers[name].publish(message)
