@@ -19,7 +19,7 @@ from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.mavros import Mavros
+from uav_dc_ros.nodes.vehicles.mavros import Mavros
 
 START = Enu(20.0, 0.0, 0.0)  # on the ground below it
 SCENARIO = changed(

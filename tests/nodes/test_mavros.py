@@ -17,8 +17,8 @@ from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.mavros import Mavros
-from uav_dc_ros.nodes.mavros_stream import LIFE_S
+from uav_dc_ros.nodes.vehicles.mavros import Mavros
+from uav_dc_ros.nodes.vehicles.stream import LIFE_S
 
 STANDS = "-7,11,3"  # where the copter stands in MAVROS's frame: east, north, up
 ORIGIN = Enu(27.0, -11.0, -3.0)  # of that frame, in the grid's

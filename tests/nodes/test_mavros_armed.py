@@ -24,8 +24,9 @@ from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.frames import Enu, Ned, to_enu, to_ned
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import convert, mavros
-from uav_dc_ros.nodes.mavros import Mavros
+from uav_dc_ros.nodes import convert
+from uav_dc_ros.nodes.vehicles import mavros
+from uav_dc_ros.nodes.vehicles.mavros import Mavros
 
 STANDS = Enu(-7.0, 11.0, 3.0)
 READY_S = 5.0

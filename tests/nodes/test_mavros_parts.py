@@ -21,12 +21,12 @@ from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Wish
 from uav_dc_ros.errors import VehicleError
-from uav_dc_ros.nodes import mavros_messages
-from uav_dc_ros.nodes.mavros_commands import ASK_AGAIN_S, Commands
-from uav_dc_ros.nodes.mavros_diagnostics import OTHERS_S
-from uav_dc_ros.nodes.mavros_hearing import Hearing
-from uav_dc_ros.nodes.mavros_stream import LIFE_S, Stream
-from uav_dc_ros.nodes.mavros_time import PATIENCE_S, VehicleTime
+from uav_dc_ros.nodes.vehicles import mavros_messages
+from uav_dc_ros.nodes.vehicles.mavros_commands import ASK_AGAIN_S, Commands
+from uav_dc_ros.nodes.vehicles.mavros_diagnostics import OTHERS_S
+from uav_dc_ros.nodes.vehicles.mavros_hearing import Hearing
+from uav_dc_ros.nodes.vehicles.mavros_time import PATIENCE_S, VehicleTime
+from uav_dc_ros.nodes.vehicles.stream import LIFE_S, Stream
 
 PLACE = Enu(20.0, 0.0, 0.0)
 LINK = "uas:///uas1"

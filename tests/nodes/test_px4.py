@@ -29,9 +29,10 @@ from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import fastdds, px4, px4_hearing
+from uav_dc_ros.nodes import fastdds
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.px4_hearing import Px4Hearing
+from uav_dc_ros.nodes.vehicles import px4, px4_hearing
+from uav_dc_ros.nodes.vehicles.px4_hearing import Px4Hearing
 
 # One worker builds the messages, once.
 pytestmark = pytest.mark.xdist_group("px4")

@@ -308,22 +308,25 @@ class Bridge:
             return []
         descent = self._descent
         if not known.armed:
-            self._end(descent.outcome, self.reason)
+            self._end(descent.outcome, descent.why)
             return []
         if descent.obeys(known):
             self.setpoint = None
+            self._change(descent.why)
             return []
         if descent.lands_instead(
             self.settings, self._asked.last_s.get(SetMode(Mode.RETURN)), known.vehicle_s
         ):
-            self._change(f"{self.reason}; it does not return ({known.refusal or 'no answer'}): lands")
+            descent.why += f"; it does not return ({known.refusal or 'no answer'}): lands"
+        refused = f"; {known.refusal}" if known.refusal and descent.tries else ""
+        self._change(f"{descent.why}{refused}")
         return [descent.wish]
 
     # Small change.
 
     def _descend(self, how: Mode, outcome: Phase, why: str) -> None:
         """Bring it down; until it obeys, the setpoint holds it where it is."""
-        self._descent = Descent(how, outcome)
+        self._descent = Descent(how, outcome, why)
         self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:

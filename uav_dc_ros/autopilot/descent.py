@@ -16,12 +16,14 @@ class Descent:
     Attributes:
         how: the mode that it is to come down in.
         outcome: of the mission, once the vehicle stands.
+        why: it comes down.
         obeyed: was it seen coming down? From then on it is let alone: who changes the mode now is the pilot.
         tries: how often it was asked.
     """
 
     how: Mode = Mode.LAND
     outcome: Phase = Phase.ABORTED
+    why: str = ""
     obeyed: bool = False
     tries: int = 0
 

@@ -85,7 +85,7 @@ def check_vehicle(options: argparse.Namespace, nodes: list[str]) -> None:
     if options.missions != 1:
         raise ParameterError(f"--missions {options.missions}: expected 1 with --vehicle {options.vehicle}")
     if "bridge" in nodes:
-        vehicles.check(options.vehicle, options.connect or "", options.datum or "")
+        vehicles.check(options.vehicle, options.connect or "", options.datum or "", options.arm)
 
 
 def check_writable(summary: Path, bag: Path | None) -> None:

@@ -23,8 +23,8 @@ from uav_dc_ros.autopilot.dialects import (
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
 from uav_dc_ros.errors import VehicleError
-from uav_dc_ros.nodes.mavros_diagnostics import Diagnostics
-from uav_dc_ros.nodes.mavros_time import VehicleTime
+from uav_dc_ros.nodes.vehicles.mavros_diagnostics import Diagnostics
+from uav_dc_ros.nodes.vehicles.mavros_time import VehicleTime
 
 POSE, FIX = "mavros/local_position/pose", "mavros/global_position/global"
 STATE, EXTENDED_STATE = "mavros/state", "mavros/extended_state"

@@ -29,10 +29,10 @@ from sensor_msgs.msg import (  # type: ignore[import-untyped, unused-ignore]
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import mavros_messages
 from uav_dc_ros.nodes.convert import FRAME, position_m, stamp_ns
-from uav_dc_ros.nodes.mavros_commands import Commands
-from uav_dc_ros.nodes.mavros_hearing import (
+from uav_dc_ros.nodes.vehicles import mavros_messages
+from uav_dc_ros.nodes.vehicles.mavros_commands import Commands
+from uav_dc_ros.nodes.vehicles.mavros_hearing import (
     ESTIMATOR_STATUS,
     EXTENDED_STATE,
     FIX,
@@ -42,7 +42,7 @@ from uav_dc_ros.nodes.mavros_hearing import (
     SYS_STATUS,
     Hearing,
 )
-from uav_dc_ros.nodes.mavros_stream import Stream
+from uav_dc_ros.nodes.vehicles.stream import Stream
 
 SETPOINT = "mavros/setpoint_position/local"
 DIAGNOSTICS = "/diagnostics"  # absolute, as diagnostic_updater publishes it

@@ -23,9 +23,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uav_dc_ros.autopilot import dialects
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned
+from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
-from uav_dc_ros.nodes.px4_hearing import COMPANION, Px4Hearing
+from uav_dc_ros.nodes.vehicles.px4_hearing import COMPANION, Px4Hearing
 
 STREAM_S = 0.05
 STREAM_VEHICLE_S = 0.2  # of a simulated vehicle whose time runs faster; PX4 wants more than 2 Hz of that
@@ -226,6 +227,7 @@ class Px4:
         self._changed.notify()
 
     def _run(self) -> None:
+        run_when_due()
         due_s = time.monotonic()
         while True:
             with self._changed:

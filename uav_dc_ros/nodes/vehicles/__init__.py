@@ -11,6 +11,9 @@ from uav_dc_ros.autopilot.mavlink import Mavlink, load_codec
 from uav_dc_ros.autopilot.vehicle import Vehicle
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.nodes.vehicles import mavros_messages
+from uav_dc_ros.nodes.vehicles.mavros import Mavros
+from uav_dc_ros.nodes.vehicles.px4 import Px4, load_messages
 
 
 def make(node: Node, values: Mapping[str, Any], scenario: Scenario, anchor: str) -> Vehicle:
@@ -30,14 +33,16 @@ def make(node: Node, values: Mapping[str, Any], scenario: Scenario, anchor: str)
     place = Enu(east_m, north_m, 0.0)
     datum = Geodetic.parse(values["datum"]) if values["datum"] else None
     kind, connect = values["vehicle"], values["connect"]
-    check(kind, connect, values["datum"])
+    check(kind, connect, values["datum"], values["arm"])
     if kind == "mavlink":
         return Mavlink(connect, datum=datum, place=place, anchor=anchor)
-    raise ParameterError(f"vehicle: {kind!r}; not there yet")
+    if kind == "mavros":
+        return Mavros(node, place=place, anchor=anchor, datum=datum, arms=values["arm"])
+    return Px4(node, place=place, anchor=anchor, datum=datum)
 
 
-def check(kind: str, connect: str, datum: str) -> None:
-    """Refuse a way that this machine does not have, or an address or datum that is none.
+def check(kind: str, connect: str, datum: str, arm: bool) -> None:
+    """Refuse a way that this machine does not have, or cannot arm by; an address or datum that is none.
 
     Raises:
         VehicleError: what was wrong.
@@ -52,3 +57,7 @@ def check(kind: str, connect: str, datum: str) -> None:
             raise ParameterError("connect: none given; expected where the vehicle is: tcp:127.0.0.1:5760")
         Address.parse(connect)
         load_codec()
+    elif kind == "px4":
+        load_messages()
+    elif arm:
+        mavros_messages.load(needed_for="arming")
