@@ -15,6 +15,7 @@ from uav_dc_ros.recordings.pages.health import Health
 from uav_dc_ros.recordings.pages.missions import Flown, flown
 from uav_dc_ros.recordings.pages.page import Page
 from uav_dc_ros.recordings.pages.world import world
+from uav_dc_ros.recordings.step import RecordedStep
 
 SUMMARIES_MAX = 2_000  # rows in the list of missions
 SYSTEM_ROOM = 150_000  # bytes kept for it, for latencies, nodes and faults
@@ -113,7 +114,7 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
     return page, f"{len(held)}{left} mission{'s' if total > 1 else ''}"
 
 
-def _heard(recorded: steps.Steps, health: Health) -> Iterator[steps.RecordedStep]:
+def _heard(recorded: steps.Steps, health: Health) -> Iterator[RecordedStep]:
     for step in recorded:
         health.hear(step)
         yield step

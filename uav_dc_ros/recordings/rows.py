@@ -10,7 +10,7 @@ from uav_dc_ros.core import reward as core_reward
 from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError
-from uav_dc_ros.recordings.steps import RecordedStep
+from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.tables import Columns
 
 _WHICH: Columns = {"flight": "int", "mission": "int", "step": "int"}

@@ -11,7 +11,8 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TOLD_MAX, Phase
 from uav_dc_ros.recordings.pages.diagnostics import Node, Report
 from uav_dc_ros.recordings.pages.missions import NO_END, Flown
-from uav_dc_ros.recordings.steps import STEP_TOPICS, RecordedStep, Steps
+from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps
 
 SAMPLES_MAX = 100_000  # of a latency: percentiles need no more
 FAULTS_MAX = 300  # rows told one by one

@@ -16,7 +16,7 @@ from uav_dc_ros.core import mission, radio, reward, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.recordings.steps import RecordedStep
+from uav_dc_ros.recordings.step import RecordedStep
 
 STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart
 VALUES_MAX = 60_000  # steps times users: what a page can draw, and hold
