@@ -14,6 +14,7 @@ from rich.text import Text
 from uav_dc_ros import cli
 from uav_dc_ros.bags.storage import RECOVER
 from uav_dc_ros.recordings.missions import MissionSurvey
+from uav_dc_ros.recordings.step import printable
 from uav_dc_ros.recordings.survey import Survey, TopicSurvey, start_text, survey
 
 WIDTH = 80  # where there is no terminal
@@ -115,7 +116,9 @@ def _reasons(missions: list[MissionSurvey]) -> list[str]:
         if mission.reason:
             flight = f" of flight {mission.flight}" if mission.flight else ""
             where = f" in {mission.namespace}" if mission.namespace else ""
-            told.append(f" mission {mission.mission}{flight}{where}: {mission.outcome}: {mission.reason}")
+            told.append(
+                f" mission {mission.mission}{flight}{where}: {mission.outcome}: {printable(mission.reason)}"
+            )
     return told
 
 

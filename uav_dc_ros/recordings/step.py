@@ -119,6 +119,11 @@ class RecordedStep:
         return True
 
 
+def printable(text: str) -> str:
+    """A reason as a line that no terminal obeys: bags are told by anybody."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 def is_same_status(one: Mission, other: Mission) -> bool:
     """Whether two words on a step differ in nothing but phase and reason."""
     return msgspec.structs.replace(one, phase=other.phase, reason=other.reason) == other
