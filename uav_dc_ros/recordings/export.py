@@ -99,7 +99,8 @@ def run(options: argparse.Namespace) -> int:
                 options.out, recorded, scenario, options.observation or "mission", options.bag.name
             )
         else:
-            flew, format = vehicle(reader, namespace), options.format or "parquet"
+            format: Format = options.format or "parquet"
+            flew = vehicle(reader, namespace)
             write_tables(options.out, recorded, scenario, reader.about, options.tables, format, flew)
         for topic, n in sorted(recorded.orphans.items()):
             print(f"  {n} messages on {topic} came too late to be brought together with their step")
