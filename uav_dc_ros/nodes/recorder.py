@@ -27,7 +27,7 @@ class Recorder(BagNode):
         super().__init__("recorder")
 
     def about(self) -> Mapping[str, str]:
-        """Scenario, policy, seed, missions and pace."""
+        """Scenario, policy, seed, missions, pace, and what flies."""
         given = self.values
         scenario = scenarios.load(given["scenario"])
         about = {
@@ -38,6 +38,7 @@ class Recorder(BagNode):
             "seed": str(given["seed"]),
             "missions": str(given["missions"]),
             "pace": pace.text(given["pace"]),
+            "vehicle": given.get("vehicle", "simulated"),
         }
         if given["policy"]:
             loaded = policies.load(given["policy"])
