@@ -147,7 +147,7 @@ class Steps:
             topic = self._topics[message.topic]
             try:
                 if topic == "pose":
-                    self._hear_pose(_pose(message))
+                    self._hear_pose(read_pose(message))
                     continue
                 payload = messages.decode(payloads.text_in_cdr(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
@@ -293,7 +293,7 @@ def _expect(reader: BagReader, topic: RecordedTopic, type: str) -> None:
         )
 
 
-def _pose(message: BagMessage) -> RecordedPose:
+def read_pose(message: BagMessage) -> RecordedPose:
     """The pose in a message.
 
     Raises:

@@ -106,7 +106,11 @@ class Health:
             self._fault(flown.last_ns, name, f"{what}: {count}")
         if flown.outcome in (Phase.ABORTED, NO_END):
             told = "aborted" if flown.outcome == Phase.ABORTED else "its end is not in the bag"
-            self._fault(flown.last_ns, name, f"{told}, after step {flown.steps}")
+            why = f": {flown.reason}" if flown.reason else ""
+            self._fault(flown.last_ns, name, f"{told}, after step {flown.steps}{why}")
+        for step, word in flown.journey.words if flown.journey else ():
+            if word.holds:
+                self._fault(word.log_ns, name, f"step {step}: {word.reason}")
 
     def read(self) -> None:
         """Go through the bag once more, for its times and the nodes' diagnostics."""
