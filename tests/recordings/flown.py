@@ -27,7 +27,7 @@ from uav_dc_ros.messages import Phase
 TICK_S = 0.05
 LATENCY_NS = 700_000
 DEAD_S = 2.0  # a bridge that was killed is missing for so long
-LIMIT_S = 3000.0
+LIMIT_S = 6000.0
 ARRIVED = (Phase.READY, Phase.LANDING, Phase.LANDED, Phase.TIMEOUT, Phase.ABORTED)
 SWAY_M = 0.4  # how far a vehicle is from where it is sent, at most
 
@@ -41,6 +41,7 @@ class Flight:
         beat: called before each tick, to do harm.
         settings: of the bridge.
         policy: decides; None: straight to the dock.
+        patience_s: how long the policy thinks about a move.
         speed: how much faster than time the vehicle is.
         begun_ns: when.
 
@@ -59,6 +60,7 @@ class Flight:
         beat: Callable[["Flight"], None] = lambda _: None,
         settings: Settings | None = None,
         policy: Policy | None = None,
+        patience_s: float = 0.0,
         speed: float = 1.0,
         begun_ns: int = BEGUN_NS,
     ) -> None:
@@ -71,6 +73,7 @@ class Flight:
         self.bridge: Bridge | None = self._bridge()
         self._beat, self._policy, self._begun_ns = beat, policy, begun_ns
         self._dead_until_s = 0.0
+        self._patience_s, self._ready_since_s = patience_s, 0.0
         self._sway = np.random.default_rng(seed)
         self._last: messages.Mission | None = None
         self._users_due = False
@@ -141,6 +144,8 @@ class Flight:
             fingerprint=self.scenario.fingerprint,
         )
         self._say("mission", self._last)
+        if bridge.phase is Phase.READY:
+            self._ready_since_s = self.vehicle.now_s
         is_new = bridge.step != self._users_of
         if bridge.phase is Phase.READY or (bridge.phase in ARRIVED and is_new and bridge.step > 0):
             self._users_due = True
@@ -174,6 +179,8 @@ class Flight:
         if rates is None or status is None or rates.step != bridge.step:
             return
         if bridge.phase is not Phase.READY or bridge.fault is not None:
+            return
+        if self.vehicle.now_s - self._ready_since_s < self._patience_s:
             return
         self.vehicle.climb_to_m = None  # it has taken off, and may descend
         action = way_home(bridge) if self._policy is None else self._decided(status, rates)

@@ -109,8 +109,9 @@ class Flights(Book):
         )
         self.apart.add(step, self._scenario)
         self.holds += sum(told.holds for told in step.told)
-        found = self._order(step, before.told[-1] if follows and before and before.told else None)
-        found += self._time(step)
+        found = self._time(step)
+        if not step.untold:
+            found += self._order(step, before.told[-1] if follows and before and before.told else None)
         moves = sum(told.phase is Phase.MOVING for told in step.phases)
         self.begun += moves > 0
         if moves > 1:

@@ -54,7 +54,7 @@ class RecordedStep:
             ready for a move, or else the newest.
         told: every phase and reason of the vehicle, in the order in which they were published: at most
             `TOLD_KEPT`.
-        untold: how many there were beyond those.
+        untold: how many more there were, in the middle.
         log_ns: when each was received, nanoseconds since the epoch, by topic.
         publish_ns: when each was published, by topic.
         poses: the first poses of the step's own time, by stamp: at most `POSES_KEPT`.
@@ -112,10 +112,10 @@ class RecordedStep:
             again = publish_ns == told.publish_ns or not reason or told is self.told[-1]
             if again and (phase, reason) == told[:2]:
                 return False
-        if len(self.told) >= TOLD_KEPT:
+        insort(self.told, Told(phase, reason, log_ns, publish_ns), key=lambda one: one.publish_ns)
+        if len(self.told) > TOLD_KEPT:  # how it began, and how it ended, tells most
+            del self.told[TOLD_KEPT // 2]
             self.untold += 1
-        else:
-            insort(self.told, Told(phase, reason, log_ns, publish_ns), key=lambda one: one.publish_ns)
         return True
 
 

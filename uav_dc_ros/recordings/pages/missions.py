@@ -101,7 +101,7 @@ class Flown:
                 self.outcome, self.reason = status.phase.value, status.reason
         if rates is not None:
             self._book(step.step, rates)
-        self._keep(step, self._fly(step.position_m, status), users, rates)
+        self._keep(step, self._fly(step.position_m, status if step.is_measured else None), users, rates)
 
     def summary(self) -> dict[str, Any]:
         """The mission in numbers, as run_all's `--summary` has them."""

@@ -40,7 +40,7 @@ function drawVehicle(journey) {
     { type: "scatter", mode: "lines", name: "flown", x: way.s, y: way.z, line: { color: colour("accent"), width: 2 }, hovertemplate: "%{y:.1f} m" },
     { type: "scatter", mode: "markers", name: "held", x: held.map((word) => word.s), y: held.map(() => 0), text: held.map((word) => plain(word.reason)), marker: { symbol: "x", size: 8, color: colour("warm") }, hovertemplate: "%{text}" },
   ], layout({
-    shapes: held.map(band), xaxis: seconds({ title: "s" }), yaxis: axis({ rangemode: "tozero", title: "m", nticks: 5 }),
+    shapes: held.map(band), xaxis: seconds({ title: "s" }), yaxis: axis({ range: [0, 1.06 * Math.max(10, ...way.z, ...cells.z)], title: "m", nticks: 5 }),
     annotations: named.map((word, i) => ({ x: word.s, y: 1, xref: "x", yref: "paper", yanchor: "bottom", xanchor: word.s > end / 2 ? "right" : "left", text: plain(word.phase), showarrow: false, yshift: (i % 2) * 13, font: { size: 11, color: colour("muted") } })),
     margin: { l: 8, r: 10, t: 30, b: 8 },
   }), CONFIG);
