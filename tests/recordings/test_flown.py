@@ -18,12 +18,13 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.recordings.step import TOLD_KEPT
+from uav_dc_ros.recordings.pages.vehicle import WAY_MAX, Way
+from uav_dc_ros.recordings.step import TOLD_KEPT, RecordedPose
 from uav_dc_ros.recordings.steps import Steps
 from uav_dc_ros.recordings.vehicles import vehicle
 
 TINY = tiny()
-LONG = tiny(mission={"max_steps": 240})
+LONG = tiny(mission={"max_steps": 60})
 LAST = TINY.mission.max_steps
 
 
@@ -136,15 +137,15 @@ def test_a_vehicle_that_waits_for_hours_fills_no_memory():
 
 
 @pytest.fixture(scope="module")
-def an_hour():
-    """A flight of an hour, since the policy thinks for long."""
+def long_flight():
+    """A flight of a quarter of an hour, since the policy thinks for long."""
     return flown.Flight(LONG, patience_s=14.0).fly()
 
 
-def test_an_hour_of_poses_is_read_in_a_few_at_a_time(an_hour):
-    """Twenty poses a second for an hour, of which a step keeps some; none is held that no step can want."""
-    assert sum(m.topic == "/pose" for m in an_hour) > 70_000
-    stream = Steps(InMemory(an_hour), "", STEP_NS)
+def test_the_poses_of_a_long_flight_are_few_in_memory(long_flight):
+    """Twenty poses a second, of which a step keeps some; none is held that no step can want."""
+    assert sum(m.topic == "/pose" for m in long_flight) > 18_000
+    stream = Steps(InMemory(long_flight), "", STEP_NS)
     most = 0
     for step in stream:
         most = max(most, len(stream._poses))
@@ -373,7 +374,23 @@ def test_a_report_tells_phases_faults_and_the_way(bags, capsys, tmp_path, fault)
         assert np.hypot(np.diff(way["x"]), np.diff(way["y"])).sum() > 300.0
 
 
-def test_the_way_of_a_long_flight_stays_small(an_hour, capsys, tmp_path):
-    data = page_of(capsys, write(tmp_path / "bag", an_hour, flown.flown_about(LONG)), tmp_path)
-    assert len(data["mission-0"]["journey"]["way"]["s"]) <= 3000
+def test_the_way_of_a_long_flight_stays_small():
+    """Ten hours of poses, now flying, now standing."""
+    way = Way(TINY)
+    for i in range(0, 36_000 * 20, 7):
+        at_ns = round(i / 20 * 1e9)
+        x_m = (i // 20_000) * 500.0 + (i % 20_000) * 0.5 * (i // 20_000 % 2)
+        way.add(RecordedPose(at_ns, np.asarray([x_m, 0.0, 100.0]), at_ns, at_ns))
+    columns = way.columns(0, 10**18)
+    assert 1000 < len(columns["s"]) == len(columns["x"]) == len(columns["z"]) <= WAY_MAX
+    assert columns["s"][0] == 0.0
+    assert max(np.diff(columns["s"])) < 80.0, "no part of it is lost"
+    part = way.columns(10**12, 2 * 10**12)
+    assert (part["s"][0] >= 0.0, part["s"][-1] <= 1000.0) == (True, True)
+
+
+def test_a_long_flight_has_a_report(long_flight, capsys, tmp_path):
+    data = page_of(capsys, write(tmp_path / "bag", long_flight, flown.flown_about(LONG)), tmp_path)
+    journey = data["mission-0"]["journey"]
+    assert len(journey["cells"]["step"]) == LONG.mission.max_steps + 1
     assert (tmp_path / "page.html").stat().st_size < 3_000_000
