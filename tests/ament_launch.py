@@ -6,7 +6,7 @@ substitution that it does not know is an error.
 
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,8 @@ ATTRIBUTES = {
     "node": {"pkg", "exec", "name", "namespace", "output", "on_exit", "if", "unless"},
     "param": {"name", "value", "type"},
 }
-TYPES: dict[str, type] = {"str": str, "int": int}
 BOOLEAN = {"true": True, "True": True, "1": True, "false": False, "False": False, "0": False}
+TYPES: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "bool": BOOLEAN.__getitem__}
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,13 @@ pytestmark = pytest.mark.xdist_group("ament")
 LAUNCH = ROOT / "uav_dc_ros" / "share" / "launch" / "mission.launch.xml"
 PROCESSES = [name for name, row in NODES.items() if row.process]
 STARTED = [name for name in PROCESSES if not NODES[name].on_request]
-PEERS = [name for name in PROCESSES if NODES[name].needed]
+PEERS = [name for name in PROCESSES if NODES[name].needed and name != "bridge"]
 
 # Options of run_all without an argument of their name, and why.
 OTHERWISE = {
     "no_record": "record:=false",
     "summary": "run_all itself follows the missions and sums them up; under launch nobody does",
+    "settings": "launch has ways of its own to set a node's parameters",
     "help": "ros2 launch --show-args",
     "version": "in package.xml",
 }
@@ -179,7 +180,7 @@ def test_the_arguments_of_the_launch_file_are_the_options_of_run_all():
     for name in ("scenario", "seed", "missions"):
         assert arguments[name]["default"] == str(options[name].default)
     assert float(arguments["pace"]["default"]) == options["pace"].default
-    assert arguments["nodes"]["default"].split(",") == STARTED
+    assert arguments["nodes"]["default"].split(",") == [*STARTED, "bridge"]
 
 
 @pytest.mark.parametrize(
@@ -192,8 +193,13 @@ def test_the_arguments_of_the_launch_file_are_the_options_of_run_all():
             [n for n in PEERS if n != "recorder"],
         ),
         ({"nodes": "policy,recorder"}, ["policy", "recorder"], PEERS),
+        (
+            {"vehicle": "mavlink", "connect": "tcp:127.0.0.1:5760", "arm": "true"},
+            [STARTED[0], "bridge", *STARTED[1:]],
+            [*PEERS, "bridge"],
+        ),
     ],
-    ids=["all", "no bag", "two of them"],
+    ids=["all", "no bag", "two of them", "a bridge"],
 )
 def test_the_launch_file_starts(given, started, peers):
     nodes = ament_launch.nodes(LAUNCH, given)
@@ -204,6 +210,12 @@ def test_the_launch_file_starts(given, started, peers):
         assert node.parameters["scenario"] == "five_clusters"
         assert node.parameters.get("policy", "five_clusters_dueling") == "five_clusters_dueling"
         assert re.fullmatch(r"bags/[\d_-]+", node.parameters.get("bag", "bags/1"))
+        if node.name in ("world", "bridge", "recorder"):
+            given_for = given.get("vehicle", "simulated")
+            inside = "external" if "vehicle" in given else "simulated"
+            assert node.parameters["vehicle"] == (inside if node.name == "world" else given_for)
+        if node.name == "bridge":
+            assert (node.parameters["connect"], node.parameters["arm"]) == (given["connect"], True)
 
 
 def test_the_launch_file_starts_a_live_view_if_asked():

@@ -182,9 +182,9 @@ def decode(text: str | bytes, kind: type[P]) -> P:
     try:
         return msgspec.json.decode(text, type=kind)
     except msgspec.ValidationError as error:
-        raise MessageError("invalid", _told(error)) from None
+        raise MessageError("invalid", told(str(error))) from None
     except (msgspec.DecodeError, RecursionError, UnicodeError) as error:
-        raise MessageError("malformed", _told(error)) from None
+        raise MessageError("malformed", told(str(error))) from None
 
 
 def schema(kind: type[Payload]) -> dict[str, Any]:
@@ -204,11 +204,10 @@ def write_schemas(folder: Path) -> None:
         (folder / f"{topic}.schema.json").write_text(schema_text(kind), "utf-8")
 
 
-def _told(error: Exception) -> str:
-    """An error in words. It may quote the payload: a line of it, and nothing that a terminal obeys."""
-    text = str(error)
-    told = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:TOLD_MAX])
-    return told if len(text) <= TOLD_MAX else f"{told}..."
+def told(text: str) -> str:
+    """A text as it may be told, though it quotes what came from outside: a line, nothing a terminal obeys."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:TOLD_MAX])
+    return line if len(line) < TOLD_MAX else f"{line[: TOLD_MAX - 3]}..."
 
 
 def _same_length(**columns: list[Any]) -> None:

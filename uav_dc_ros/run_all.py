@@ -1,6 +1,7 @@
 """Fly recorded missions: start the nodes, watch the flight, close the bag, print a summary.
 
 python -m uav_dc_ros.run_all --scenario five_clusters --seed 3
+python -m uav_dc_ros.run_all --vehicle mavlink --connect tcp:127.0.0.1:5760
 """
 
 import argparse
@@ -10,6 +11,7 @@ from typing import NoReturn
 from uav_dc_ros import __version__, cli
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.topics import SIMULATED, VEHICLES
 
 PROG = "python -m uav_dc_ros.run_all"
 PORT_MAX = 65535
@@ -54,7 +56,41 @@ def parser() -> cli.Parser:
         type=_pace,
         default=WATCHABLE_PACE,
         metavar="lockstep|FACTOR",
-        help="as fast as the nodes can, or how many times faster than real time (default: %(default)g)",
+        help="as fast as the nodes can, or how many times faster than real time (default: %(default)g); a "
+        "real vehicle has its own",
+    )
+    vehicle = options.add_argument_group("a real vehicle, or one that another simulator flies")
+    vehicle.add_argument(
+        "--vehicle",
+        choices=(SIMULATED, *VEHICLES),
+        default=SIMULATED,
+        help="what flies: the world node's own, or an autopilot's over MAVLink, MAVROS or PX4's uXRCE-DDS "
+        "(default: %(default)s)",
+    )
+    vehicle.add_argument(
+        "--connect",
+        metavar="ADDRESS",
+        help="of a vehicle on MAVLink: tcp:HOST:PORT, udp:HOST:PORT (listens), udpout:HOST:PORT, "
+        "serial:DEVICE:BAUD",
+    )
+    vehicle.add_argument(
+        "--arm",
+        action="store_true",
+        help="set the mode, arm and take off; without it a pilot does the first two",
+    )
+    vehicle.add_argument(
+        "--datum",
+        metavar="LAT,LON,ALT",
+        help="of the grid's corner (default: the vehicle stands where the scenario starts)",
+    )
+    vehicle.add_argument(
+        "--set",
+        dest="settings",
+        type=_setting,
+        action="append",
+        default=[],
+        metavar="NODE.PARAMETER=VALUE",
+        help="any parameter of a node, such as bridge.then=land; repeatable",
     )
     recording = options.add_mutually_exclusive_group()
     recording.add_argument(
@@ -107,6 +143,14 @@ def _pace(text: str) -> float | None:
         return pace.parse(text)
     except ParameterError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _setting(text: str) -> tuple[str, str, str]:
+    where, equals, value = text.partition("=")
+    node, dot, name = where.partition(".")
+    if not (equals and dot and node and name):
+        raise argparse.ArgumentTypeError(f"{text!r}; expected NODE.PARAMETER=VALUE, such as bridge.then=land")
+    return node, name, value
 
 
 def _names(text: str) -> list[str]:

@@ -31,6 +31,8 @@ class Topic:
         asks_reliable: reliability asked for by subscriptions.
         latched: durability transient local instead of volatile, offered and asked for.
         depth: messages that a publisher keeps.
+        lease_s: within how many seconds a publisher that was killed is missed, by who asks for it; None: by
+            the middleware's own measure, tens of seconds.
         recorded: does the recorder write it?
     """
 
@@ -40,8 +42,13 @@ class Topic:
     asks_reliable: bool = True
     latched: bool = False
     depth: int = 1000
+    lease_s: float | None = None
     recorded: bool = True
 
+
+# What flies: the world node's own vehicle, or the way to a real one.
+SIMULATED = "simulated"
+VEHICLES = ("mavlink", "mavros", "px4")
 
 JSON = "std_msgs/msg/String"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -57,7 +64,7 @@ TOPICS: dict[str, Topic] = {
         Topic(name="users", type=JSON, latched=True, depth=500),
         Topic(name="rates", type=JSON, latched=True, depth=500),
         Topic(name="mission", type=JSON, latched=True),
-        Topic(name="move", type=JSON),
+        Topic(name="move", type=JSON, lease_s=0.25),
         Topic(name="target", type=POSE, latched=True),
         Topic(name="ready", type=JSON, latched=True, depth=10, recorded=False),
         Topic(name="path", type=PATH, latched=True, depth=1),

@@ -10,7 +10,11 @@ a TCP server starts when its first client comes; messages at the rates that were
 is ready after a while, and arming that is refused before, with a text; GUIDED without an estimate; one
 position setpoint that is followed for ever, a velocity setpoint for 3 s; a take-off by command, which a
 setpoint interrupts; OFFBOARD only after a second of setpoints at more than 2 Hz, and a failsafe (return) when
-they end; the frames each of them takes; speeds; disarming on the ground. A foreign gimbal speaks too.
+they end; the frames each of them takes; speeds; disarming on the ground; MAVLink 1 until MAVLink 2 is
+heard; motors that need two seconds to lift it; the last ten metres down at half a metre per second; the
+charge that ArduCopter's simulator counts to nothing within seven minutes while the voltage stays; PX4's
+origin, sent when it changes or when asked for it, and its readiness, told for the mode that it is in.
+A foreign gimbal speaks too.
 
 Not imitated: attitude, wind, noise, GPS, parameters, missions, failsafes other than PX4's for setpoints,
 links that lose single messages, yaw. Unlike any real one, its time waits (a quarter of a second at most)
@@ -24,6 +28,7 @@ import math
 import os
 import select
 import socket
+import struct
 import sys
 import time
 from typing import Any
@@ -32,10 +37,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 TICK_S = 0.02
 ACROSS_MPS, UP_MPS, DOWN_MPS, ACROSS_MPS2 = 10.2, 2.5, 1.5, 1.9
+SLOW_M, SLOW_MPS = 10.0, 0.5  # LAND_ALT_LOW, LAND_SPEED
+SPOOL_S = 2.0  # from the command to take off until it leaves the ground
 RETURN_M = 15.0
+FULL_V, SAG_V, EMPTY_V = 12.6, 0.3, 10.2  # at rest, less in the air, at rest without charge
+COUNTED_PER_S = 29.3 / 3600 / 3.3  # amperes of ArduCopter's simulator, ampere-hours of BATT_CAPACITY
+ADVICE_S = 30.0
 VELOCITY_S = 3.0  # GUID_TIMEOUT
 OFFBOARD_GAP_S, OFFBOARD_PROOF_S, OFFBOARD_LOSS_S = 0.5, 1.0, 1.0
 IDLE_DISARM_S, LANDED_DISARM_S = 10.0, 1.0
+SO_TIMESTAMPNS = 35  # of Linux: when a datagram came, however late this process reads it
 PATIENCE_S, AHEAD_S, LEAP_S = 0.25, 0.4, 0.4  # wall, simulated, simulated
 FLAGS, MADE_UP = 0x33F, 0x80
 HOME = (47.397742, 8.545594, 488.0)
@@ -70,6 +81,7 @@ class Copter:
         self.target_s = -math.inf
         self.streamed_since_s, self.streamed_s = math.inf, -math.inf
         self.ground_since_s = 0.0
+        self.take_off_s, self.counted = 0.0, 0.0
         self.battery, self.lost, self.refuses, self.balks = 1.0, False, False, False
 
     @property
@@ -84,6 +96,14 @@ class Copter:
             return 3
         return 4 if self.mode in LANDS else 2
 
+    @property
+    def charge(self) -> float:
+        return self.battery if self.px4 else max(0.0, self.battery - self.counted)
+
+    @property
+    def volts(self) -> float:
+        return EMPTY_V + (FULL_V - EMPTY_V) * self.battery - (0.0 if self.landed else SAG_V)
+
     def set_mode(self, mode: str, why: str) -> None:
         if mode != self.mode:
             self.mode, self.taking_off_to_m = mode, None
@@ -97,6 +117,7 @@ class Copter:
 
     def tick(self) -> None:
         self.t_s += TICK_S
+        self.counted += 0.0 if self.landed else COUNTED_PER_S * TICK_S
         if self.px4 and self.mode == "OFFBOARD" and self.t_s - self.streamed_s > OFFBOARD_LOSS_S:
             self.set_mode("AUTO.RTL", "failsafe: no offboard setpoints")
         goal = self.ned if self.landed else self._goal()
@@ -114,7 +135,8 @@ class Copter:
             rises = self.target is not None and self.target[2] < self.ned[2] - 0.5
             self.landed = not (self.mode == "OFFBOARD" and rises)
         else:
-            self.landed = not (self.mode == "GUIDED" and self.taking_off_to_m is not None)
+            turning = self.taking_off_to_m is not None and self.t_s - self.take_off_s >= SPOOL_S
+            self.landed = not (self.mode == "GUIDED" and turning)
         return self._goal() if not self.landed else self.ned
 
     def _goal(self) -> list[float]:
@@ -162,6 +184,8 @@ class Copter:
         self.velocity[0] += change[0] * share
         self.velocity[1] += change[1] * share
         up, down = UP_MPS, DOWN_MPS
+        if self.ned[2] > -SLOW_M and goal[2] > 0.0:
+            down = SLOW_MPS
         if self.target_velocity is not None and self.mode in FOLLOWS:
             up, down = min(up, abs(self.target_velocity[2])), min(down, abs(self.target_velocity[2]))
         self.velocity[2] = max(-up, min(down, 2.0 * dd))
@@ -172,13 +196,23 @@ class Copter:
             tell("touched down", self.t_s, ned=self.ned)
 
 
+class Codec(mav.MAVLink):
+    """Speaks MAVLink 1 until it has heard MAVLink 2."""
+
+    old = True
+
+    def send(self, message: Any, force_mavlink1: bool = False) -> None:
+        super().send(message, force_mavlink1=self.old)
+
+
 class Autopilot:
     """The copter's radio: messages in and out, and the faults."""
 
     def __init__(self, copter: Copter, system: int) -> None:
         self.copter = copter
-        self.mav = mav.MAVLink(self, system, 1)
-        self.gimbal = mav.MAVLink(self, system, 154)
+        self.mav = Codec(self, system, 1)
+        self.gimbal = Codec(self, system, 154)
+        self.origin_sent, self.advised_s = False, -math.inf
         self.parser = mav.MAVLink(None)
         self.parser.robust_parsing = True
         self.out = bytearray()
@@ -187,13 +221,15 @@ class Autopilot:
         self.later: list[tuple[float, Any]] = []
         self.setpoints, self.last_setpoint, self.interrupted = 0, None, 0
         self.heartbeats = 0
-        self.times: list[float] | None = None  # when setpoints came, steady clock
+        self.came_s = 0.0
+        self.times: list[float] | None = None  # when setpoints came, as the system stamped them; UDP only
 
     def write(self, data: bytes) -> None:  # pymavlink calls it
         self.out += data
 
     def forget_rates(self) -> None:
         self.due = {mav.MAVLINK_MSG_ID_HEARTBEAT: (1.0, self.copter.t_s)}
+        self.origin_sent = False
 
     # Out.
 
@@ -202,6 +238,9 @@ class Autopilot:
 
     def speak(self) -> None:
         t_s = self.copter.t_s
+        if not self.copter.ready and not self.copter.px4 and t_s - self.advised_s >= ADVICE_S:
+            self.advised_s = t_s
+            self.say("PreArm: AHRS: waiting for home")
         for number, (period_s, next_s) in list(self.due.items()):
             if t_s + 1e-9 >= next_s:
                 self.due[number] = (period_s, max(next_s + period_s, t_s - period_s))
@@ -222,13 +261,17 @@ class Autopilot:
                 ned = [p + o for p, o in zip(c.ned, self.offset, strict=True)]
                 self.mav.local_position_ned_send(boot_ms, *ned, *c.velocity)
         elif number == mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
-            if c.t_s >= c.ready_s:
+            if c.t_s >= c.ready_s and not (c.px4 and self.origin_sent):
+                self.origin_sent = True
                 self.mav.gps_global_origin_send(
                     *(round(v * s) for v, s in zip(HOME, (1e7, 1e7, 1e3), strict=True))
                 )
         elif number == mav.MAVLINK_MSG_ID_SYS_STATUS:
-            health = mav.MAV_SYS_STATUS_PREARM_CHECK if c.ready and not c.refuses else 0
-            self.mav.sys_status_send(0, 0, health, 0, 12000, 0, round(c.battery * 100), 0, 0, 0, 0, 0, 0)
+            ready = c.ready and not c.refuses and (not c.px4 or c.mode == "OFFBOARD")
+            battery = mav.MAV_SYS_STATUS_SENSOR_BATTERY
+            health = battery | (mav.MAV_SYS_STATUS_PREARM_CHECK if ready else 0)
+            volts, charge = round(c.volts * 1e3), round(c.charge * 100)
+            self.mav.sys_status_send(health, battery, health, 0, volts, 0, charge, 0, 0, 0, 0, 0, 0)
         elif number == mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
             self.mav.extended_sys_state_send(0, c.landed_state)
         elif number == mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
@@ -242,6 +285,8 @@ class Autopilot:
         """Take in bytes; was a message among them."""
         messages = self.parser.parse_buffer(data) or []
         for message in messages:
+            if message.get_msgbuf()[0] == mav.PROTOCOL_MARKER_V2:
+                self.mav.old = self.gimbal.old = False
             name = message.get_type()
             if name == "COMMAND_LONG" and message.target_system == self.mav.srcSystem:
                 self.later.append((self.copter.t_s + self.late_s, message))
@@ -261,7 +306,7 @@ class Autopilot:
             )
             if why:
                 self.say(why)
-            if message.command != mav.MAV_CMD_SET_MESSAGE_INTERVAL:
+            if message.command not in (mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAV_CMD_REQUEST_MESSAGE):
                 tell("command", self.copter.t_s, command=message.command, result=result, why=why)
 
     def _command(self, m: Any) -> tuple[int, str]:
@@ -275,6 +320,10 @@ class Autopilot:
                 self.due[int(m.param1)] = (m.param2 / 1e6, c.t_s)
             else:
                 self.due.pop(int(m.param1), None)
+            return 0, ""
+        if m.command == mav.MAV_CMD_REQUEST_MESSAGE:
+            self.origin_sent = False
+            self._send(int(m.param1))
             return 0, ""
         if m.command == mav.MAV_CMD_DO_SET_MODE:
             number = int(m.param2) << 16 | int(m.param3) << 24 if c.px4 else int(m.param2)
@@ -300,7 +349,7 @@ class Autopilot:
         if m.command == mav.MAV_CMD_NAV_TAKEOFF and not c.px4:
             if not (c.armed and c.landed and c.mode == "GUIDED"):
                 return failed, ""
-            c.taking_off_to_m = m.param7
+            c.taking_off_to_m, c.take_off_s = m.param7, c.t_s
             return 0, ""
         return mav.MAV_RESULT_UNSUPPORTED, ""
 
@@ -313,7 +362,7 @@ class Autopilot:
         c = self.copter
         self.setpoints += 1
         if self.times is not None:
-            self.times.append(time.monotonic())
+            self.times.append(self.came_s)
         ned, key = [m.x, m.y, m.z], (m.coordinate_frame, m.type_mask, m.x, m.y, m.z, m.vx, m.vy, m.vz)
         if key != self.last_setpoint:
             self.last_setpoint = key
@@ -342,8 +391,9 @@ class Control:
     """Commands on standard input, a line each.
 
     refuse 0|1 (to arm, and tells so before); balk 0|1 (to arm, without a warning); drop SECONDS (wall);
-    freeze 0|1; jump NORTH EAST DOWN (0 0 0: back); mode NAME (a pilot); disarm; battery SHARE; lose 0|1 (the
-    estimate); late SECONDS (simulated); reboot; times (of setpoints, from now on); report; quit.
+    freeze 0|1; jump NORTH EAST DOWN (0 0 0: back); mode NAME, arm, disarm (a pilot); battery SHARE; counted
+    SHARE (of the battery, whose voltage stays); lose 0|1 (the estimate); late SECONDS (simulated); reboot;
+    times (of setpoints, from now on); report; quit.
     """
 
     def __init__(self, autopilot: Autopilot) -> None:
@@ -377,10 +427,12 @@ class Control:
                 a.offset = [float(word) for word in words]
             case "mode":
                 c.set_mode(words[0], "pilot")
-            case "disarm":
-                c.arm(False, "pilot")
+            case "arm" | "disarm":
+                c.arm(verb == "arm", "pilot")
             case "battery":
-                c.battery = float(words[0])
+                c.battery, c.counted = float(words[0]), 0.0
+            case "counted":
+                c.counted = c.battery - float(words[0])
             case "lose":
                 c.lost = words[0] == "1"
             case "late":
@@ -423,6 +475,7 @@ class Wire:
         else:
             self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self.udp.setblocking(False)
+            self.udp.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self.peer = ("127.0.0.1", udp)
             port = udp
         self.met = False
@@ -434,19 +487,20 @@ class Wire:
 
     def exchange(self, autopilot: Autopilot, dropped: bool) -> bool:
         """Pass bytes both ways; did a message come."""
-        data, out = b"", bytes(autopilot.out)
+        data, out, met = b"", bytes(autopilot.out), False
         autopilot.out.clear()
         if self.udp is not None:
             self.met = True
-            try:
-                while True:
-                    data += self.udp.recv(65536)
-            except OSError:
-                pass
+            with contextlib.suppress(OSError):
+                while True:  # a datagram is a message or several, and came when the system says
+                    data, more, _, _ = self.udp.recvmsg(65536, 64)
+                    seconds, nanoseconds = struct.unpack("@ll", more[0][2])
+                    autopilot.came_s = seconds + nanoseconds * 1e-9
+                    met = (not dropped and autopilot.hear(data)) or met
             if out and not dropped:
                 with contextlib.suppress(OSError):
                     self.udp.sendto(out, self.peer)
-            return not dropped and autopilot.hear(data)
+            return met
         if dropped:
             self._hang_up()
             return False

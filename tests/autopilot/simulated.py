@@ -23,6 +23,7 @@ class Vehicle:
     deaf: bool = False  # it follows no wish
     refused: tuple[Mode, ...] = ()
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of what it believes of its position
+    said: str = ""
     now_s: float = 0.0
     climb_to_m: float | None = None
     asked: list[Wish] = field(default_factory=list)
@@ -79,6 +80,7 @@ class Vehicle:
             estimate_ok=self.estimate_ok,
             battery=self.battery,
             vehicle_s=self.now_s,
+            said=self.said,
         )
 
 

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.autopilot.flight import Fake, fake
 
-SPEED = 20.0
+SPEED = 40.0
 POSITION, VELOCITY = 0xDF8, 0xDC7
 
 
@@ -119,7 +119,7 @@ def test_guided_comes_before_the_estimate_and_arming_only_after(copter: Client) 
 def test_speeds_of_the_copter(copter: Client) -> None:
     copter.take_off(50.0)
     up_s = copter.fake.all("taken off")[0]["t_s"] - copter.fake.all("armed")[0]["t_s"]
-    assert up_s == pytest.approx(50 / 2.5, abs=1.5)
+    assert up_s == pytest.approx(2 + 50 / 2.5, abs=1.5)
     copter.send(100.0, 0.0, -50.0)
     begun_s, peak_mps = copter.t_s, 0.0
     while True:
@@ -135,7 +135,7 @@ def test_speeds_of_the_copter(copter: Client) -> None:
     assert copter.place() == pytest.approx((100.0, 0.0, -50.0), abs=0.05)
     assert copter.mode(9) == 0
     landed = copter.fake.wait_for("touched down")["t_s"] - copter.fake.all("mode")[-1]["t_s"]
-    assert landed == pytest.approx(50 / 1.5, abs=2.0)
+    assert landed == pytest.approx(40 / 1.5 + 10 / 0.5, abs=2.0)
     copter.fake.wait_for("disarmed")
 
 

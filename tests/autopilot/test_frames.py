@@ -17,6 +17,7 @@ from uav_dc_ros.autopilot.frames import (
     wrapped,
     yaw_of_heading,
 )
+from uav_dc_ros.errors import VehicleError
 
 ZURICH = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
 QUARTER = math.pi / 2
@@ -93,3 +94,12 @@ def test_the_origin_of_an_autopilot_north_east_of_the_datum_counts_positive() ->
     origin = ZURICH.at(Enu(30.0, 40.0, 5.0))
     frame = LocalFrame(origin=origin.seen_from(ZURICH))
     assert frame.from_autopilot(Ned(0.0, 0.0, 0.0)) == pytest.approx(Enu(30.0, 40.0, 5.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "1,2", "1,2,3,4", "a,b,c", "nan,1,2", "1,2,nan", "90.1,0,0", "0,-180.1,0", "1,2,inf", "1,2,1e5"],
+)
+def test_what_is_no_datum_is_told(text: str) -> None:
+    with pytest.raises(VehicleError, match=r"^datum: .*; expected LATITUDE,LONGITUDE,ALTITUDE"):
+        Geodetic.parse(text)

@@ -3,7 +3,12 @@
 frames   ENU and NED, yaw, and the grid around a datum on the Earth
 fence    where the vehicle may be, and be sent
 vehicle  what passes between the bridge and a transport
+battery  is the battery low
 watch    how carefully to fly, and what keeps a vehicle from going on
+course   where a mission stands on the grid
+ground   before the first step
+descent  what brings a vehicle down
+priority running when it is due
 bridge   from connecting to landing: phases, steps, faults
 mavlink  a transport: an autopilot on MAVLink, over TCP, UDP or a serial line
 """

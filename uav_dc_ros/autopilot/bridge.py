@@ -5,42 +5,30 @@
 It decides, and does nothing itself: `tick` is called often with what is known of the vehicle, and returns
 wishes for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
 last good setpoint stays), then to *return* or *land*, and at last to `aborted` with its reason. A pilot who
-changes the mode has the vehicle at once: from then on there are no setpoints and no wishes.
+changes the mode has the vehicle at once: from then on there are no setpoints and no wishes. Where that mode
+brings it down (an autopilot's failsafe does that, too), it is watched until it stands.
 """
 
 from collections.abc import Callable
 
-import msgspec
-import numpy as np
-
+from uav_dc_ros.autopilot.asking import Asked
+from uav_dc_ros.autopilot.course import Cell, Course, Dwell, Standing
+from uav_dc_ros.autopilot.descent import DOWN, Descent
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.ground import Ground, Next
+from uav_dc_ros.autopilot.patience import Patience
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.autopilot.watch import Settings, Watch
-from uav_dc_ros.core import world as core
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 
+__all__ = ["Bridge", "Standing"]
+
 FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
+DECIDED = (Phase.READY, Phase.MOVING)  # by a policy
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
-
-
-class Standing(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a mission stands, for a bridge that was killed and takes it up again.
-
-    Attributes:
-        step, cell: to go on with. A move that was begun is flown to its end, and not begun again.
-        flies: has the vehicle left the ground, or may it have?
-        outcome: of a mission that was on its way down, or over; None: it goes on.
-        reason: why it was.
-    """
-
-    step: int
-    cell: tuple[int, int, int]
-    flies: bool = False
-    outcome: Phase | None = None
-    reason: str = ""
 
 
 class Bridge:
@@ -51,15 +39,15 @@ class Bridge:
         settings: how carefully.
         on_change: called after each change of phase or step.
         standing: of a mission that is taken up again.
+        fence: around targets and poses; None: the one around the scenario.
 
     Attributes:
         phase: where the mission stands.
         reason: why it is in this phase, in words.
-        step: steps flown.
-        cell: the cell that the vehicle reached last.
-        goal: the cell that it is in, or flies to.
+        course: steps flown, the cell reached last, and the cell that it flies to.
         fault: what keeps it from going on at the moment; None: nothing.
         setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
+        policy_is_gone: to be set while nobody is there who would decide the next move: the vehicle stops.
     """
 
     def __init__(
@@ -68,24 +56,26 @@ class Bridge:
         settings: Settings,
         on_change: Callable[[], None] = lambda: None,
         standing: Standing | None = None,
+        fence: Fence | None = None,
     ) -> None:
         self.scenario, self.settings = scenario, settings
-        self.fence = Fence.around(scenario)
+        self.fence = fence or Fence.around(scenario)
         self.phase, self.reason = Phase.IDLE, "not started"
-        self._standing = standing or Standing(step=0, cell=scenario.start_cell)
-        self.step, self.cell, self.goal = self._standing.step, self._standing.cell, self._standing.cell
+        self.course = Course(scenario, standing)
         self.fault: str | None = None
         self.setpoint: Enu | None = None
+        self.policy_is_gone = False
         self._on_change = on_change
-        self._outcome = Phase.ABORTED  # of a mission that lands
-        self._asked: dict[Wish, float] = {}  # when a wish was last uttered, vehicle time
+        self._asked = Asked(settings)
         self._since_s = 0.0  # vehicle time of the last change of phase
-        self._there_since_s: float | None = None
+        self._dwell = Dwell(settings)
+        self._patience = Patience(settings, scenario.mission.step_s)
         self._fault_since_s = 0.0, 0.0  # steady clock, vehicle time
         self._now_s = 0.0  # vehicle time
-        self._down: Mode = settings.then  # how it descends
-        self._tries = 0  # at having it descend so
+        self._steady_s = self._since_steady_s = 0.0  # steady clock: last tick, last change of phase
+        self._descent = Descent()
         self._watched = Watch(settings)
+        self._ground = Ground(self.course, settings, self.fence, self._watched)
 
     @property
     def is_over(self) -> bool:
@@ -93,16 +83,31 @@ class Bridge:
         return self.phase.is_over
 
     @property
+    def step(self) -> int:
+        """Steps flown."""
+        return self.course.step
+
+    @property
+    def cell(self) -> Cell:
+        """The cell that the vehicle reached last."""
+        return self.course.cell
+
+    @property
+    def goal(self) -> Cell:
+        """The cell that it is in, or flies to."""
+        return self.course.goal
+
+    @property
     def standing(self) -> Standing:
         """Where the mission stands now."""
         if self.phase in (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT):
-            return self._standing
+            return self.course.standing
         over = self.phase is Phase.LANDING or self.is_over
         return Standing(
             step=self.step + (self.phase is Phase.MOVING),
             cell=self.goal,
             flies=True,
-            outcome=self._outcome if over else None,
+            outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
             reason=self.reason if over else "",
         )
 
@@ -112,14 +117,24 @@ class Bridge:
             return f"the vehicle is {self.phase.value} ({self.fault or self.reason}); expected it to be ready"
         if step != self.step:
             return f"a move for step {step}; expected {self.step}"
-        cell = self.scenario.grid.move(np.asarray(self.cell), np.asarray(int(action)))
-        breach = self.fence.breach(self._centre(tuple(cell.tolist())))
-        if breach is not None:
+        cell = self.course.beyond(action)
+        target = self.course.centre(cell)
+        if (breach := self.fence.breach(target)) is not None:
             return f"the target is outside the fence: {breach}"
-        self.goal = tuple(cell.tolist())
-        self.setpoint = self._centre(self.goal)
-        self._enter(Phase.MOVING, f"{action.label} to cell {self.goal}", self._now_s)
+        self.course.goal, self.setpoint = cell, target
+        self._enter(Phase.MOVING, f"{action.label} to cell {cell}")
         return None
+
+    def stop(self, why: str) -> None:
+        """End the mission, since nobody will steer any more; a vehicle that flies comes down."""
+        if self.phase in STEERED:
+            self._give_up(why)
+        elif self.phase is not Phase.LANDING and not self.is_over:
+            self._end(Phase.ABORTED, why)
+
+    def is_done_with(self, known: Telemetry) -> bool:
+        """Does the vehicle come to its end without any further word."""
+        return self.is_over or (self.phase is Phase.LANDING and self._descent.obeys(known))
 
     def tick(self, now_s: float, known: Telemetry) -> list[Wish]:
         """Go on.
@@ -131,9 +146,9 @@ class Bridge:
         Returns:
             Wishes to be passed on now, at most one of each kind.
         """
-        self._now_s = known.vehicle_s
+        self._now_s, self._steady_s = known.vehicle_s, now_s
         if self.phase is Phase.IDLE:
-            self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position", known.vehicle_s)
+            self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
         if self.phase.is_over:
             return []
         if self.phase in FLYING:
@@ -142,6 +157,8 @@ class Bridge:
             self._watch(now_s, known)
         if self.fault is not None and self.phase in STEERED:
             return []  # hold: the setpoint stays
+        if self.phase in DECIDED and not self._policy_lives(known):
+            return []
         wishes = {
             Phase.CONNECTING: self._connect,
             Phase.PREFLIGHT: self._prepare,
@@ -150,21 +167,31 @@ class Bridge:
             Phase.MOVING: self._fly,
             Phase.LANDING: self._land,
         }[self.phase](now_s, known)
-        return [wish for wish in wishes if self._may_ask(wish, known.vehicle_s)]
+        uttered = [wish for wish in wishes if self._asked.may(wish, known.vehicle_s)]
+        self._descent.tries += sum(isinstance(wish, SetMode) for wish in uttered)
+        return uttered
 
     # What goes wrong.
 
     def _taken_over(self, known: Telemetry) -> bool:
-        """Has somebody else the vehicle now: a pilot who changed the mode, or whoever disarmed it."""
-        ours = (Mode.COMMANDED,) if self.phase in STEERED else (Mode.LAND, Mode.RETURN, Mode.COMMANDED)
-        if self.phase is Phase.LANDING and not known.armed:
+        """Has somebody else the vehicle now, who changed its mode or disarmed it."""
+        landing = self.phase is Phase.LANDING
+        if landing and not known.armed:
             return False  # it stands
+        why = self.fault or (self.reason if landing else None) or known.refusal
+        after = "".join(
+            f" ({word}: {what})" for word, what in (("after", why), ("it says", known.said)) if what
+        )
         if not known.armed:
-            self._end(Phase.ABORTED, f"disarmed by somebody else while it was {self.phase.value}")
-        elif known.mode not in ours:
-            why = self.fault or (self.reason if self.phase is Phase.LANDING else None)
-            after = f" (after: {why})" if why else ""  # maybe the autopilot's own answer to that
-            self._end(Phase.ABORTED, f"taken over: mode {known.mode_name or known.mode.value}{after}")
+            who = "disarmed by a pilot or by the autopilot itself"
+            self._end(Phase.ABORTED, f"{who} while it was {self.phase.value}{after}")
+        elif known.mode is not Mode.COMMANDED if not landing else not self._descent.is_ours(known.mode):
+            mode = known.mode_name or known.mode.value
+            changed = f"mode {mode}: changed by a pilot or by the autopilot's failsafe{after}"
+            if not landing and known.mode in DOWN:
+                self._descend(known.mode, Phase.ABORTED, changed)
+            else:
+                self._end(Phase.ABORTED, changed)
         return self.phase.is_over
 
     def _watch(self, now_s: float, known: Telemetry) -> None:
@@ -194,186 +221,125 @@ class Bridge:
         if max(now_s - steady_s, known.vehicle_s - vehicle_s) > settings.hold_s:
             self._give_up(fault, known)
 
+    def _policy_lives(self, known: Telemetry) -> bool:
+        """Is there somebody who decides; until there is, the vehicle stops, and the step's time with it."""
+        since, now = self._patience.gone_since, (self._now_s, self._steady_s)
+        if self.policy_is_gone and since is None:
+            self._patience.gone_since = now
+            self.setpoint = known.position if self.phase is Phase.MOVING else self.setpoint
+            self._change("holds: the policy is gone")
+        elif self.policy_is_gone and since is not None and self._patience.is_over(since, now):
+            self._give_up(f"the policy has been gone for {self._patience.limit_s:g} s")
+        elif not self.policy_is_gone and since is not None:
+            self._patience.gone_since = None
+            self._since_s += now[0] - since[0]
+            self.setpoint = self.course.target
+            self._change(f"goes on after: {self.reason}")
+        return not self.policy_is_gone
+
     def _give_up(self, why: str, known: Telemetry | None = None) -> None:
         """End the mission: bring the vehicle down. One that does not know where it is cannot return."""
         self.fault = None
-        self._outcome = Phase.ABORTED
         lost = known is not None and not known.estimate_ok
-        self._descend(Mode.LAND if lost else self.settings.then, why)
+        self._descend(Mode.LAND if lost else self.settings.then, Phase.ABORTED, why)
 
     # What is to be done in each phase.
 
     def _connect(self, now_s: float, known: Telemetry) -> list[Wish]:
-        fault = self._watched.fault(now_s, known)
-        if known.missing is not None or fault is not None or known.position is None:
-            self._change(known.missing or fault or "no position yet")
-            return []
-        if (breach := self.fence.breach(known.position)) is not None:
-            self._change(f"the vehicle is outside the fence: {breach}")
-            return []
-        if self._standing.flies and not self._is_still_ours(known):
-            return []
-        self.setpoint = known.position  # an autopilot may want to see setpoints before it follows any
-        flies = known.armed and known.on_ground is False
-        if flies and known.mode is Mode.COMMANDED:
-            if self.settings.flying_at_start == "land":
-                self._outcome = Phase.ABORTED
-                self._descend(self.settings.then, "it flew already when the bridge came")
-                return []
-            self.setpoint = self._centre(self.goal)
-            self._enter(
-                Phase.TAKEOFF, "it flies already: to the cell where the mission stands", known.vehicle_s
-            )
-            return []
-        self._enter(Phase.PREFLIGHT, "connected", known.vehicle_s)
-        return []
-
-    def _is_still_ours(self, known: Telemetry) -> bool:
-        """May a mission that was in the air be taken up again; if not, it ends, or goes on coming down."""
-        before = self._standing
-        if before.outcome is not None and known.armed:
-            self._outcome = before.outcome
-            down = known.mode if known.mode in (Mode.RETURN, Mode.LAND) else self.settings.then
-            self._descend(down, before.reason)
-        elif not known.armed:  # it is never armed a second time
-            why = before.reason or "on the ground and disarmed when the bridge came back"
-            self._end(before.outcome or Phase.ABORTED, why)
-        elif known.mode is not Mode.COMMANDED:
-            self._end(
-                Phase.ABORTED, f"in mode {known.mode_name or known.mode.value} when the bridge came back"
-            )
-        elif self._is_done():
-            self._finish("when the bridge came back")
-        else:
-            return True
-        return False
+        return self._follow(self._ground.connect(now_s, known))
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
-        fault = self._watched.fault(now_s, known)
-        if fault is None and known.position is not None:
-            fault = self.fence.breach(known.position)
-        if fault is not None and not (known.armed and known.mode is Mode.COMMANDED):
-            self.setpoint = None
-            self._enter(Phase.CONNECTING, fault, known.vehicle_s)
-            return []
-        if known.mode is Mode.COMMANDED and known.armed:
-            x_m, y_m, _ = known.position or self._centre(self.goal)
-            self.setpoint = Enu(x_m, y_m, self._centre(self.goal).up_m)
-            if (breach := self.fence.breach(self.setpoint)) is not None:
-                self._give_up(f"the target is outside the fence: {breach}")
-                return []
-            self._enter(Phase.TAKEOFF, "armed, in the commanded mode", known.vehicle_s)
-            return []
-        if known.armed:
-            mode = known.mode_name or known.mode.value
-            if Arm() in self._asked:
-                self._end(Phase.ABORTED, f"taken over: mode {mode}, before it took off")
-            else:
-                self._change(f"a pilot flies: mode {mode}")
-            return []
-        if (low := self._watched.battery_is_low(known)) is not None:
-            self._change(low)
-            return []
-        if not self.settings.arm:
-            self._change("waiting for a pilot to set the mode and arm (--arm does it here)")
-            return []
-        self._change(known.refusal or "sets the mode and arms")
-        return [Arm()] if known.mode is Mode.COMMANDED else [SetMode(Mode.COMMANDED)]
+        return self._follow(self._ground.prepare(now_s, known, Arm() in self._asked.last_s))
+
+    def _follow(self, advice: Next) -> list[Wish]:
+        """Do what a look at a vehicle on the ground led to."""
+        self.setpoint = advice.setpoint
+        if advice.phase.is_over:
+            self._end(advice.phase, advice.why)
+        elif advice.phase is Phase.LANDING:
+            self._descend(advice.down, advice.outcome, advice.why)
+        elif advice.phase is Phase.TAKEOFF and self.course.is_done:
+            self._finish("when the bridge came back")
+        elif advice.phase is self.phase:
+            self._change(advice.why)
+        else:
+            self._enter(advice.phase, advice.why)
+        return [] if advice.wish is None else [advice.wish]
 
     def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
-        start, position = self._centre(self.goal), known.position
+        start, position = self.course.target, known.position
         assert position is not None, "a fault otherwise"
         if known.vehicle_s - self._since_s > self.settings.takeoff_s:
             self._give_up(f"not at the start after {self.settings.takeoff_s:g} s")
             return []
         if position.up_m >= start.up_m - self.settings.tolerance_m:
             self.setpoint = start  # high enough to fly across
-        if self._is_there(start, known):
-            self.cell = self.goal
-            self._enter(Phase.READY, f"at the start, cell {self.cell}", known.vehicle_s)
+        if self._dwell.is_there(start, known):
+            self.course.cell = self.course.goal
+            self._enter(Phase.READY, f"at the start, cell {self.cell}")
             return []
         return [TakeOff(start.up_m)] if known.on_ground is not False else []
 
     def _wait(self, now_s: float, known: Telemetry) -> list[Wish]:
-        patience_s = self.settings.silent_steps * self.scenario.mission.step_s
-        if known.vehicle_s - self._since_s > patience_s:
-            self._give_up(f"no move from the policy for {patience_s:g} s")
+        if self._patience.is_over((self._since_s, self._since_steady_s), (known.vehicle_s, now_s)):
+            self._give_up(f"no move from the policy for {self._patience.limit_s:g} s")
         return []
 
     def _fly(self, now_s: float, known: Telemetry) -> list[Wish]:
-        there = self._is_there(self._centre(self.goal), known)
+        there = self._dwell.is_there(self.course.target, known)
         if not there and known.vehicle_s - self._since_s < self.scenario.mission.step_s:
             return []
-        self.step, self.cell = self.step + 1, self.goal
+        self.course.arrive()
         how = "there" if there else f"not there after {self.scenario.mission.step_s:g} s, which a step has"
-        if self._is_done():
+        if self.course.is_done:
             self._finish(how)
         else:
-            self._enter(Phase.READY, f"step {self.step}: {how}", known.vehicle_s)
+            self._enter(Phase.READY, f"step {self.step}: {how}")
         return []
-
-    def _is_done(self) -> bool:
-        """Are there no further steps."""
-        terminated, truncated, _ = core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
-        return self.step > 0 and bool(terminated or truncated)
 
     def _finish(self, how: str) -> None:
         """Come down after the last step."""
-        _, _, landed = core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
-        if landed:
-            self._outcome = Phase.LANDED
-            self._descend(Mode.LAND, f"step {self.step}: at the dock ({how})")
+        if self.course.is_at_dock:
+            self._descend(Mode.LAND, Phase.LANDED, f"step {self.step}: at the dock ({how})")
         else:
-            self._outcome = Phase.TIMEOUT
-            self._descend(self.settings.then, f"step {self.step}: out of steps away from the dock ({how})")
+            why = f"step {self.step}: out of steps away from the dock ({how})"
+            self._descend(self.settings.then, Phase.TIMEOUT, why)
 
     def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
         if self._watched.link_is_lost(now_s, known):  # who knows what mode it is in by now
             if known.heartbeat_s is None or now_s - known.heartbeat_s > self.settings.lost_s:
                 self._end(Phase.ABORTED, f"{self.reason}; not heard of for {self.settings.lost_s:g} s")
             return []
+        descent = self._descent
         if not known.armed:
-            self._end(self._outcome, self.reason)
+            self._end(descent.outcome, self.reason)
             return []
-        if known.mode is self._down:
+        if descent.obeys(known):
             self.setpoint = None
             return []
-        if self._down is Mode.RETURN and known.mode is Mode.LAND:
-            return []  # its own failsafe knows better
-        asked_s = self._asked.get(SetMode(Mode.RETURN), known.vehicle_s)
-        answered = known.vehicle_s - asked_s >= self.settings.retry_s
-        if self._down is Mode.RETURN and self._tries >= self.settings.returning_tries and answered:
-            self._down = Mode.LAND
+        if descent.lands_instead(
+            self.settings, self._asked.last_s.get(SetMode(Mode.RETURN)), known.vehicle_s
+        ):
             self._change(f"{self.reason}; it does not return ({known.refusal or 'no answer'}): lands")
-        return [SetMode(self._down)]
+        return [descent.wish]
 
     # Small change.
 
-    def _is_there(self, target: Enu, known: Telemetry) -> bool:
-        """Has the vehicle been at a place for the dwell time; where it is must be known."""
-        assert known.position is not None, "a fault otherwise"
-        if float(np.linalg.norm(np.subtract(known.position, target))) > self.settings.tolerance_m:
-            self._there_since_s = None
-            return False
-        if self._there_since_s is None:
-            self._there_since_s = known.vehicle_s
-        return known.vehicle_s - self._there_since_s >= self.settings.dwell_s
-
-    def _centre(self, cell: tuple[int, ...]) -> Enu:
-        return Enu(*self.scenario.grid.centre_m(np.asarray(cell), like=np.zeros(1)).tolist())
-
-    def _descend(self, how: Mode, why: str) -> None:
+    def _descend(self, how: Mode, outcome: Phase, why: str) -> None:
         """Bring it down; until it obeys, the setpoint holds it where it is."""
-        self._down, self._tries = how, 0
-        self._enter(Phase.LANDING, why, self._now_s)
+        self._descent = Descent(how, outcome)
+        self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:
         self.setpoint, self.fault = None, None
-        self._enter(phase, why, self._now_s)
+        self._enter(phase, why)
 
-    def _enter(self, phase: Phase, why: str, vehicle_s: float) -> None:
-        self.phase, self._since_s, self._there_since_s = phase, vehicle_s, None
-        self._asked.clear()
+    def _enter(self, phase: Phase, why: str) -> None:
+        self.phase, self._since_s = phase, self._now_s
+        self._dwell.begin()
+        self._patience.gone_since = None
+        self._since_steady_s = self._steady_s
+        self._asked.begin()
         self.reason = why
         self._on_change()
 
@@ -382,12 +348,3 @@ class Bridge:
         if why != self.reason:
             self.reason = why
             self._on_change()
-
-    def _may_ask(self, wish: Wish, vehicle_s: float) -> bool:
-        """Utter a wish now: the first time, or long enough after the last."""
-        last_s = self._asked.get(wish)
-        if last_s is not None and vehicle_s - last_s < self.settings.retry_s:
-            return False
-        self._asked[wish] = vehicle_s
-        self._tries += 1
-        return True

@@ -10,7 +10,7 @@ from uav_dc_ros.autopilot.vehicle import Mode
 
 ON_GROUND, IN_AIR, TAKING_OFF, LANDING = 1, 2, 3, 4  # MAV_LANDED_STATE
 COPTERS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})  # MAV_TYPE of what hovers
-PREARM_CHECK = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
+PREARM_CHECK, BATTERY = 1 << 28, 1 << 25  # MAV_SYS_STATUS_PREARM_CHECK, MAV_SYS_STATUS_SENSOR_BATTERY
 
 # ESTIMATOR_STATUS_FLAGS of PX4, which ArduPilot's EKF_STATUS_FLAGS follow.
 ATTITUDE, VELOCITY_ACROSS, VELOCITY_UP, ACROSS_RELATIVE, ACROSS, UP = (1 << bit for bit in range(6))
@@ -31,6 +31,8 @@ class Dialect:
         asked: the mode to ask for.
         estimate_message: name of the message that carries the state of its position estimate.
         ready_flags: of that message, before it arms.
+        tells_readiness: does SYS_STATUS say whether it would arm? PX4's does for the mode that it is in,
+            which is not the one that it is to arm in.
         climbs_by_setpoint: takes off by setpoints, and wants to see some before it follows any. Otherwise it
             is given a command to take off, and setpoints would interrupt that.
     """
@@ -41,6 +43,7 @@ class Dialect:
     asked: Mapping[Mode, int]
     estimate_message: str
     ready_flags: int
+    tells_readiness: bool
     climbs_by_setpoint: bool
 
     def mode(self, custom_mode: int) -> Mode:
@@ -74,7 +77,8 @@ class Dialect:
             return False
         if armed:
             return flags & FLYABLE == FLYABLE
-        return flags & self.ready_flags == self.ready_flags and bool(health & PREARM_CHECK)
+        ready = not self.tells_readiness or bool(health & PREARM_CHECK)
+        return flags & self.ready_flags == self.ready_flags and ready
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
@@ -116,6 +120,7 @@ ARDUCOPTER = Dialect(
     asked={Mode.COMMANDED: 4, Mode.HOLD: 17, Mode.RETURN: 6, Mode.LAND: 9},
     estimate_message="EKF_STATUS_REPORT",
     ready_flags=ARMABLE,
+    tells_readiness=True,
     climbs_by_setpoint=False,
 )
 
@@ -152,6 +157,7 @@ PX4 = Dialect(
     },
     estimate_message="ESTIMATOR_STATUS",
     ready_flags=FLYABLE,
+    tells_readiness=False,
     climbs_by_setpoint=True,
 )
 

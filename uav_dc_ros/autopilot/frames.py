@@ -4,13 +4,14 @@ Local ENU metres are counted from a *datum*, a point on the Earth: the corner of
 An autopilot counts its local NED metres from an *origin* of its own, mostly where it was switched on.
 """
 
+import importlib
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Self
-
-import pymap3d
+from typing import Any, NamedTuple, Self
 
 from uav_dc_ros.errors import VehicleError
+
+HIGHEST_M = 10_000.0
 
 
 class Enu(NamedTuple):
@@ -78,7 +79,8 @@ class Geodetic:
             latitude_deg, longitude_deg, altitude_m = (float(part) for part in text.split(","))
         except ValueError:
             latitude_deg = math.nan
-        if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and math.isfinite(altitude_m)):
+        right = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and abs(altitude_m) <= HIGHEST_M
+        if not right:
             raise VehicleError(
                 f"datum: {text!r}; expected LATITUDE,LONGITUDE,ALTITUDE in degrees and metres, such as "
                 "47.397742,8.545594,488.0"
@@ -93,11 +95,11 @@ class Geodetic:
         """Position of this point in the ENU frame of a datum (exact on WGS84, not the flat Earth's)."""
         here = (self.latitude_deg, self.longitude_deg, self.altitude_m)
         there = (datum.latitude_deg, datum.longitude_deg, datum.altitude_m)
-        return Enu(*(float(value) for value in pymap3d.geodetic2enu(*here, *there)))
+        return Enu(*(float(value) for value in _pymap3d().geodetic2enu(*here, *there)))
 
     def at(self, offset: Enu) -> Self:
         """The point at an offset in this point's ENU frame."""
-        latitude_deg, longitude_deg, altitude_m = pymap3d.enu2geodetic(
+        latitude_deg, longitude_deg, altitude_m = _pymap3d().enu2geodetic(
             *offset, self.latitude_deg, self.longitude_deg, self.altitude_m
         )
         return type(self)(
@@ -124,3 +126,17 @@ class LocalFrame:
     def from_autopilot(self, position: Ned) -> Enu:
         """A position of the autopilot's, in the grid's ENU frame."""
         return Enu(*(p + o for p, o in zip(to_enu(position), self.origin, strict=True)))
+
+
+def _pymap3d() -> Any:
+    """The Earth's ellipsoid; only who has a datum needs it.
+
+    Raises:
+        VehicleError: it is not installed.
+    """
+    try:
+        return importlib.import_module("pymap3d")
+    except ImportError:
+        raise VehicleError(
+            "a datum needs pymap3d; expected it installed: pip install 'uav_dc_ros[mavlink]'"
+        ) from None

@@ -1,10 +1,11 @@
 """What is known of the vehicle, from the MAVLink messages that came. No input or output."""
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from uav_dc_ros.autopilot.dialects import COPTERS, DIALECTS, ON_GROUND, Dialect
+from uav_dc_ros.autopilot.dialects import BATTERY, COPTERS, DIALECTS, ON_GROUND, Dialect
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, LocalFrame, Ned
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
 
@@ -14,6 +15,8 @@ NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a camera, a ground station
 ACCEPTED, IN_PROGRESS = 0, 5  # MAV_RESULT
 WARNING = 4  # MAV_SEVERITY; what is below is worse
 CHUNK = 50  # characters of a STATUSTEXT
+NO_VOLTAGE = 65535
+ADVICE_S = 60.0  # age of a reason not to arm that may still hold; ArduPilot repeats it every 30 s
 TEXT_S = 2.0  # a reason comes within this time before or after the refusal, steady clock
 STALE_S = 3.0  # age after which the last report on an estimate says nothing, steady clock
 REBOOT_S = 1.0  # a vehicle whose time goes back by more has started anew
@@ -26,7 +29,9 @@ RATES_HZ = {
     "SYS_STATUS": 2.0,
     "GPS_GLOBAL_ORIGIN": 1.0,
 }
+ONCE = frozenset({"GPS_GLOBAL_ORIGIN"})  # PX4 sends it when it changes, or is asked for this one
 ESTIMATE_HZ = 5.0
+ADVICE = ("PreArm", "Preflight", "Arm:")
 SEEN = 64  # texts that are kept
 
 
@@ -60,6 +65,8 @@ class Hearing:
         self._custom_mode, self._armed = 0, False
         self._flags, self._health = 0, 0
         self._battery: float | None = None
+        self._battery_v: float | None = None
+        self._battery_fails = False
         self._origin: Geodetic | None = None
         self._ned: Ned | None = None
         self._position: Enu | None = None
@@ -107,9 +114,12 @@ class Hearing:
                 sure and dialect and dialect.estimate_ok(self._flags, self._health, self._armed)
             ),
             battery=self._battery,
+            battery_v=self._battery_v,
+            battery_fails=self._battery_fails,
             vehicle_s=self.vehicle_s,
-            missing=self._missing(),
+            missing=self._missing(now_s),
             refusal=self._refusal(),
+            said="; ".join(self._said(now_s - TEXT_S, now_s)),
         )
 
     def wanted(self) -> Mapping[str, float]:
@@ -134,7 +144,7 @@ class Hearing:
         else:
             self.system, self.dialect, self._stranger = system, dialect, None
 
-    def _missing(self) -> str | None:
+    def _missing(self, now_s: float) -> str | None:
         if self.dialect is None:
             return self._stranger or (
                 "no heartbeat from an autopilot"
@@ -143,6 +153,9 @@ class Hearing:
         lacking = [name for name in self.wanted() if name not in self.heard]
         if lacking:
             return f"the autopilot has not sent {', '.join(lacking)} yet"
+        if not self._armed and not self._flags_ok():
+            told = [text for text in self._said(now_s - ADVICE_S, now_s) if text.startswith(ADVICE)]
+            return f"the autopilot is not ready to arm: {told[-1] if told else 'no position estimate yet'}"
         if self._position is None and self.landed_state == ON_GROUND:
             return "the autopilot has no estimate of its position yet"
         if self._position is None:
@@ -157,6 +170,8 @@ class Hearing:
             self.granted("arming")
 
     def _on_gps_global_origin(self, message: Any, now_s: float) -> None:
+        if abs(message.latitude) > 90e7 or abs(message.longitude) > 180e7:
+            return  # nowhere on the Earth
         self._origin = Geodetic(
             latitude_deg=message.latitude / 1e7,
             longitude_deg=message.longitude / 1e7,
@@ -169,6 +184,8 @@ class Hearing:
     def _on_local_position_ned(self, message: Any, now_s: float) -> None:
         if message.time_boot_ms == self._position_ms:
             return  # the same again
+        if not all(map(math.isfinite, (message.x, message.y, message.z))):
+            return  # no position
         self._position_ms = message.time_boot_ms
         self._ned, self._position_s = Ned(message.x, message.y, message.z), now_s
         self._place()
@@ -179,6 +196,10 @@ class Hearing:
     def _on_sys_status(self, message: Any, now_s: float) -> None:
         self._health = message.onboard_control_sensors_health
         self._battery = message.battery_remaining / 100 if message.battery_remaining >= 0 else None
+        volts = message.voltage_battery / 1e3
+        self._battery_v = volts if 0 < message.voltage_battery < NO_VOLTAGE else None
+        watched = message.onboard_control_sensors_enabled & BATTERY
+        self._battery_fails = bool(watched and not self._health & BATTERY)
 
     def _on_ekf_status_report(self, message: Any, now_s: float) -> None:
         self._flags = message.flags
@@ -219,14 +240,18 @@ class Hearing:
         if vehicle_s < self.vehicle_s - REBOOT_S:
             self._boot_s = self.vehicle_s
             self.heard = {"HEARTBEAT": self.heard["HEARTBEAT"]} if "HEARTBEAT" in self.heard else {}
-            self._position, self._ned, self._origin = None, None, None
+            self._position, self._ned, self._origin, self._position_s = None, None, None, None
             self.landed_state, self._flags = None, 0
             vehicle_s = self._boot_s + boot_s
         self.vehicle_s = max(self.vehicle_s, vehicle_s)
+
+    def _said(self, from_s: float, to_s: float) -> list[str]:
+        """What it warned of between two steady times, each of it once."""
+        return list(dict.fromkeys(text for text_s, text in self.texts if from_s <= text_s <= to_s))
 
     def _refusal(self) -> str | None:
         if not self._refusals:
             return None
         what, (at_s, result) = max(self._refusals.items(), key=lambda refusal: refusal[1][0])
-        said = dict.fromkeys(text for text_s, text in self.texts if abs(text_s - at_s) <= TEXT_S)
+        said = self._said(at_s - TEXT_S, at_s + TEXT_S)
         return f"{what} refused: {'; '.join(said) or result}"

@@ -5,6 +5,7 @@ one is opened. (pymavlink's own wait while they connect anew, and tell of it on 
 """
 
 import contextlib
+import importlib
 import socket
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, Self
@@ -60,6 +61,8 @@ class Address:
         kind, _, rest = text.partition(":")
         place, _, number = rest.rpartition(":")
         kind = "udpin" if kind == "udp" else kind
+        if place.startswith("[") and place.endswith("]"):  # an IPv6 address, as people write it
+            place = place[1:-1]
         if kind not in ("tcp", "udpin", "udpout", "serial") or not place or not number.isascii():
             raise VehicleError(f"connect: {text!r}; expected {EXPECTED}")
         least, most, what = (1, 4_000_000, "baud") if kind == "serial" else (1, 65535, "port")
@@ -82,9 +85,26 @@ class Address:
             if self.kind == "tcp":
                 return _Tcp(self)
             return _Serial(self) if self.kind == "serial" else _Udp(self)
+        except ValueError as error:  # a name that no host and no device can have
+            raise VehicleError(f"connect: {str(self)!r}: {error}; expected {EXPECTED}") from None
         except OSError as error:
             why = error.strerror or str(error)
-            raise LinkDown(f"{self} does not answer: {why}") from None
+            what = "does not answer" if self.kind == "tcp" else "cannot be opened"
+            raise LinkDown(f"{self} {what}: {why}") from None
+
+
+def load_serial(address: Address) -> Any:
+    """pyserial.
+
+    Raises:
+        VehicleError: it is not installed.
+    """
+    try:
+        return importlib.import_module("serial")
+    except ImportError:
+        raise VehicleError(
+            f"{address} needs pyserial; expected it installed: pip install 'uav_dc_ros[mavlink]'"
+        ) from None
 
 
 class _Tcp:
@@ -163,12 +183,7 @@ class _Udp:
 
 class _Serial:
     def __init__(self, address: Address) -> None:
-        try:
-            import serial  # type: ignore[import-untyped, unused-ignore]
-        except ImportError:
-            raise VehicleError(
-                f"{address} needs pyserial; expected it installed: pip install 'uav_dc_ros[mavlink]'"
-            ) from None
+        serial = load_serial(address)
         self.address = address
         self.port = serial.Serial(
             address.place, address.number, timeout=0, write_timeout=0, exclusive=True

@@ -1,6 +1,7 @@
 """MAVLink with an autopilot: hears what it tells, passes wishes on, streams setpoints. It decides nothing.
 
-A thread of its own reads and writes, so that the stream keeps its pace whatever the rest of the process does.
+A thread of its own reads and writes, before all others where the system allows that, so that the stream keeps
+its pace. (Who holds Python's lock holds it up: the rest of the process should run when it is due, too.)
 It is a sign of life of those who decide all the same: heartbeats and setpoints end `LIFE_S` after the last
 call of `steer`, and then the autopilot's own failsafes take over, as they do when the process is gone.
 """
@@ -17,14 +18,15 @@ from collections import deque
 from typing import Any, Self
 
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, Hearing
-from uav_dc_ros.autopilot.links import Address, Link, LinkDown
+from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, ONCE, Hearing
+from uav_dc_ros.autopilot.links import Address, Link, LinkDown, load_serial
+from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 
 SYSTEM, COMPONENT = 255, 191  # as what FS_GCS_ENABLE of ArduPilot looks after; MAV_COMP_ID_ONBOARD_COMPUTER
 ONBOARD_CONTROLLER, NO_AUTOPILOT, ACTIVE = 18, 8, 4  # MAV_TYPE, MAV_AUTOPILOT, MAV_STATE of this end
-SET_MODE, ARM, TAKE_OFF, SET_INTERVAL = 176, 400, 22, 511  # MAV_CMD
+SET_MODE, ARM, TAKE_OFF, SET_INTERVAL, REQUEST = 176, 400, 22, 511, 512  # MAV_CMD
 CUSTOM_MODE = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 LOCAL_NED = 1  # MAV_FRAME; the one that ArduPilot and PX4 both take
 POSITION_ONLY = 0xDF8  # POSITION_TARGET_TYPEMASK: ignore velocity, acceleration, yaw and its rate
@@ -82,6 +84,8 @@ class Mavlink:
             datum = Geodetic.parse(anchor)
         self.address = Address.parse(address)
         self._codec = load_codec()
+        if self.address.kind == "serial":
+            load_serial(self.address)
         self._mav = self._codec.MAVLink(None, SYSTEM, COMPONENT)
         self._mav.robust_parsing = True  # skips bytes that are no message
         self._hearing = Hearing(datum, place, system)
@@ -170,6 +174,7 @@ class Mavlink:
             os.write(self._wake_in, b"\0")
 
     def _run(self) -> None:
+        run_when_due()
         heartbeat_s = stream_s = time.monotonic()
         streamed_vehicle_s, streamed, opened_s = 0.0, None, -math.inf
         heard_s = 0.0
@@ -279,6 +284,8 @@ class Mavlink:
                 self._asked_s[name] = now_s
                 number = getattr(self._codec, f"MAVLINK_MSG_ID_{name}")
                 self._send_command(SET_INTERVAL, float(number), 1e6 / rate_hz)
+                if name in ONCE:
+                    self._send_command(REQUEST, float(number))
 
     def _send_command(self, command: int, *parameters: float) -> None:
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]

@@ -30,9 +30,12 @@ class Telemetry:
         position_s: when that came.
         estimate_ok: does the autopilot trust its position enough to fly by it?
         battery: charge that is left, 0 to 1; None: it does not tell.
+        battery_v: its voltage, volts; None: it does not tell.
+        battery_fails: does the autopilot itself find the battery too low, or broken?
         vehicle_s: the vehicle's own time, seconds: a simulated one may be faster than any clock here.
         missing: what has not come yet, though nobody flies without; None: all of it has.
         refusal: what the vehicle last refused, and why; None: nothing, or it did it after all.
+        said: what it warned of in the last seconds, in its own words; empty: nothing.
     """
 
     heartbeat_s: float | None = None
@@ -44,9 +47,12 @@ class Telemetry:
     position_s: float | None = None
     estimate_ok: bool = False
     battery: float | None = None
+    battery_v: float | None = None
+    battery_fails: bool = False
     vehicle_s: float = 0.0
     missing: str | None = None
     refusal: str | None = None
+    said: str = ""
 
 
 @dataclass(frozen=True)

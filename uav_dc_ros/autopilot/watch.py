@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from uav_dc_ros.autopilot.battery import Battery
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
 
 
@@ -18,12 +19,14 @@ class Settings:
         dwell_s: how long it must be there for a step to be done, vehicle time.
         position_age_s: age of the position after which nobody flies by it.
         link_age_s: age of the last heartbeat after which the link is lost.
-        silent_steps: steps' time without a move after which the policy is given up.
+        silent_steps: steps' time without a move after which the policy is given up, vehicle time.
+        silent_s: but not before this time, steady clock: the policy does not think faster where a simulated
+            vehicle's time does.
         fastest_mps: no vehicle of this kind flies faster; a position that does has jumped.
         jump_m: how far a position may jump, metres, as estimates do now and then.
         hold_s: how long a fault may last before the mission ends, steady or vehicle time.
         lost_s: time without a heartbeat after which nobody waits for the vehicle to land.
-        least_battery: charge at which the mission ends, 0 to 1.
+        least_battery: charge at which the mission ends, 0 to 1; 0: the battery is the autopilot's business.
         then: what ends a mission that cannot go on. Without a position, and where the vehicle refuses to
             return, it is to land.
         flying_at_start: what to do with a vehicle that flies already, in the commanded mode.
@@ -34,10 +37,11 @@ class Settings:
 
     arm: bool = False
     tolerance_m: float = 2.0
-    dwell_s: float = 1.0
+    dwell_s: float = 0.5
     position_age_s: float = 0.5
     link_age_s: float = 3.0
     silent_steps: float = 2.0
+    silent_s: float = 5.0
     fastest_mps: float = 20.0
     jump_m: float = 5.0
     hold_s: float = 5.0
@@ -59,6 +63,7 @@ class Watch:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
+        self._battery = Battery(settings.least_battery)
         self._believed: Telemetry | None = None  # the last one whose position could be true
 
     def link_is_lost(self, now_s: float, known: Telemetry) -> bool:
@@ -78,10 +83,7 @@ class Watch:
 
     def battery_is_low(self, known: Telemetry) -> str | None:
         """What is wrong with its charge; None: nothing, or it does not tell."""
-        least = self.settings.least_battery
-        if known.battery is None or known.battery >= least:
-            return None
-        return f"battery {known.battery:.0%}; expected at least {least:.0%}"
+        return self._battery.low(known) if self.settings.least_battery > 0 else None
 
     def _jumped(self, known: Telemetry) -> str | None:
         """Is the vehicle where it cannot have flown since it was somewhere believable."""

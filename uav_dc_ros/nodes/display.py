@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.messages import Mission, Phase
 from uav_dc_ros.nodes.observer import MissionSoFar, Summary
 
 REFRESH_S = 0.05
@@ -51,6 +52,7 @@ class Display:
             disable=not self.console.is_terminal,
         )
         self._next_s = 0.0  # when the next step is shown
+        self._told: tuple[Phase, str] | None = None  # what the vehicle did last
         self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, told="")
 
     def step(self, now: MissionSoFar) -> None:
@@ -68,6 +70,16 @@ class Display:
             self.console.print(f"{title}: step {now.step}/{self.scenario.mission.max_steps}: {told}")
         else:
             self._bar.update(self._task, description=title, completed=now.step, told=told)
+
+    def vehicle(self, status: Mission) -> None:
+        """Tell what a real vehicle does, unless it is a step's daily work."""
+        told = status.phase, status.reason
+        if told == self._told or not status.reason:
+            return
+        self._told = told
+        daily = status.phase is Phase.MOVING or (status.phase is Phase.READY and "step" in status.reason)
+        if not daily:
+            self.console.print(f"{status.phase}: {status.reason}", markup=False)
 
     def node_line(self, node: str, line: str) -> None:
         """Pass on a line that a node printed."""

@@ -1,11 +1,9 @@
 """One run of run_all: check everything, start the nodes, follow the missions, stop, tell."""
 
 import argparse
-import os
 import signal
 import tempfile
 import time
-from datetime import datetime
 from pathlib import Path
 
 import msgspec
@@ -16,15 +14,17 @@ from uav_dc_ros import cli, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
-from uav_dc_ros.errors import BagError, NodeError, ParameterError
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.errors import BagError, NodeError
+from uav_dc_ros.messages import Mission, Phase
 from uav_dc_ros.nodes import foxglove_server, runtime
+from uav_dc_ros.nodes import options as run_options
 from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.observer import MissionSoFar, Observer, Summary, summary
-from uav_dc_ros.nodes.parameters import ADDRESS
+from uav_dc_ros.nodes.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.supervisor import Supervisor
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.table import rows
+from uav_dc_ros.topics import SIMULATED
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
@@ -43,13 +43,18 @@ class Flight:
         self.scenario = scenarios.load(options.scenario)
         self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
         self.policy.check(self.scenario)
-        pace.check(self.scenario, options.pace, options.missions)
-        self.nodes = _nodes(options)
+        self.is_simulated = options.vehicle == SIMULATED
+        if self.is_simulated:
+            pace.check(self.scenario, options.pace, options.missions)
+        self.rows = rows(() if self.is_simulated else ("bridge",))
+        self.nodes = run_options.nodes(options)
+        self._settings = run_options.settings(options, self.nodes)
+        run_options.check_vehicle(options, self.nodes)
         if options.live is not None:
             foxglove_server.check(address=str(ADDRESS.default), port=options.live)
-        self.bag = _new_bag(options.bag) if "recorder" in self.nodes else None
+        self.bag = run_options.new_bag(options.bag) if "recorder" in self.nodes else None
         if options.summary is not None:
-            _check_writable(options.summary, self.bag)
+            run_options.check_writable(options.summary, self.bag)
         self.display = Display(self.scenario, options.missions)
         if self.policy.scenario.fingerprint != self.scenario.fingerprint:
             self.display.note(
@@ -58,8 +63,9 @@ class Flight:
                 f"{self.scenario.fingerprint})"
             )
         self.summaries: list[Summary] = []
-        self._interrupted = False
+        self._interrupted = self._aborted = False
         self._step_s = 0.0  # when the last step came, monotonic clock
+        self._phase: Phase | None = None  # of the vehicle; none before it was heard
 
     def run(self) -> int:
         """Fly; returns the exit status of the command."""
@@ -72,7 +78,7 @@ class Flight:
             rclpy.init(args=remapped, signal_handler_options=SignalHandlerOptions.NO)
             parameters = self._parameters(Path(journals))
             seed = self.options.seed if "world" in self.nodes else None
-            node = Observer(self.scenario, seed, self._peers(), self._on_step, self._on_end)
+            node = Observer(self.scenario, seed, self._peers(), self._on_status, self._on_step, self._on_end)
             executor = DirectExecutor(node.rest_s)
             executor.add_node(node)
             with Supervisor(node, parameters, self.display.node_line, self.display.note) as supervisor:
@@ -85,7 +91,7 @@ class Flight:
             self._account_for_all(node)
             node.trigger_shutdown()
             rclpy.try_shutdown()
-        status = max(status, self._mend_bag())
+        status = max(status, self._mend_bag(), int(self._aborted))
         self._tell()
         return cli.INTERRUPTED if self._interrupted else status
 
@@ -112,6 +118,8 @@ class Flight:
 
     def _check_patience(self, node: Observer, now_s: float) -> None:
         """Wait for steps that are due, and for nodes that are started here; others may take their time."""
+        if not self.is_simulated and self._phase is not None:
+            return  # the bridge itself sees to it that the mission ends; a pilot may take his time
         patience_s = SILENCE_S + pace.period_s(self.scenario, self.options.pace)
         if now_s - self._step_s <= patience_s:
             return
@@ -153,9 +161,11 @@ class Flight:
 
     def _peers(self) -> list[str]:
         """Nodes that a mission waits for, on whichever host they run."""
-        peers = [row.name for row in NODES.values() if row.needed]
+        peers = [row.name for row in self.rows.values() if row.needed]
         if self.options.no_record:
             peers.remove("recorder")
+        if self.is_simulated:
+            peers.remove("bridge")
         return peers
 
     def _parameters(self, journals: Path) -> dict[str, dict[str, object]]:
@@ -171,20 +181,33 @@ class Flight:
             "missions": options.missions,
             "pace": pace.text(options.pace),
             "bag": str(self.bag),
+            "vehicle": options.vehicle,
+            "connect": options.connect or "",
+            "arm": options.arm,
+            "datum": options.datum or "",
             **({} if options.live is None else {"port": options.live}),
         }
         started = {}
         for name in self.nodes:
+            row = self.rows[name]
             values = given | {"journal": str(journals / name)}
+            if name == "world" and not self.is_simulated:
+                values["vehicle"] = EXTERNAL
             started[name] = {
                 "peers": self._peers(),
-                "use_sim_time": "clock" not in NODES[name].publishes,
-                **{row.name: values[row.name] for row in NODES[name].parameters if row.name in values},
+                # A real vehicle's time is that of this machine: nobody publishes another.
+                "use_sim_time": self.is_simulated and "clock" not in row.publishes,
+                **{one.name: values[one.name] for one in row.parameters if one.name in values},
+                **self._settings.get(name, {}),
             }
         return started
 
     def _interrupt(self, *_: object) -> None:
         self._interrupted = True
+
+    def _on_status(self, status: Mission) -> None:
+        self._phase = status.phase
+        self.display.vehicle(status)
 
     def _on_step(self, mission: MissionSoFar) -> None:
         self._step_s = time.monotonic()
@@ -192,6 +215,7 @@ class Flight:
 
     def _on_end(self, mission: MissionSoFar, outcome: Phase) -> None:
         bag = None if self.bag is None else str(self.bag)
+        self._aborted |= outcome is Phase.ABORTED
         self.summaries.append(summary(mission, outcome, self.scenario, self.policy.name, bag))
 
     def _tell(self) -> None:
@@ -203,59 +227,3 @@ class Flight:
             text = msgspec.json.format(msgspec.json.encode(told), indent=2)
             cli.write_whole(self.options.summary, text + b"\n")
         self.display.summary(self.summaries)
-
-
-def _nodes(options: argparse.Namespace) -> list[str]:
-    """Names of the nodes to start here.
-
-    Raises:
-        ParameterError: a node that does not exist, or contradicts another option.
-    """
-    known = [row.name for row in NODES.values() if row.process]
-    wanted = options.nodes
-    if wanted is None:
-        wanted = [name for name in known if not NODES[name].on_request]
-        if options.no_record:
-            wanted.remove("recorder")
-    for name in wanted:
-        if name not in known:
-            raise ParameterError(f"--nodes: {name!r}; expected some of {', '.join(known)}")
-    if options.live is not None and "live_view" not in wanted:
-        wanted = [*wanted, "live_view"]
-    if "recorder" in wanted and options.no_record:
-        raise ParameterError("--nodes: 'recorder', with --no-record; expected one or the other")
-    if "recorder" not in wanted and options.bag is not None:
-        raise ParameterError(f"--bag {options.bag}: no recorder is started here; expected it among --nodes")
-    return [name for name in known if name in wanted]
-
-
-def _check_writable(summary: Path, bag: Path | None) -> None:
-    folder = summary.absolute().parent
-    taken = summary.is_dir() or summary.absolute() == bag
-    if taken or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise ParameterError(
-            f"--summary {summary}: expected a file in an existing folder that can be written"
-        )
-
-
-def _new_bag(wanted: Path | None) -> Path:
-    """Folder of the new bag: the one wanted, or a dated one.
-
-    Raises:
-        BagError: it exists, or cannot be made.
-    """
-    if wanted is None:
-        dated = Path("bags") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-        wanted = dated
-        again = 2
-        while wanted.exists():
-            wanted, again = dated.with_name(f"{dated.name}_{again}"), again + 1
-    elif wanted.exists():
-        raise BagError(
-            f"--bag {wanted}: it exists already, and no bag is ever overwritten; expected a new folder"
-        )
-    wanted = wanted.absolute()
-    above = next(parent for parent in wanted.parents if parent.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise BagError(f"--bag {wanted}: {above} is not a folder that can be written; expected one")
-    return wanted

@@ -18,7 +18,7 @@ from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes import cdr, diagnostics, qos
 from uav_dc_ros.nodes.diagnostics import Meter
 from uav_dc_ros.nodes.managed_node import ManagedNode
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.table import rows
 from uav_dc_ros.topics import TOPICS, Topic
 
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this node has been started again
@@ -46,8 +46,10 @@ class MissionNode(ManagedNode):
         drains: does the node still handle, when asked to stop, what has arrived by then?
         rest_s: pause after each turn of its executor: see there.
         meter: what it counts for its diagnostics.
+        is_supervised: does run_all look after it?
         restarts: how often it has been started again.
         peers: the other nodes of the mission.
+        rows: the node table, as it is in this mission.
         message_bytes: about how large a message is that it publishes, by topic, where that may be much;
             to be told when it is configured.
         published_ns: when the message that is being handled was published, nanoseconds since the epoch.
@@ -59,6 +61,7 @@ class MissionNode(ManagedNode):
     def __init__(self, name: str, overrides: Sequence[rclpy.Parameter] = ()) -> None:
         super().__init__(name, overrides)
         self.meter = Meter()
+        self.is_supervised = SUPERVISED in os.environ
         self.restarts = int(os.environ.get(SUPERVISED) or 0)
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.message_bytes: dict[str, int] = {}
@@ -66,6 +69,7 @@ class MissionNode(ManagedNode):
         self.publishers_of: dict[str, Publisher] = {}
         self.subscriptions_of: dict[str, Any] = {}
         self.peers = [peer for peer in self.values["peers"] if peer != name]
+        self.rows = rows([name, *self.peers])
         self._timers_active: list[Any] = []
         self._diagnostics_timer: Any = None
         self._told_incompatible: set[tuple[str, str]] = set()
@@ -185,15 +189,25 @@ class MissionNode(ManagedNode):
 
     def _look_for_peers(self) -> None:
         for topic, publisher in self.publishers_of.items():
-            hearing = sum(topic in NODES[peer].subscribes for peer in self.peers)
+            hearing = sum(topic in self.rows[peer].subscribes for peer in self.peers)
             if publisher.get_subscription_count() < hearing:
                 return
         for topic, subscription in self.subscriptions_of.items():
-            saying = sum(topic in NODES[peer].publishes for peer in self.peers)
+            saying = sum(topic in self.rows[peer].publishes for peer in self.peers)
             if subscription.get_publisher_count() < saying:
                 return
         self._peers_timer.cancel()
         self.on_peers()
+
+    def check_peer(self, payload: messages.Ready) -> None:
+        """Refuse what nobody of the table says.
+
+        Raises:
+            MessageError: no node has that name.
+        """
+        if payload.node not in self.rows:
+            known = ", ".join(self.rows)
+            raise MessageError("unknown_node", f"{payload.node!r}; expected some of {known}")
 
     def on_peers(self) -> None:
         """All peers are there."""

@@ -30,6 +30,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
         distance_m: length of the path flown, metres.
         reward: r^t at the end (eq. 7), as `evaluate` and the policies' cards have it.
+        reason: how a real vehicle came to its end, in words; empty in simulation.
         bag: folder of the bag, or null.
     """
 
@@ -44,6 +45,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     sum_rate_bps: float
     distance_m: float
     reward: float
+    reason: str
     bag: str | None
 
 
@@ -58,6 +60,7 @@ class MissionSoFar:
         rates: what was measured last.
         distance_m: length of the path flown, metres.
         over: has it come to its end?
+        reason: what the vehicle said of that.
         sum_of_sum_rates_bps: sum-rates of all measured steps, added up, bit/s.
         unheard_steps: that were flown while nobody measured them.
     """
@@ -70,6 +73,7 @@ class MissionSoFar:
     rates: messages.Rates | None = None
     distance_m: float = 0.0
     over: bool = False
+    reason: str = ""
     sum_of_sum_rates_bps: float = 0.0
     unheard_steps: int = 0
 
@@ -110,6 +114,7 @@ class Observer(MissionNode):
         scenario: the world that is flown.
         seed: seed of the first mission; none: whatever the vehicle says.
         peers: nodes of the mission.
+        on_status: called with each word of the vehicle.
         on_step: called after each step.
         on_end: called when a mission has come to its end, with how.
 
@@ -124,6 +129,7 @@ class Observer(MissionNode):
         scenario: Scenario,
         seed: int | None,
         peers: list[str],
+        on_status: Callable[[messages.Mission], None],
         on_step: Callable[[MissionSoFar], None],
         on_end: Callable[[MissionSoFar, messages.Phase], None],
     ) -> None:
@@ -132,13 +138,13 @@ class Observer(MissionNode):
         self.seed = seed
         self.mission: MissionSoFar | None = None
         self.restarts_of: dict[str, int] = {}
-        self._on_step, self._on_end = on_step, on_end
+        self._on_status, self._on_step, self._on_end = on_status, on_step, on_end
 
     def activate(self) -> None:
         """Follow from here on."""
         self._steps = StepPairs()
         self._position_m: list[float] = []  # before the first step
-        self._ended: dict[int, messages.Phase] = {}  # missions that are over, and how
+        self._ended: dict[int, messages.Mission] = {}  # missions that are over, and how
         self._ended_s = 0.0  # when the last one was
 
     def on_mission(self, payload: messages.Mission) -> None:
@@ -150,10 +156,14 @@ class Observer(MissionNode):
         payloads.check_world(payload, self.scenario)
         if self.seed is not None and payload.seed != self.seed + payload.mission:
             raise NodeError(ANOTHER_MISSION)
+        self._on_status(payload)
         if payload.phase.is_over and payload.mission not in self._ended:
-            self._ended[payload.mission] = payload.phase
+            self._ended[payload.mission] = payload
             self._ended_s = time.monotonic()
         self._hear(payload)
+        now = self.mission
+        if now is not None and (now.mission, now.step) == (payload.mission, payload.step):
+            self.close()  # if this is its end, all of it was heard
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Follow the collection."""
@@ -181,18 +191,23 @@ class Observer(MissionNode):
         self.mission, self._position_m = now, position_m
         now.step, now.cell, now.rates = mission.step, mission.cell, rates
         now.over = mission.phase.is_over
+        now.reason = mission.reason
         self._on_step(now)
         if now.over:
             self._on_end(now, mission.phase)
 
     def close(self, waited_s: float = 0.0) -> None:
         """End the mission that is followed, if it is over since `waited_s`: its last rates may never come."""
+        if self.mission is None and self._ended:  # it ended before its first step
+            mission, end = next(iter(self._ended.items()))
+            self.mission = MissionSoFar(scenario=self.scenario, mission=mission, seed=end.seed)
         now = self.mission
         if now is None or now.over or now.mission not in self._ended:
             return
         if time.monotonic() - self._ended_s >= waited_s:
-            now.over = True
-            self._on_end(now, self._ended[now.mission])
+            end = self._ended[now.mission]
+            now.over, now.reason = True, end.reason
+            self._on_end(now, end.phase)
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """How often nodes were started again."""
@@ -215,5 +230,6 @@ def summary(
         sum_rate_bps=now.sum_of_sum_rates_bps / max(now.step - now.unheard_steps, 1),
         distance_m=now.distance_m,
         reward=now.reward,
+        reason=now.reason,
         bag=bag,
     )

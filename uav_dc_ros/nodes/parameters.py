@@ -7,7 +7,9 @@ from typing import Any
 from uav_dc_ros.bags.part import COMPRESSIONS
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.topics import SIMULATED, VEHICLES
 
+EXTERNAL = "external"  # what the world calls a vehicle that is not its own
 WHOLE_MAX = 2**63 - 1  # of a ROS integer
 SPLIT_MAX_S = 1e9  # thirty years
 PORT_MAX = 65535
@@ -80,10 +82,15 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _compression(text: str) -> str:
-    if text not in COMPRESSIONS:
-        raise ParameterError(f"{text!r}; expected one of {', '.join(COMPRESSIONS)}")
-    return text
+def one_of(*choices: str) -> Callable[[str], str]:
+    """The check of a text that is one of a few."""
+
+    def check(text: str) -> str:
+        if text not in choices:
+            raise ParameterError(f"{text!r}; expected one of {', '.join(choices)}")
+        return text
+
+    return check
 
 
 AUTOSTART = Parameter(
@@ -166,7 +173,7 @@ COMPRESSION = Parameter(
     name="compression",
     default="zstd",
     description=f"how a bag's chunks are compressed: one of {', '.join(COMPRESSIONS)}",
-    parse=_compression,
+    parse=one_of(*COMPRESSIONS),
 )
 MIN_FREE_BYTES = Parameter(
     name="min_free_bytes",
@@ -195,6 +202,18 @@ ADDRESS = Parameter(
     name="address",
     default="127.0.0.1",
     description="network address that the server listens on; 0.0.0.0: all of this machine's",
+)
+VEHICLE_OF_WORLD = Parameter(
+    name="vehicle",
+    default=SIMULATED,
+    description=f"'{SIMULATED}': this node flies it; '{EXTERNAL}': a bridge does, and here are the users",
+    parse=one_of(SIMULATED, EXTERNAL),
+)
+VEHICLE_FLOWN = Parameter(
+    name="vehicle",
+    default=SIMULATED,
+    description=f"what flies: '{SIMULATED}', or the way to a real one: one of {', '.join(VEHICLES)}",
+    parse=one_of(SIMULATED, *VEHICLES),
 )
 BAG_FILES = (RECORDED_TOPICS, SPLIT_BYTES, SPLIT_S, COMPRESSION, MIN_FREE_BYTES)  # of who writes a bag
 EVERY = (AUTOSTART, PEERS)  # that every node has

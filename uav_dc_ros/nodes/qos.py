@@ -2,11 +2,13 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -61,12 +63,13 @@ def offered(topic: Topic, message_bytes: int = 0) -> QoSProfile:
         depth=min(topic.depth, max(fitting, HISTORY_LEAST)),
         reliability=ReliabilityPolicy.RELIABLE if topic.reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
+        **({} if topic.lease_s is None else {"liveliness_lease_duration": Duration(seconds=topic.lease_s)}),
     )
 
 
 def requested(topic: Topic, *, all: bool) -> QoSProfile:
     """The QoS that a subscription asks for; `all` as in the node table's `hears_all`."""
-    profile = offered(topic)
+    profile = offered(replace(topic, lease_s=None))  # who wants a lease is deaf to those without
     profile.depth = NEWEST
     if not topic.asks_reliable:
         profile.reliability = ReliabilityPolicy.BEST_EFFORT

@@ -73,15 +73,19 @@ def give_way() -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def main(make: Callable[[], MissionNode], arguments: list[str] | None = None) -> NoReturn:
+def main(
+    make: Callable[[], MissionNode], arguments: list[str] | None = None, *, gives_way: bool = True
+) -> NoReturn:
     """Run one node until it is asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`.
 
     Args:
         make: makes the node.
         arguments: ROS arguments; those of the command line, unless given.
+        gives_way: see `give_way`.
     """
     fastdds.use_profiles()
-    give_way()
+    if gives_way:
+        give_way()
     status = NOT_BEGUN
     try:
         node = _made(make, arguments)

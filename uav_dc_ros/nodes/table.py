@@ -1,8 +1,9 @@
 """The nodes, one row each: the only list. Topics are those of `topics.TOPICS`. Knows no ROS."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 
+from uav_dc_ros.nodes import bridge_parameters
 from uav_dc_ros.nodes import parameters as p
 from uav_dc_ros.topics import TOPICS
 
@@ -21,7 +22,7 @@ class NodeRow:
             first word and the last, and the world starts the mission.
         restarts: how often a node that died is started again within `supervisor.RESTART_WINDOW_S`; once more
             ends the mission, or, if the node is not needed for it, the restarts.
-        needed: can no mission be flown without it?
+        needed: can no mission be flown without it? A bridge, not without one where the vehicle is a real one.
         on_request: is it started only when it is asked for?
         again: parameters with which it is restarted, beside those that it had.
     """
@@ -46,8 +47,20 @@ NODES: dict[str, NodeRow] = {
             name="world",
             publishes=("pose", "users", "mission", "target", "diagnostics", "clock"),
             subscribes=("move", "ready"),
-            parameters=(p.SCENARIO, p.SEED, p.MISSIONS, p.PACE, p.JOURNAL),
+            parameters=(p.SCENARIO, p.VEHICLE_OF_WORLD, p.SEED, p.MISSIONS, p.PACE, p.JOURNAL),
             rank=2,
+        ),
+        NodeRow(
+            name="bridge",
+            publishes=("pose", "mission", "target", "diagnostics"),
+            subscribes=("move", "ready"),
+            parameters=(
+                *(bridge_parameters.VEHICLE, bridge_parameters.CONNECT, bridge_parameters.DATUM),
+                *(p.SCENARIO, p.SEED, p.JOURNAL, bridge_parameters.FENCE_MARGIN_M),
+                *bridge_parameters.SETTINGS,
+            ),
+            rank=2,
+            on_request=True,
         ),
         NodeRow(
             name="channel_monitor",
@@ -67,6 +80,7 @@ NODES: dict[str, NodeRow] = {
             subscribes=tuple(topic.name for topic in TOPICS.values() if topic.recorded),
             parameters=(
                 *(p.BAG, p.RESUME, p.SCENARIO, p.POLICY_IF_KNOWN, p.SEED, p.MISSIONS, p.PACE),
+                p.VEHICLE_FLOWN,
                 *p.BAG_FILES,
             ),
             hears_all=True,
@@ -110,3 +124,13 @@ NODES: dict[str, NodeRow] = {
         ),
     )
 }
+
+# Around a real vehicle the world has the users only.
+WORLD_AROUND = replace(
+    NODES["world"], publishes=("users", "ready", "diagnostics"), subscribes=("mission", "pose")
+)
+
+
+def rows(nodes: Collection[str]) -> Mapping[str, NodeRow]:
+    """The rows as they are in a mission of these nodes: a bridge brings a vehicle of its own."""
+    return {**NODES, "world": WORLD_AROUND} if "bridge" in nodes else NODES

@@ -1,5 +1,7 @@
 """The world: the vehicle in simulation, and the users who walk about.
 
+Around a vehicle from outside (`vehicle:=external`) it is the users only: see `surroundings`.
+
 The vehicle says in `mission` which step it is ready for, and flies the `move` that comes for it. In
 lockstep the next step starts when the move has come; at a pace, a step lasts its seconds divided by
 the pace, and no move in time means hover.
@@ -20,14 +22,16 @@ import numpy as np
 from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
-from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import cdr, convert, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.parameters import EXTERNAL
+from uav_dc_ros.nodes.surroundings import Surroundings
+from uav_dc_ros.nodes.table import WORLD_AROUND
 
 STALL_S = 1.0  # a lockstep that stands still for so long repeats its last messages
 CLOCK_PERIOD_S = 0.05
@@ -53,7 +57,12 @@ class World(MissionNode):
         """Load the world, and see whether it can be flown at this pace."""
         self.scenario = scenarios.load(self.values["scenario"])
         self.pace: float | None = self.values["pace"]
-        pace.check(self.scenario, self.pace, self.values["missions"])
+        self.surroundings: Surroundings | None = None
+        if self.values["vehicle"] == EXTERNAL:
+            self.row = WORLD_AROUND
+            self.surroundings = Surroundings(self.scenario, self.values["seed"])
+        else:
+            pace.check(self.scenario, self.pace, self.values["missions"])
         self.message_bytes = {"users": USER_BYTES * self.scenario.n_users}
         self.journal = Journal(self.values["journal"])
 
@@ -69,7 +78,8 @@ class World(MissionNode):
         self._hovered = 0  # steps without a move in time
         self._overruns, self._overruns_told = 0, 0
         self._lateness_s: deque[float] = deque(maxlen=1000)
-        self._restore()
+        if self.surroundings is None:
+            self._restore()
 
     def deactivate(self) -> None:
         """Say that a mission was stopped before its end, and what happened for want of a move."""
@@ -84,18 +94,19 @@ class World(MissionNode):
 
     def on_ready(self, payload: messages.Ready) -> None:
         """Note that a peer is ready; one that came back is told where the mission stands."""
-        if payload.node not in NODES:
-            raise MessageError("unknown_node", f"{payload.node!r}; expected some of {', '.join(NODES)}")
+        self.check_peer(payload)
         self._ready_peers.add(payload.node)
         if not self._flying:
             self._start_if_all_ready()
-        elif payload.node in self.peers and NODES[payload.node].needed:
+        elif payload.node in self.peers and self.rows[payload.node].needed:
             self._tell()
 
     def on_peers(self) -> None:
         """Note that all peers have been found."""
+        super().on_peers()
         self._peers_seen = True
-        self._start_if_all_ready()
+        if self.surroundings is None:
+            self._start_if_all_ready()
 
     def _start_if_all_ready(self) -> None:
         if self._flying or not self._peers_seen or not self._ready_peers.issuperset(self.peers):
@@ -130,15 +141,10 @@ class World(MissionNode):
     def _place(self, mission: int) -> None:
         """Put the vehicle and the users where a mission starts."""
         self._mission, self._step = mission, 0
-        self._rng = np.random.default_rng(self.values["seed"] + mission)
-        self._users_m = core.place_users(self.scenario, self._draw())
+        self._crowd = Crowd(self.scenario, self.values["seed"] + mission)
         self._cell = np.asarray(self.scenario.start_cell)
         self._phase = Phase.READY
         self._action = None
-
-    def _draw(self) -> Array:
-        """Random numbers in the order of the environment: one for the start, one for each step."""
-        return self._rng.random((self.scenario.n_users, 2))
 
     def _restore(self) -> None:
         """Fly again, silently, what the journal of a killed world holds.
@@ -209,25 +215,43 @@ class World(MissionNode):
     def _move(self, action: Action) -> None:
         """One step of the world."""
         self._cell = self.scenario.grid.move(self._cell, np.asarray(int(action)))
-        self._users_m = core.walk_users(self.scenario, self._users_m, self._draw())
+        self._crowd.walk()
         self._step += 1
         self._action = None
         terminated, truncated, landed = core.ends(self.scenario, np.asarray(self._step), self._cell)
         if terminated or truncated:
             self._phase = Phase.LANDED if landed else Phase.TIMEOUT
 
+    # Around a vehicle from outside.
+
+    def on_mission(self, payload: messages.Mission) -> None:
+        """Note where the vehicle's mission stands."""
+        assert self.surroundings is not None, "otherwise it is this node that says it"
+        self.surroundings.hear(payload)
+
+    def on_pose(self, pose: cdr.Pose) -> None:
+        """Publish the users of a step that the vehicle has come to."""
+        assert self.surroundings is not None, "otherwise it is this node that says it"
+        if (users := self.surroundings.users(pose.stamp_ns)) is not None:
+            self.say("users", users)
+
     # What the others hear.
 
     def _tell(self) -> None:
         """Publish the state of this step. What the move waits for comes first."""
-        position_m = self.scenario.grid.centre_m(self._cell, like=self._users_m)
+        users_m = self._crowd.positions_m
+        position_m = self.scenario.grid.centre_m(self._cell, like=users_m)
         time_ns = self._time_ns()
         pose = cdr.pose(position_m, time_ns)
         self.publish("pose", pose)
         self.say(
             "users",
             payloads.users(
-                self.scenario, self._users_m, mission=self._mission, step=self._step, time_ns=time_ns
+                self.scenario,
+                self._crowd.positions_m,
+                mission=self._mission,
+                step=self._step,
+                time_ns=time_ns,
             ),
         )
         self.say("mission", self._status())
@@ -263,6 +287,9 @@ class World(MissionNode):
         """Where the mission stands, and whether its steps keep their time."""
         if self.state != "active":
             return [], {}
+        if self.surroundings is not None:
+            status = self.surroundings.status
+            return [], {"vehicle": f"{status.phase}, step {status.step}" if status else "not heard yet"}
         late, self._overruns_told = self._overruns > self._overruns_told, self._overruns
         values = {
             "mission": str(self._mission),

@@ -1,0 +1,71 @@
+"""When a battery is low: what is counted, what its voltage says, what the autopilot finds."""
+
+import pytest
+
+from uav_dc_ros.autopilot.battery import Battery
+from uav_dc_ros.autopilot.vehicle import Telemetry
+
+LEAST = 0.2
+REST_V = 12.6
+
+
+def told(
+    charge: float | None, volts: float | None, at_s: float = 100.0, armed: bool = True, fails: bool = False
+) -> Telemetry:
+    return Telemetry(
+        battery=charge, battery_v=volts, battery_fails=fails, armed=armed, vehicle_s=at_s, on_ground=not armed
+    )
+
+
+def in_the_air() -> Battery:
+    """A battery that was seen at rest, full."""
+    battery = Battery(LEAST)
+    assert battery.low(told(1.0, REST_V, 0.0, armed=False)) is None
+    return battery
+
+
+def test_a_charge_under_the_least_is_low() -> None:
+    battery = in_the_air()
+    assert battery.low(told(0.2, 10.6, 100.0)) is None
+    assert battery.low(told(0.19, 10.6, 200.0)) == "battery 19% at 10.6 V; expected at least 20%"
+
+
+def test_one_that_is_counted_empty_at_the_voltage_of_a_full_one_is_not() -> None:
+    """As ArduCopter's simulator tells it: 29 A of 3.3 Ah for 18 minutes, 12.3 V all the time."""
+    battery = in_the_air()
+    for at_s in range(1, 1080):
+        assert battery.low(told(max(0.0, 1 - at_s * 29.3 / 3600 / 3.3), 12.3, float(at_s))) is None
+
+
+@pytest.mark.parametrize("cells", [3, 4, 6, 12])
+def test_a_real_one_that_is_nearly_empty_is_found_at_any_number_of_cells(cells: int) -> None:
+    battery = Battery(LEAST)
+    battery.low(told(1.0, 4.15 * cells, 0.0, armed=False))
+    for at_s in range(1, 600):  # from 4.0 V to 3.55 V a cell, under load
+        share = at_s / 600
+        low = battery.low(told(1.0 - share, (4.0 - 0.45 * share) * cells, float(at_s)))
+        assert (low is None) == (1.0 - share >= LEAST), at_s
+
+
+def test_a_dip_of_the_voltage_is_not_the_end() -> None:
+    battery = in_the_air()
+    for tenth in range(600):
+        volts = 10.9 if 300 <= tenth < 305 else 12.3
+        assert battery.low(told(0.1, volts, 1.0 + tenth / 10)) is None
+
+
+def test_nobody_knows_better_who_never_saw_it_at_rest() -> None:
+    assert Battery(LEAST).low(told(0.1, 12.3)) == "battery 10% at 12.3 V; expected at least 20%"
+
+
+def test_nobody_takes_off_with_one_that_is_counted_empty() -> None:
+    assert "battery 10%" in str(in_the_air().low(told(0.1, REST_V, armed=False)))
+
+
+def test_the_autopilot_is_believed_where_it_counts_nothing_or_agrees() -> None:
+    battery = in_the_air()
+    assert battery.low(told(None, 12.3)) is None
+    assert battery.low(told(None, 12.3, fails=True)) == "the autopilot finds its battery low"
+    assert "battery 10%" in str(battery.low(told(0.1, 12.3, fails=True)))
+    assert battery.low(told(0.5, 12.3, fails=True)) is None, "its own failsafe's business"
+    assert "battery 10%" in str(Battery(LEAST).low(told(0.1, None)))

@@ -1,0 +1,318 @@
+"""The bridge's node: missions through real nodes over real DDS, beside a fake autopilot on real MAVLink.
+
+The aircraft is what cannot exist here: see tests/autopilot/autopilot.py for what its stand-in imitates.
+"""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from tests.autopilot.flight import Fake, fake
+from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.small_worlds import config
+from uav_dc_ros import scenarios
+from uav_dc_ros.agents import network
+from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core.crowd import Crowd
+from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.env.registration import ENV_ID
+
+FIVE = scenarios.load("five_clusters")
+STEPS = 7  # of the low world's missions
+
+LOW = """
+name = "low"
+[grid]
+n_x = 8
+n_y = 2
+n_z = 1
+cell_m = 20.0
+altitude_min_m = 10.0
+altitude_step_m = 10.0
+[users]
+cluster_centres_m = [[60.0, 10.0]]
+users_per_cluster = 4
+cluster_radius_m = 10.0
+v_max_mps = 1.0
+[mission]
+start_m = [0.0, 0.0, 10.0]
+dock_m = [140.0, 0.0]
+step_s = 10.0
+max_steps = 7
+d_cons_m = 50.0
+r_min_bits = 1e7
+episode_end = "on_arrival"
+[radio]
+bandwidth_hz = 1e6
+tx_power_w = 5.0
+noise_power_dbm = -110.0
+ref_gain_db = -50.0
+path_loss_exponent = 2.0
+interference = "all"
+[reward]
+beta = 1.0
+zeta = 1.0
+r_plus = "binary"
+form = "episode"
+data_scale_bits = 1e7
+"""
+
+
+@pytest.fixture
+def low(tmp_path: Path) -> tuple[object, ...]:
+    """Options for a low world, where a flight takes a minute, and a policy that goes east to its dock."""
+    path = tmp_path / "low.toml"
+    path.write_text(LOW)
+    scenario: Scenario = scenarios.load(path)
+    made = config(scenario, name="eastward")
+    parameters = network.initial(made.architecture(scenario), np.random.default_rng(1))
+    zeros = {name: np.zeros_like(array) for name, array in parameters.items()}
+    zeros["advantage.bias"][int(Action.RIGHT)] = 1.0
+    policies.save(tmp_path / "eastward", made, zeros, lambda _: "# test\n")
+    return "--scenario", path, "--policy", tmp_path / "eastward"
+
+
+def beside(autopilot: Fake, *options: object) -> tuple[object, ...]:
+    return "--vehicle", "mavlink", "--connect", autopilot.address, *options
+
+
+def statuses(bag: Path) -> list[dict[str, Any]]:
+    """What the vehicle said, in order."""
+    return [payload for topic, payload in read_bag(bag) if topic == "/mission"]
+
+
+def check_steps(bag: Path, steps: int = STEPS) -> None:
+    """Each step was flown once, and ended one cell further."""
+    told = statuses(bag)
+    moving = [status["step"] for status in told if status["phase"] == "moving"]
+    begun = [step for step, _ in itertools.groupby(moving)]
+    assert begun == list(range(steps)), begun
+    cells = {status["step"]: status["cell"] for status in told}
+    assert cells == {step: [step, 0, 0] for step in range(steps + 1)}
+
+
+def killed(ros: Ros, node: str) -> float:
+    """Kill a node; when."""
+    (process,) = [pid for pid, command in ros.processes().items() if f"uav_dc_ros.nodes.{node} " in command]
+    os.kill(process, signal.SIGKILL)
+    return time.monotonic()
+
+
+def until(condition: Callable[[], Any], process: subprocess.Popen[str], seconds: float = 40.0) -> None:
+    end_s = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end_s
+        time.sleep(0.002)
+
+
+def flies_east(autopilot: Fake, step: int) -> bool:
+    """Has it been sent to the cell of a step."""
+    return any(told["ned"][1] == pytest.approx(20.0 * step, abs=0.2) for told in autopilot.all("setpoint"))
+
+
+# Whole missions.
+
+
+def simulated_cells(seed: int) -> list[list[int]]:
+    """The cells of the same mission in the environment."""
+    policy = policies.load("five_clusters_dueling")
+    env = gymnasium.make(ENV_ID, scenario=FIVE).unwrapped
+    _, info = env.reset(seed=seed)
+    cells, over = [info["cell"].tolist()], False
+    while not over:
+        seen = {name: info[name] for name in ("cell", "step", "data_bits", "collected")}
+        _, _, terminated, truncated, info = env.step(policy.act(policy.observe(FIVE, **seen)))
+        over = terminated or truncated
+        cells.append(info["cell"].tolist())
+    return cells
+
+
+@pytest.mark.parametrize(("kind", "wire"), [("ardupilot", "tcp"), ("px4", "udp")])
+def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
+    """It takes off, flies the cells of the simulation with that seed among the same users, and lands."""
+    with fake(kind, wire, speed=100.0) as autopilot:
+        summary = ros.folder / "summary.json"
+        status, output = ros.run_all(
+            *beside(autopilot, "--arm", "--seed", 3, "--bag", "bag", "--summary", summary)
+        )
+        report = autopilot.report()
+    assert status == 0, output
+    assert "Traceback" not in output
+    told = json.loads(summary.read_text())
+    assert (told["outcome"], told["steps"], told["seed"]) == ("landed", FIVE.mission.max_steps, 3)
+    assert told["reason"].startswith("step 60: at the dock")
+    assert not report["armed"]
+    dock = np.subtract(FIVE.mission.dock_m, FIVE.mission.start_m[:2])
+    assert report["ned"][:2] == pytest.approx([dock[1], dock[0]], abs=2.0)  # north, east
+    bag = read_bag(ros.folder / "bag")
+    ready = {p["step"]: p["cell"] for t, p in bag if t == "/mission" and p["phase"] in ("ready", "landed")}
+    assert [ready[step] for step in range(61)] == simulated_cells(3)
+    phases = [phase for phase, _ in itertools.groupby(p["phase"] for t, p in bag if t == "/mission")]
+    assert phases[:5] == ["idle", "connecting", "preflight", "takeoff", "ready"]
+    assert phases[5:-2] == ["moving", "ready"] * 59 + ["moving"]
+    assert phases[-2:] == ["landing", "landed"]
+    assert all(p["reason"] for t, p in bag if t == "/mission")
+    crowd = Crowd(FIVE, 3)
+    users = {p["step"]: p for t, p in bag if t == "/users"}
+    assert users.keys() == set(range(61))
+    for step in range(61):
+        crowd.walk(step - crowd.step)
+        assert np.array_equal(np.asarray([users[step]["x_m"], users[step]["y_m"]]).T, crowd.positions_m)
+    rates = [p for t, p in bag if t == "/rates"]
+    assert sorted({p["step"] for p in rates}) == list(range(61))
+    assert sum(rates[-1]["collected"]) == told["users_collected"] >= 40
+    last = [m for t, m in bag if t == "/diagnostics" for s in m.status if s.name == "bridge"][-1].status
+    values = {pair.key: pair.value for status in last if status.name == "bridge" for pair in status.values}
+    assert values["phase"] == "landed" or values["phase"] == "landing"
+    assert values["reason"].startswith("step 60")
+
+
+def test_a_pilot_arms_where_the_bridge_may_not(ros: Ros, low: tuple[object, ...]) -> None:
+    with fake("ardupilot", speed=8.0) as autopilot:
+        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--bag", "bag"))
+        assert process.stdout is not None
+        shown = wait_for(process.stdout, "waiting for a pilot")
+        time.sleep(1.0)
+        assert not [told for told in autopilot.all("command") if told["command"] in (176, 400, 22)]
+        autopilot.do("mode", "GUIDED")
+        autopilot.do("arm")
+        status, output = finish(process)
+    assert status == 0, shown + output
+    check_steps(ros.folder / "bag")
+
+
+# What dies.
+
+
+def test_a_killed_policy_makes_the_vehicle_hold(ros: Ros, low: tuple[object, ...]) -> None:
+    """Within half a second, in the middle of a move, where it is; the policy comes back, and it goes on."""
+    with fake("ardupilot", speed=4.0) as autopilot:
+        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
+        until(lambda: flies_east(autopilot, 3), process)
+        before = len(autopilot.all("setpoint"))
+        killed_s = killed(ros, "policy")
+        until(lambda: len(autopilot.all("setpoint")) > before, process)
+        assert time.monotonic() - killed_s < 0.5
+        east_m = autopilot.all("setpoint")[before]["ned"][1]
+        assert 40.0 - 2.0 <= east_m < 58.0, "where it was then"
+        status, output = finish(process)
+        assert status == 0, output
+        check_steps(ros.folder / "bag")
+        reasons = [status["reason"] for status in statuses(ros.folder / "bag")]
+        assert "holds: the policy is gone" in reasons
+        assert "goes on after: holds: the policy is gone" in reasons
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", pytest.param("px4", marks=pytest.mark.long)])
+def test_a_killed_bridge_takes_the_mission_up_again(ros: Ros, low: tuple[object, ...], kind: str) -> None:
+    """ArduCopter hovers meanwhile; PX4 misses the stream, and returns: then the mission is over."""
+    with fake(kind, speed=4.0) as autopilot:
+        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
+        until(lambda: flies_east(autopilot, 3), process)
+        killed(ros, "bridge")
+        status, output = finish(process)
+        arms = [told for told in autopilot.all("command") if told["command"] == 400]
+        assert len(arms) == 1, "never armed a second time"
+        assert not autopilot.report()["armed"]
+    assert "it is started again (1 of 3" in output
+    if kind == "ardupilot":
+        assert status == 0, output
+        check_steps(ros.folder / "bag")
+        assert statuses(ros.folder / "bag")[-1]["phase"] == "landed"
+    else:
+        assert status == 1, output
+        last = statuses(ros.folder / "bag")[-1]
+        assert last["phase"] == "aborted"
+        assert "AUTO.RTL" in last["reason"]
+
+
+@pytest.mark.long
+def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object, ...]) -> None:
+    with fake("ardupilot", speed=4.0) as autopilot:
+        options = beside(autopilot, "--arm", "--bag", "bag", "--set", "bridge.flying_at_start=land")
+        process = ros.start("uav_dc_ros.run_all", *low, *options, "--set", "bridge.then=land")
+        until(lambda: flies_east(autopilot, 3), process)
+        killed(ros, "bridge")
+        status, output = finish(process)
+        down = autopilot.report()["ned"]
+    assert status == 1, output
+    last = statuses(ros.folder / "bag")[-1]
+    assert (last["phase"], last["reason"]) == ("aborted", "it flew already when the bridge came")
+    assert 20.0 < down[1] < 80.0, "not at home"
+
+
+@pytest.mark.parametrize(
+    ("number", "wanted"), [(signal.SIGINT, 130), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.long)]
+)
+def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
+    ros: Ros, low: tuple[object, ...], number: signal.Signals, wanted: int
+) -> None:
+    with fake("ardupilot", speed=4.0) as autopilot:
+        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
+        until(lambda: flies_east(autopilot, 2), process)
+        process.send_signal(number)
+        status, output = finish(process)
+        assert status == wanted, output
+        end_s = time.monotonic() + 20.0
+        while (report := autopilot.report())["armed"]:
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
+        assert report["ned"][:2] == pytest.approx([0.0, 0.0], abs=1.0)
+        assert report["mode"] == "RTL"
+        if number == signal.SIGINT:
+            assert "aborted" in output
+            assert statuses(ros.folder / "bag")[-1]["reason"] == "the bridge was stopped"
+        assert ros.gone()
+
+
+@pytest.mark.long
+def test_a_pilot_who_takes_over_keeps_the_vehicle(ros: Ros, low: tuple[object, ...]) -> None:
+    with fake("ardupilot", speed=4.0) as autopilot:
+        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
+        until(lambda: flies_east(autopilot, 2), process)
+        autopilot.do("mode", "LOITER")
+        asked = len(autopilot.all("command"))
+        status, output = finish(process)
+        assert status == 1, output
+        assert len(autopilot.all("command")) == asked, "nothing more is asked of it"
+        report = autopilot.report()
+        assert (report["mode"], report["armed"]) == ("LOITER", True)
+    last = statuses(ros.folder / "bag")[-1]
+    assert last["phase"] == "aborted"
+    assert "LOITER" in last["reason"]
+
+
+@pytest.mark.long
+def test_the_stream_keeps_its_pace_while_policies_load_and_die(ros: Ros, low: tuple[object, ...]) -> None:
+    """20 Hz, measured where it arrives; 99 of 100 setpoints within 10 ms of their time."""
+    with fake("ardupilot", "udp", speed=1.0, ready_s=1.0) as autopilot:
+        given = (*low, *beside(autopilot, "--arm", "--no-record"))
+        process = ros.start("uav_dc_ros.run_all", *given)
+        until(lambda: flies_east(autopilot, 1), process)
+        autopilot.do("times")
+        for _ in range(3):
+            killed(ros, "policy")
+            time.sleep(4.0)  # it is found dead, started again, loads, and decides
+        times = autopilot.report()["times"]
+        process.send_signal(signal.SIGINT)
+        finish(process)
+    beats = [times[0]]
+    for time_s in times:
+        if time_s - beats[-1] > 0.04:  # another goal goes out at once, between the beats
+            beats.append(time_s)
+    gaps_ms = np.diff(beats) * 1e3
+    assert len(gaps_ms) > 200
+    off_ms = np.percentile(np.abs(gaps_ms - 50.0), 99)
+    assert off_ms < 10.0, np.sort(gaps_ms)[-5:]

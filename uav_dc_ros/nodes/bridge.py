@@ -1,0 +1,251 @@
+"""The vehicle beside an autopilot: tells the mission's steps, flies the moves that come, and keeps it safe.
+
+What it decides is in `uav_dc_ros.autopilot`; how it reaches the vehicle, in `vehicles`. It is a process of
+its own: a policy that loads, hangs or dies disturbs no setpoint. A bridge that was killed finds in its
+journal where the mission stood, and takes it up in the air; it never arms a second time.
+"""
+
+import dataclasses
+import time
+
+import msgspec
+import numpy as np
+
+from uav_dc_ros import messages, scenarios
+from uav_dc_ros.autopilot.bridge import Bridge, Standing
+from uav_dc_ros.autopilot.fence import Fence
+from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Vehicle
+from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.core.grid import Action
+from uav_dc_ros.errors import MessageError, NodeError
+from uav_dc_ros.messages import Phase
+from uav_dc_ros.nodes import cdr, runtime, vehicles
+from uav_dc_ros.nodes.journal import Journal
+from uav_dc_ros.nodes.lease import Lease
+from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
+from uav_dc_ros.topics import TOPICS
+
+TICK_S = 0.05  # vehicle time
+TICK_LEAST_S = 0.005  # steady time: a simulated vehicle may be faster than anybody can look
+SPEED_OVER_S = 0.5  # steady time over which the speed of the vehicle's time is measured
+OBEYS_S = 2.5  # for a vehicle to obey a bridge that stops
+
+
+class Kept(msgspec.Struct, frozen=True, kw_only=True):
+    """The journal's line: which mission it is, where it stands, and where the grid lies."""
+
+    fingerprint: str
+    seed: int
+    standing: Standing
+    anchor: str
+
+
+class AutopilotBridge(MissionNode):
+    """Flies one mission of one vehicle."""
+
+    def __init__(self) -> None:
+        super().__init__("bridge")
+
+    def configure(self) -> None:
+        """Load the world, and what is left of a mission whose bridge was killed."""
+        values = self.values
+        self.scenario = scenarios.load(values["scenario"])
+        names = [field.name for field in dataclasses.fields(Settings)]
+        settings = {name: values[name] for name in names}
+        self.settings = Settings(**settings | {"then": Mode(values["then"])})
+        self.journal = Journal(values["journal"])
+        kept = self._restore()
+        self.taken_up = kept is not None and kept.standing.flies
+        fence = Fence.around(self.scenario, values["fence_margin_m"])
+        self.bridge = Bridge(
+            self.scenario,
+            self.settings,
+            self._on_change,
+            standing=kept.standing if kept else None,
+            fence=fence,
+        )
+        self.vehicle: Vehicle = vehicles.make(self, values, self.scenario, kept.anchor if kept else "")
+
+    def activate(self) -> None:
+        """Reach for the vehicle; the mission begins when the peers are ready, or goes on at once."""
+        self._ready_peers: set[str] = set()
+        self._peers_seen = False
+        self._begun = False
+        self._known = Telemetry()
+        self._told: messages.Mission | None = None
+        self._position_s: float | None = None  # of the pose published last
+        self._last_stamp_ns = 0
+        self._setpoint: Enu | None = None  # published last as `target`
+        self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
+        self._policy = Lease(self, TOPICS["move"])
+        self.vehicle.open()
+        self._timer = self.timer(TICK_S, self._tick)
+        if self.taken_up:
+            self.get_logger().warning(f"takes up a mission at step {self.bridge.step}")
+            self._begun = True
+        else:
+            self._tell()
+
+    def deactivate(self) -> None:
+        """Bring a vehicle that flies down, and let go of it once it obeys."""
+        bridge = self.bridge
+        if self._begun and not bridge.is_over:
+            bridge.stop("the bridge was stopped")
+            deadline_s = time.monotonic() + OBEYS_S
+            while not (bridge.is_done_with(self._known)) and time.monotonic() < deadline_s:
+                self._tick()
+                time.sleep(TICK_LEAST_S)
+        self.vehicle.close()
+        self.journal.close()
+        self._policy.close()
+
+    # Before the start.
+
+    def on_ready(self, payload: messages.Ready) -> None:
+        """Note that a peer is ready."""
+        self.check_peer(payload)
+        self._ready_peers.add(payload.node)
+
+    def on_peers(self) -> None:
+        """Note that all peers have been found."""
+        self._peers_seen = True
+
+    def _begin_if_all_ready(self) -> None:
+        if not self._peers_seen or not self._ready_peers.issuperset(self.peers):
+            return
+        if self.count_publishers("mission") > 1:
+            raise NodeError(ANOTHER_MISSION)
+        self._begun = True
+
+    def _restore(self) -> Kept | None:
+        """What the journal tells of a mission.
+
+        Raises:
+            NodeError: it is that of another flight.
+        """
+        lines = self.journal.lines()
+        if not lines:
+            return None
+        try:
+            kept = msgspec.json.decode(lines[-1], type=Kept)
+        except msgspec.DecodeError as error:
+            raise NodeError(f"journal {self.values['journal']}: not a bridge's: {error}") from None
+        if (kept.fingerprint, kept.seed) != (self.scenario.fingerprint, self.values["seed"]):
+            raise NodeError(
+                f"journal {self.values['journal']}: of another flight (seed {kept.seed}, scenario "
+                f"{kept.fingerprint}); expected seed {self.values['seed']}, scenario "
+                f"{self.scenario.fingerprint}, or a new file"
+            )
+        return kept
+
+    # Flying.
+
+    def on_move(self, payload: messages.Move) -> None:
+        """Fly a move."""
+        self._policy.hear()
+        if payload.mission != 0:
+            raise MessageError("wrong_step", f"a move for mission {payload.mission}; expected mission 0")
+        if (why := self.bridge.move(payload.step, Action[payload.action.upper()])) is not None:
+            raise MessageError("not_now", why)
+
+    def _tick(self) -> None:
+        self._known = known = self.vehicle.telemetry()
+        self._keep_pace(known)
+        self._publish_pose(known)
+        if not self._begun:
+            self._begin_if_all_ready()
+        if self._begun:
+            self.bridge.policy_is_gone = self._policy.is_gone()
+            for wish in self.bridge.tick(time.monotonic(), known):
+                self.vehicle.ask(wish)
+        self.vehicle.steer(self.bridge.setpoint)
+        self._publish_target()
+
+    def _keep_pace(self, known: Telemetry) -> None:
+        """Look as often as the vehicle's own time asks for."""
+        now_s = time.monotonic()
+        if self._pace_since is None or known.vehicle_s < self._pace_since[1]:
+            self._pace_since = now_s, known.vehicle_s
+        since_s, vehicle_since_s = self._pace_since
+        if now_s - since_s < SPEED_OVER_S:
+            return
+        speed = (known.vehicle_s - vehicle_since_s) / (now_s - since_s)
+        self._pace_since = now_s, known.vehicle_s
+        period_s = min(TICK_S, max(TICK_LEAST_S, TICK_S / speed)) if speed > 0 else TICK_S
+        if abs(period_s * 1e9 - self._timer.timer_period_ns) > 0.2 * self._timer.timer_period_ns:
+            self._timer.timer_period_ns = round(period_s * 1e9)
+
+    def _publish_pose(self, known: Telemetry) -> None:
+        if known.position is None or known.position_s is None or known.position_s == self._position_s:
+            return
+        self._position_s = known.position_s
+        age_ns = round((time.monotonic() - known.position_s) * 1e9)
+        now_ns: int = self.get_clock().now().nanoseconds
+        stamp_ns = max(now_ns - age_ns, self._last_stamp_ns + 1)
+        self._last_stamp_ns = stamp_ns
+        self.publish("pose", cdr.pose(np.asarray(known.position), stamp_ns))
+
+    def _publish_target(self) -> None:
+        setpoint = self.bridge.setpoint
+        if setpoint is not None and setpoint != self._setpoint:
+            now_ns: int = self.get_clock().now().nanoseconds
+            self.publish("target", cdr.pose(np.asarray(setpoint), now_ns))
+        self._setpoint = setpoint
+
+    def _on_change(self) -> None:
+        """Keep where the mission stands, and say it: what others know is never forgotten."""
+        kept = Kept(
+            fingerprint=self.scenario.fingerprint,
+            seed=self.values["seed"],
+            standing=self.bridge.standing,
+            anchor=self.vehicle.anchor,
+        )
+        self.journal.begin(msgspec.json.encode(kept))
+        self._tell()
+
+    def _tell(self) -> None:
+        bridge = self.bridge
+        waits = "" if self._begun else f"waits for {', '.join(self.peers)}"
+        status = messages.Mission(
+            mission=0,
+            step=bridge.step,
+            phase=bridge.phase,
+            reason=messages.told(waits or bridge.reason),
+            cell=bridge.cell,
+            remaining_steps=self.scenario.mission.max_steps - bridge.step,
+            seed=self.values["seed"],
+            scenario=self.scenario.name,
+            fingerprint=self.scenario.fingerprint,
+        )
+        if status != self._told:
+            self._told = status
+            self.say("mission", status)
+            if not self.is_supervised and bridge.phase not in (Phase.READY, Phase.MOVING):
+                self.get_logger().info(f"{status.phase}: {status.reason}")
+
+    def diagnose(self) -> tuple[list[str], dict[str, str]]:
+        """Where the mission and the vehicle stand."""
+        if self.state != "active":
+            return [], {}
+        bridge, known, now_s = self.bridge, self._known, time.monotonic()
+        aborted = bridge.phase is Phase.ABORTED
+        warnings = [bridge.reason] if aborted or bridge.fault else []
+        values = {
+            "phase": bridge.phase.value,
+            "reason": bridge.reason,
+            "step": str(bridge.step),
+            "autopilot": self.vehicle.kind or "not heard yet",
+            "mode": known.mode_name,
+            "armed": str(known.armed).lower(),
+            "estimate": "good" if known.estimate_ok else "not good",
+            "battery": "" if known.battery is None else f"{known.battery:.0%}",
+            "grid anchor": self.vehicle.anchor,
+        }
+        for name, at_s in (("position", known.position_s), ("heartbeat", known.heartbeat_s)):
+            values[f"{name} age [s]"] = "" if at_s is None else f"{now_s - at_s:.2f}"
+        return warnings, values
+
+
+if __name__ == "__main__":
+    runtime.main(AutopilotBridge, gives_way=False)  # the vehicle does not wait

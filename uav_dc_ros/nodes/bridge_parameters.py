@@ -1,0 +1,74 @@
+"""The bridge's ROS parameters: the way to the vehicle, and how carefully it is flown. Knows no ROS."""
+
+from uav_dc_ros.autopilot.fence import MARGIN_M
+from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.nodes.parameters import Parameter, one_of
+from uav_dc_ros.topics import VEHICLES
+
+VEHICLE = Parameter(
+    name="vehicle",
+    default="mavlink",
+    description=f"the way to the autopilot: one of {', '.join(VEHICLES)}",
+    parse=one_of(*VEHICLES),
+)
+CONNECT = Parameter(
+    name="connect",
+    default="",
+    description="where a vehicle on MAVLink is found, such as tcp:127.0.0.1:5760, udp:0.0.0.0:14550 or "
+    "serial:/dev/ttyAMA0:921600",
+)
+DATUM = Parameter(
+    name="datum",
+    default="",
+    description="latitude, longitude (degrees) and altitude (metres) of the grid's corner, with a comma "
+    "between; empty: the vehicle stands where the scenario starts when its first good position comes",
+)
+FENCE_MARGIN_M = Parameter(
+    name="fence_margin_m",
+    default=MARGIN_M,
+    least=1.0,
+    most=1000.0,
+    unit="m",
+    description="how far the fence lies around the grid, and above its highest altitude",
+)
+
+
+def _setting(name: str, description: str, unit: str = "", least: float = 0.0, most: float = 0.0) -> Parameter:
+    """A parameter that is a field of `autopilot.watch.Settings`, and has its default."""
+    default = getattr(Settings, name)
+    if isinstance(default, bool):
+        return Parameter(name=name, default=default, description=description)
+    return Parameter(name=name, default=default, least=least, most=most, unit=unit, description=description)
+
+
+SETTINGS = (
+    _setting("arm", "may the bridge set the mode, and arm? false: it waits for a pilot to do so"),
+    _setting("tolerance_m", "distance within which the vehicle is at a cell's centre", "m", 0.1, 50.0),
+    _setting("dwell_s", "how long it must be there for a step to be done, vehicle time", "s", 0.0, 60.0),
+    _setting("position_age_s", "age of the position after which nobody flies by it", "s", 0.1, 10.0),
+    _setting("link_age_s", "age of the last heartbeat after which the link is lost", "s", 1.5, 60.0),
+    _setting("silent_steps", "steps' time without a move after which the policy is given up", "", 0.1, 100.0),
+    _setting("silent_s", "but not before this time by the clock", "s", 0.0, 600.0),
+    _setting("fastest_mps", "no vehicle of this kind flies faster: what does, has jumped", "m/s", 1.0, 100.0),
+    _setting("jump_m", "how far a position may jump, as estimates do now and then", "m", 0.1, 100.0),
+    _setting("hold_s", "how long a fault may last before the mission ends", "s", 0.1, 600.0),
+    _setting("lost_s", "time without a heartbeat after which nobody waits for the landing", "s", 1.0, 3600.0),
+    _setting("least_battery", "charge at which the mission ends, 0 to 1", "", 0.0, 1.0),
+    Parameter(
+        name="then",
+        default=str(Settings.then),
+        description="what ends a mission that cannot go on: return or land",
+        parse=one_of("return", "land"),
+    ),
+    Parameter(
+        name="flying_at_start",
+        default=Settings.flying_at_start,
+        description="what to do with a vehicle that flies already, in the commanded mode: resume or land",
+        parse=one_of("resume", "land"),
+    ),
+    _setting("retry_s", "pause before the autopilot is asked again, vehicle time", "s", 0.5, 60.0),
+    _setting("returning_tries", "how often it is asked to return before it is asked to land", "", 1, 100),
+    _setting(
+        "takeoff_s", "longest time for take-off and the way to the start, vehicle time", "s", 5.0, 3600.0
+    ),
+)

@@ -1,0 +1,125 @@
+"""Options of run_all that are looked at together, or need this machine: checked before anything starts."""
+
+import argparse
+import os
+from datetime import datetime
+from pathlib import Path
+
+import msgspec
+
+from uav_dc_ros.errors import BagError, ParameterError
+from uav_dc_ros.nodes import vehicles
+from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.topics import SIMULATED, VEHICLES
+
+
+def nodes(options: argparse.Namespace) -> list[str]:
+    """Names of the nodes to start here.
+
+    Raises:
+        ParameterError: a node that does not exist, or contradicts another option.
+    """
+    known = [row.name for row in NODES.values() if row.process]
+    wanted = options.nodes
+    if wanted is None:
+        wanted = [name for name in known if not NODES[name].on_request]
+        if options.vehicle != SIMULATED:
+            wanted.append("bridge")
+        if options.no_record:
+            wanted.remove("recorder")
+    for name in wanted:
+        if name not in known:
+            raise ParameterError(f"--nodes: {name!r}; expected some of {', '.join(known)}")
+    if "bridge" in wanted and options.vehicle == SIMULATED:
+        raise ParameterError(f"--nodes: 'bridge'; expected it with --vehicle {', '.join(VEHICLES)} only")
+    if options.live is not None and "live_view" not in wanted:
+        wanted = [*wanted, "live_view"]
+    if "recorder" in wanted and options.no_record:
+        raise ParameterError("--nodes: 'recorder', with --no-record; expected one or the other")
+    if "recorder" not in wanted and options.bag is not None:
+        raise ParameterError(f"--bag {options.bag}: no recorder is started here; expected it among --nodes")
+    return [name for name in known if name in wanted]
+
+
+def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[str, object]]:
+    """Values of `--set`, checked, by node and parameter.
+
+    Raises:
+        ParameterError: a node that is not started here, or a parameter or value that cannot be.
+    """
+    given: dict[str, dict[str, object]] = {}
+    for node, name, text in options.settings:
+        told = f"--set {node}.{name}={text}"
+        if node not in nodes:
+            raise ParameterError(f"{told}: expected a node that is started here: {', '.join(nodes)}")
+        row = next((row for row in NODES[node].parameters if row.name == name), None)
+        if row is None:
+            known = ", ".join(row.name for row in NODES[node].parameters)
+            raise ParameterError(f"{told}: node {node} has no such parameter; expected some of {known}")
+        try:
+            value = text if isinstance(row.default, str) else msgspec.json.decode(text)
+        except msgspec.DecodeError:
+            value = text
+        try:
+            row.value(value)
+        except ParameterError as error:
+            raise ParameterError(f"--set {node}.{error}") from None
+        given.setdefault(node, {})[name] = value
+    return given
+
+
+def check_vehicle(options: argparse.Namespace, nodes: list[str]) -> None:
+    """Refuse options that do not go together, and a way to the vehicle that this machine does not have.
+
+    Raises:
+        UavDcError: what was wrong.
+    """
+    simulated = options.vehicle == SIMULATED
+    for name, value in (("connect", options.connect), ("arm", options.arm), ("datum", options.datum)):
+        if value and simulated:
+            raise ParameterError(f"--{name}: expected --vehicle {', '.join(VEHICLES)} with it")
+        if value and "bridge" not in nodes:
+            raise ParameterError(f"--{name}: expected the node 'bridge' among --nodes")
+    if simulated:
+        return
+    if options.missions != 1:
+        raise ParameterError(f"--missions {options.missions}: expected 1 with --vehicle {options.vehicle}")
+    if "bridge" in nodes:
+        vehicles.check(options.vehicle, options.connect or "", options.datum or "")
+
+
+def check_writable(summary: Path, bag: Path | None) -> None:
+    """Refuse a file for the summary that could not be written.
+
+    Raises:
+        ParameterError: why.
+    """
+    folder = summary.absolute().parent
+    taken = summary.is_dir() or summary.absolute() == bag
+    if taken or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise ParameterError(
+            f"--summary {summary}: expected a file in an existing folder that can be written"
+        )
+
+
+def new_bag(wanted: Path | None) -> Path:
+    """Folder of the new bag: the one wanted, or a dated one.
+
+    Raises:
+        BagError: it exists, or cannot be made.
+    """
+    if wanted is None:
+        dated = Path("bags") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+        wanted = dated
+        again = 2
+        while wanted.exists():
+            wanted, again = dated.with_name(f"{dated.name}_{again}"), again + 1
+    elif wanted.exists():
+        raise BagError(
+            f"--bag {wanted}: it exists already, and no bag is ever overwritten; expected a new folder"
+        )
+    wanted = wanted.absolute()
+    above = next(parent for parent in wanted.parents if parent.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise BagError(f"--bag {wanted}: {above} is not a folder that can be written; expected one")
+    return wanted

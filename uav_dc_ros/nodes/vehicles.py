@@ -1,0 +1,54 @@
+"""The ways to a real vehicle, by the name that the parameter `vehicle` has for them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rclpy.node import Node
+
+from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.links import Address
+from uav_dc_ros.autopilot.mavlink import Mavlink, load_codec
+from uav_dc_ros.autopilot.vehicle import Vehicle
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import ParameterError
+
+
+def make(node: Node, values: Mapping[str, Any], scenario: Scenario, anchor: str) -> Vehicle:
+    """The vehicle that a bridge's parameters name; not opened yet.
+
+    Args:
+        node: of the bridge, for ways that are made of topics.
+        values: its parameters.
+        scenario: whose start the vehicle stands under, unless there is a datum.
+        anchor: of the same vehicle before the bridge was started again; empty: there was none.
+
+    Raises:
+        VehicleError: there is no such way on this machine.
+        ParameterError: parameters that do not go together.
+    """
+    east_m, north_m, _ = scenario.mission.start_m
+    place = Enu(east_m, north_m, 0.0)
+    datum = Geodetic.parse(values["datum"]) if values["datum"] else None
+    kind, connect = values["vehicle"], values["connect"]
+    check(kind, connect, values["datum"])
+    if kind == "mavlink":
+        return Mavlink(connect, datum=datum, place=place, anchor=anchor)
+    raise ParameterError(f"vehicle: {kind!r}; not there yet")
+
+
+def check(kind: str, connect: str, datum: str) -> None:
+    """Refuse a way that this machine does not have, or an address or datum that is none.
+
+    Raises:
+        VehicleError: what was wrong.
+        ParameterError: an address where none belongs, or none where one is needed.
+    """
+    if datum:
+        Geodetic.parse(datum)
+    if kind != "mavlink" and connect:
+        raise ParameterError(f"connect: {connect!r}; expected none with a vehicle on {kind}")
+    if kind == "mavlink":
+        if not connect:
+            raise ParameterError("connect: none given; expected where the vehicle is: tcp:127.0.0.1:5760")
+        Address.parse(connect)
+        load_codec()
