@@ -20,6 +20,7 @@ from uav_dc_ros.autopilot.vehicle import Mode
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagMessage
 from uav_dc_ros.core import world
+from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
@@ -78,8 +79,7 @@ class Flight:
         self._last: messages.Mission | None = None
         self._users_due = False
         self._users_of = -1  # step
-        self._rng = np.random.default_rng(seed)
-        self._users_m = world.place_users(scenario, self._draw())
+        self._crowd = Crowd(scenario, seed)
         self._rates: messages.Rates | None = None
         self._data_bits = np.zeros(scenario.n_users)
         self._collected = np.zeros(scenario.n_users, dtype=bool)
@@ -105,9 +105,6 @@ class Flight:
 
     def _bridge(self, **standing: object) -> Bridge:
         return Bridge(self.scenario, self.settings, self._tell, **standing)  # type: ignore[arg-type]
-
-    def _draw(self) -> np.ndarray:
-        return self._rng.random((self.scenario.n_users, 2))
 
     def _tick(self) -> None:
         self._beat(self)
@@ -158,14 +155,13 @@ class Flight:
             return
         self._users_due = False
         step = self._last.step
-        while self._users_of < step:
-            self._users_of += 1
-            if self._users_of:
-                self._users_m = world.walk_users(self.scenario, self._users_m, self._draw())
+        self._users_of = step
+        self._crowd.walk(step - self._crowd.step)
+        users_m = self._crowd.positions_m
         at = {"mission": 0, "step": step}
-        self._say("users", payloads.users(self.scenario, self._users_m, time_ns=stamp_ns, **at))
+        self._say("users", payloads.users(self.scenario, users_m, time_ns=stamp_ns, **at))
         if self._rates is None or self._rates.step != step:
-            link = world.measure(self.scenario, swayed, self._users_m, self._collected)
+            link = world.measure(self.scenario, swayed, users_m, self._collected)
             if step:
                 self._data_bits, self._collected = world.collect(
                     self.scenario, link, self._data_bits, self._collected
@@ -294,7 +290,9 @@ def bag(folder: Path, scenario: Scenario, fault: str = "none", **how: object) ->
 
 def flown_about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, str]:
     """What the recorder writes about it."""
-    return about(scenario, seed, vehicle="mavlink", missions="1", **{"pace": "1.0"} | values)
+    told = about(scenario, seed, vehicle="mavlink", missions="1", **values)
+    del told["pace"]  # a real vehicle has its own
+    return told
 
 
 def phases(told: list[BagMessage]) -> list[tuple[int, Phase, str]]:

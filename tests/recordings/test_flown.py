@@ -8,6 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from tests.autopilot.flight import fake
+from tests.conftest import Ros, finish
+from tests.nodes.test_bridge import flies_east, killed, low, until  # noqa: F401
 from tests.recordings import flown, report_bags
 from tests.recordings.made import changing, copy, flight, said, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, read
@@ -267,6 +270,32 @@ def test_a_bag_of_another_recorder_is_known_by_what_the_vehicle_tells(bags, caps
     bag = write(tmp_path / "simulated", flight(TINY), about)
     with BagReader(bag) as reader:
         assert vehicle(reader, "") == "simulated"
+
+
+@pytest.mark.long
+def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, capsys):  # noqa: F811
+    """Through real DDS and real MAVLink, beside a fake autopilot: both policy and bridge die on the way."""
+    bag = ros.folder / "bag"
+    with fake("ardupilot", speed=4.0) as autopilot:
+        options = ("--vehicle", "mavlink", "--connect", autopilot.address, "--arm", "--bag", bag)
+        process = ros.start("uav_dc_ros.run_all", *low, *options)
+        for step, node in ((2, "policy"), (5, "bridge")):
+            until(lambda step=step: flies_east(autopilot, step), process)
+            killed(ros, node)
+        status, output = finish(process)
+    assert status == 0, output
+    status, out = run(capsys, "verify", bag, "--policy-dir", low[-1], "--complete")
+    assert status == 0, out
+    assert out.endswith("\nverified\n")
+    assert "phases of 8 of 8 steps looked at, each follows as it may; 7 moves were begun" in out
+    told = [one for step in steps_of(bag)[0] for one in step.told]
+    assert "holds: the policy is gone" in {one.reason for one in told}
+    assert sum(one.phase is Phase.TAKEOFF for one in told) == 2
+    status, out = run(capsys, "info", bag)
+    assert "bridge 1, policy 1" in out
+    assert "mission 0: landed: step 7: at the dock" in out
+    journey = page_of(capsys, bag, ros.folder)["mission-0"]["journey"]
+    assert max(journey["way"]["z"]) == pytest.approx(10.0, abs=2.0)
 
 
 # Info, export.

@@ -27,7 +27,8 @@ from uav_dc_ros.recordings.rows import Mission
 from uav_dc_ros.recordings.steps import Steps
 from uav_dc_ros.recordings.tables import Format, Table
 from uav_dc_ros.recordings.transitions import Transition, Transitions
-from uav_dc_ros.recordings.vehicles import SIMULATED, vehicle
+from uav_dc_ros.recordings.vehicles import vehicle
+from uav_dc_ros.topics import SIMULATED
 
 ALL = tuple(rows.tables(real=True))
 EPILOG = f"""\

@@ -18,6 +18,7 @@ from uav_dc_ros import messages, payloads
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
@@ -160,7 +161,8 @@ class World(Book):
         self._scenario, self._seeded, self._real = scenario, seeded, real
         self._lockstep = lockstep or real
         self._before: RecordedStep | None = None
-        self._walk: tuple[int, int, np.random.Generator, Array] | None = None  # seed, step, users
+        self._crowd: Crowd | None = None
+        self._crowd_of = -1  # seed
 
     def add(self, step: RecordedStep) -> None:
         """Recompute a step's status, and in simulation its pose and users."""
@@ -256,15 +258,10 @@ class World(Book):
 
     def _users_m(self, seed: int, step: int) -> Array:
         """Users of the mission with a seed after some steps, metres, `[U, 2]`."""
-        shape = (self._scenario.n_users, 2)
-        if self._walk is None or self._walk[0] != seed or self._walk[1] > step:
-            rng = np.random.default_rng(seed)
-            self._walk = seed, 0, rng, world.place_users(self._scenario, rng.random(shape))
-        seed, now, rng, users_m = self._walk
-        for _ in range(step - now):
-            users_m = world.walk_users(self._scenario, users_m, rng.random(shape))
-        self._walk = seed, step, rng, users_m
-        return users_m
+        if self._crowd is None or self._crowd_of != seed or self._crowd.step > step:
+            self._crowd, self._crowd_of = Crowd(self._scenario, seed), seed
+        self._crowd.walk(step - self._crowd.step)
+        return self._crowd.positions_m
 
 
 class Decisions(Book):

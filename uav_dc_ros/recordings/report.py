@@ -17,7 +17,8 @@ from uav_dc_ros.recordings.pages.page import Page
 from uav_dc_ros.recordings.pages.vehicle import Way, way
 from uav_dc_ros.recordings.pages.world import world
 from uav_dc_ros.recordings.step import RecordedStep
-from uav_dc_ros.recordings.vehicles import SIMULATED, vehicle
+from uav_dc_ros.recordings.vehicles import vehicle
+from uav_dc_ros.topics import SIMULATED
 
 SUMMARIES_MAX = 2_000  # rows in the list of missions
 SYSTEM_ROOM = 150_000  # bytes kept for it, for latencies, nodes and faults

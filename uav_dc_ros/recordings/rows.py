@@ -13,7 +13,7 @@ from uav_dc_ros.errors import BagError, MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings.step import BEFORE_START, RecordedStep
 from uav_dc_ros.recordings.tables import Columns
-from uav_dc_ros.recordings.vehicles import SIMULATED
+from uav_dc_ros.topics import SIMULATED
 
 _WHICH: Columns = {"flight": "int", "mission": "int", "step": "int"}
 # Of each table its columns. What is recorded per step holds at its end; `action` is decided there.

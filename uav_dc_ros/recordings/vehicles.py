@@ -4,8 +4,8 @@ from uav_dc_ros import messages, payloads
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
+from uav_dc_ros.topics import SIMULATED
 
-SIMULATED = "simulated"
 EXTERNAL = "external"  # a real one, of which is not known how it was reached
 
 

@@ -23,7 +23,8 @@ from uav_dc_ros.recordings.flights import Flights
 from uav_dc_ros.recordings.recompute import Channel, Decisions, World
 from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.steps import Steps
-from uav_dc_ros.recordings.vehicles import SIMULATED, is_real, vehicle
+from uav_dc_ros.recordings.vehicles import is_real, vehicle
+from uav_dc_ros.topics import SIMULATED
 
 NEEDED = ("pose", "users", "rates", "mission")  # topics without which nothing can be recomputed
 SHOWN = 5  # decisions of another policy that are shown with their Q-values
