@@ -84,9 +84,11 @@ class Flight:
         self._data_bits = np.zeros(scenario.n_users)
         self._collected = np.zeros(scenario.n_users, dtype=bool)
 
-    def fly(self) -> list[BagMessage]:
-        """Fly until it is over."""
+    def fly(self, cut_s: float = np.inf) -> list[BagMessage]:
+        """Fly until it is over, or the recorder is stopped."""
         while self.bridge is None or not self.bridge.is_over:
+            if self.vehicle.now_s > cut_s:
+                return self.told
             assert self.vehicle.now_s < LIMIT_S, self._last
             self._tick()
         self._tick()
@@ -280,6 +282,22 @@ FAULTS: dict[str, tuple[Callable[[Flight], None], Phase]] = {  # what happens, a
     "battery": (once(in_phase(Phase.MOVING, 3, 3.0), setting(battery=0.18)), Phase.ABORTED),
     "ground": (disarmed_on_ground, Phase.ABORTED),
 }
+
+
+def at_random(seed: int) -> Callable[[Flight], None]:
+    """One to three faults, each at any moment of a flight, the bridge's death among them."""
+    rng = np.random.default_rng(seed)
+    faults = (
+        Flight.kill_bridge,
+        setting(frozen=True), setting(frozen=False), setting(silent=True), setting(silent=False),
+        setting(estimate_ok=False), setting(estimate_ok=True), setting(battery=0.1),
+        setting(mode=Mode.OTHER), setting(armed=False), setting(offset=(300.0, 0.0, 0.0)),
+    )  # fmt: skip
+    beats = []
+    for _ in range(int(rng.integers(1, 4))):
+        when_s, fault = float(rng.random() * 150.0), faults[int(rng.integers(len(faults)))]
+        beats.append(once(lambda flight, when_s=when_s: flight.vehicle.now_s >= when_s, fault))  # type: ignore[misc]
+    return all_of(*beats)
 
 
 def bag(folder: Path, scenario: Scenario, fault: str = "none", **how: object) -> Path:

@@ -12,6 +12,7 @@ follows goes on from what was recorded. A number may differ by `tolerance`, rela
 
 from typing import Any, TypeAlias
 
+import msgspec
 import numpy as np
 
 from uav_dc_ros import messages, payloads
@@ -305,7 +306,12 @@ class Decisions(Book):
 
 
 def _first_unlike(one: messages.Stepped, other: messages.Stepped) -> tuple[str, Any, Any]:
-    """Name of the first field in which two payloads differ, and both values."""
+    """Name of the first field in which two payloads differ, and both values.
+
+    A vehicle may tell a step in many phases: what it says of the step itself is what does not change.
+    """
+    if isinstance(one, messages.Mission) and isinstance(other, messages.Mission):
+        other = msgspec.structs.replace(other, phase=one.phase, reason=one.reason)
     for name in one.__struct_fields__:
         a, b = getattr(one, name), getattr(other, name)
         if a != b:
