@@ -19,7 +19,7 @@ from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
 from uav_dc_ros.nodes import cdr, drawing
 from uav_dc_ros.nodes.drawing import Scene, UserState
-from uav_dc_ros.nodes.track import Track
+from uav_dc_ros.nodes.track import POSES_MAX, Track
 
 SCENARIO = scenarios.load("five_clusters")
 U = SCENARIO.n_users
@@ -303,3 +303,57 @@ def test_who_joins_after_the_end_sees_where_it_ended() -> None:
         for call in flight.step(0, step, heard=("target", "users")):
             call()
     assert flight.steps == [(0.0, 0.0), (0.0, 1.0), (0.0, 2.0)]
+
+
+def real_poses(seconds: float, mps: float, *, from_s: float = 0.0) -> Any:
+    """Twenty poses a second, straight to the east."""
+    for i in range(round(seconds * 20)):
+        at_s = from_s + i / 20
+        yield cdr.Pose(cdr.pose(np.array([i / 20 * mps, 0.0, 100.0]), round(at_s * 1e9)))
+
+
+def test_the_way_of_a_real_vehicle_is_thinned() -> None:
+    """A pose each five metres, or two seconds; and the newest one is known to the last."""
+    track = Track(SCENARIO)
+    poses = list(real_poses(60.0, 10.0))
+    for i, pose in enumerate(poses):
+        track.pose(pose, i)
+    east_m = [pose.position_m[0] for pose in track.poses]
+    assert np.diff(east_m) == pytest.approx(5.0, abs=0.51)
+    assert (track.version, track.newest) == (len(east_m), poses[-1])
+    version = track.version
+    standing = [cdr.Pose(cdr.pose(np.array([600.0, 0.0, 100.0]), round(t * 1e9))) for t in (60.0, 60.5, 61.0)]
+    for i, pose in enumerate(standing):
+        track.pose(pose, 10_000 + i)
+    assert (track.version, track.newest) == (version + 1, standing[-1]), "the path need not be drawn again"
+
+
+def test_a_way_of_any_length_stays_small() -> None:
+    """Ten hours of poses: from its beginning to its end, at most so many."""
+    track = Track(SCENARIO)
+    most = 0
+    for i in range(36_000 * 2):
+        place_m = np.array([i * 5.0, 0.0, 100.0])
+        track.pose(cdr.Pose(cdr.pose(place_m, i * 5 * 10**8)), i)
+        most = max(most, len(track._poses))
+    assert 500 < len(track.poses) <= most <= POSES_MAX
+    assert track.poses[0].stamp_ns == 0
+    apart_ns = np.diff([pose.stamp_ns for pose in track.poses])
+    assert apart_ns.max() <= 36_000 * 1e9 / len(track.poses) * 4, "no part of it is lost"
+
+
+@pytest.mark.parametrize(
+    ("phase", "reason", "expected"),
+    [
+        (Phase.READY, "", "step 12 of 60"),
+        (Phase.READY, "step 12: there", "step 12 of 60"),
+        (Phase.READY, "holds: no heartbeat for 3 s", "step 12 of 60: ready\nholds: no heartbeat for 3 s"),
+        (Phase.MOVING, "up to cell (3, 4, 1)", "step 12 of 60: moving\nup to cell (3, 4, 1)"),
+        (Phase.ABORTED, "", "step 12 of 60: aborted"),
+        (Phase.LANDING, "a " * 99, "step 12 of 60: landing" + 3 * ("\n" + " ".join("a" * 20))),
+    ],
+)
+def test_the_text_tells_what_a_real_vehicle_does_and_why(phase: Phase, reason: str, expected: str) -> None:
+    mission = msgspec.structs.replace(MISSION, phase=phase, reason=reason)
+    text = drawing.status_text(SCENARIO, scene(mission=mission))
+    assert text == f"{expected}\n2 of 50 users collected\n1.23 Mbit/s"

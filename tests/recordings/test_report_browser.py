@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
-from tests.recordings import report_bags
+from tests.recordings import flown, report_bags
 from tests.recordings.test_report import HOSTILE, report
 from tests.small_worlds import tiny
+from uav_dc_ros import messages, payloads
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 if CHROMIUM is None:
@@ -240,6 +242,47 @@ def test_without_webgl_there_is_a_map(chromium, mission_page):
         assert opened.page.evaluate(UAV)[:2] == wanted["uav_m"][:2]
     opened.check()
     bare.close()
+
+
+def test_the_flight_of_a_real_vehicle(chromium, tmp_path):
+    """Its reason is told, its phases are listed, and its way is drawn as far as the slider stands."""
+    scenario = tiny()
+    flight = flown.Flight(scenario, beat=flown.FAULTS["battery"][0])
+    said = [payloads.text_in_cdr(m.data) for m in flight.fly() if m.topic == "/mission"]
+    words = [messages.decode(text, messages.Mission) for text in said]
+    told = [said_with(m, words[-1], HOSTILE) for m in flight.told]
+    bag = flown.write(tmp_path / "bag", told, flown.flown_about(scenario))
+    assert report(bag, "--out", tmp_path / "page.html") == 0
+    journey = report_bags.unpacked(tmp_path / "page.html")["mission-0"]["journey"]
+    bare = chromium.launch(executable_path=CHROMIUM, args=["--disable-3d-apis", *ROOT])  # draws quickly
+    opened = Opened(bare, tmp_path / "page.html", DESKTOP)
+    page = opened.page
+    assert page.locator("#why").inner_text() == f"aborted: {HOSTILE}"
+    rows = page.get_by_role("region", name="Phases").locator("tbody tr")
+    assert rows.count() == len(journey["words"]) == len(words)
+    drawn = "() => document.getElementById('altitude').data.find((trace) => trace.name === 'flown').y"
+    assert page.evaluate(drawn) == journey["way"]["z"]
+    flown_x = "() => document.getElementById('scene').data.find((trace) => trace.name === 'flown').x"
+    assert page.evaluate(flown_x) == journey["way"]["x"]
+    page.get_by_label("Step", exact=True).focus()
+    page.keyboard.press("Home")
+    way, began_s = journey["way"], journey["cells"]["s"][0]
+    climb = [x for x, s in zip(way["x"], way["s"], strict=True) if s <= began_s]
+    assert page.evaluate(flown_x) == climb
+    assert 0 < len(climb) < len(journey["way"]["x"])
+    page.set_viewport_size(PHONE)
+    page.wait_for_function("() => document.querySelector('#altitude .main-svg').clientWidth < 360")
+    check_on_a_phone(page)
+    opened.check()
+    bare.close()
+
+
+def said_with(message: Any, last: messages.Mission, reason: str) -> Any:
+    """The message, with another reason if it is the last word."""
+    if message.data != payloads.cdr_of_text(messages.encode(last)):
+        return message
+    other = msgspec.structs.replace(last, reason=reason)
+    return message._replace(data=payloads.cdr_of_text(messages.encode(other)))
 
 
 def test_a_comparison_is_drawn_and_fits_a_phone_too(browser, comparison_page):

@@ -109,7 +109,7 @@ class Bridge:
         over = self.phase is Phase.LANDING or self.is_over
         return Standing(
             step=self.step + (self.phase is Phase.MOVING),
-            cell=self.goal,
+            cell=self.cell if over else self.goal,  # a move that was broken off did not reach its goal
             flies=True,
             outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
             reason=self.reason if over else "",

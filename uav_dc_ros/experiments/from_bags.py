@@ -10,7 +10,8 @@ from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.recordings import steps
-from uav_dc_ros.recordings.steps import RecordedStep, Steps
+from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.steps import Steps
 from uav_dc_ros.recordings.transitions import Transitions
 
 if TYPE_CHECKING:

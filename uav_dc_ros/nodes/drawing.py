@@ -1,5 +1,6 @@
 """What RViz and Foxglove show of a mission: a MarkerArray, made of the core's values."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -10,9 +11,10 @@ from visualization_msgs.msg import Marker
 from uav_dc_ros.core import radio
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.messages import Mission
+from uav_dc_ros.messages import Mission, Phase
 from uav_dc_ros.nodes.cdr import Writer
 from uav_dc_ros.nodes.convert import FRAME
+from uav_dc_ros.recordings.step import HOLDS
 
 Rgba = tuple[float, float, float, float]
 Xyz = tuple[float, float, float]
@@ -25,6 +27,7 @@ UAV_CELLS = 0.3
 DOCK_CELLS = 0.5
 TEXT_CELLS = 0.32  # height of a capital
 TEXT_ABOVE_CELLS = 0.9
+REASON_WIDTH, REASON_LINES = 40, 3  # of letters: a text in space that is longer hides what it is about
 THIN_CELLS = 0.01  # of what lies on the ground, layer upon layer, so that no two surfaces coincide
 
 
@@ -108,11 +111,16 @@ def user_states(served: Array, collected: Array) -> Array:
 
 
 def status_text(scenario: Scenario, scene: Scene) -> str:
-    """Step, users collected and sum-rate, a line each."""
+    """Step, users collected and sum-rate, a line each; of a real vehicle what it does, and why."""
     lines = []
     if scene.mission is not None:
-        over = f": {scene.mission.phase}" if scene.mission.phase.is_over else ""
-        lines.append(f"step {scene.mission.step} of {scenario.mission.max_steps}{over}")
+        phase, reason = scene.mission.phase, scene.mission.reason
+        waits = phase is Phase.READY and not reason.startswith(HOLDS)
+        lines.append(
+            f"step {scene.mission.step} of {scenario.mission.max_steps}{'' if waits else f': {phase}'}"
+        )
+        if reason and not waits:
+            lines += textwrap.wrap(reason, REASON_WIDTH)[:REASON_LINES]
     if scene.sum_rate_bps is not None:
         lines.append(f"{int(np.sum(scene.collected))} of {scenario.n_users} users collected")
         lines.append(f"{scene.sum_rate_bps / 1e6:.2f} Mbit/s")

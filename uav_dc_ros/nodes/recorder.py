@@ -15,7 +15,7 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.messages import PAYLOADS
 from uav_dc_ros.nodes import runtime
 from uav_dc_ros.nodes.recording import BagNode
-from uav_dc_ros.topics import JSON, TOPICS
+from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 
 
 class Recorder(BagNode):
@@ -27,7 +27,7 @@ class Recorder(BagNode):
         super().__init__("recorder")
 
     def about(self) -> Mapping[str, str]:
-        """Scenario, policy, seed, missions and pace."""
+        """Scenario, policy, seed, missions, pace, and what flies."""
         given = self.values
         scenario = scenarios.load(given["scenario"])
         about = {
@@ -37,8 +37,10 @@ class Recorder(BagNode):
             "scenario_values": json.dumps(msgspec.to_builtins(scenario)),
             "seed": str(given["seed"]),
             "missions": str(given["missions"]),
-            "pace": pace.text(given["pace"]),
+            "vehicle": given["vehicle"],
         }
+        if given["vehicle"] == SIMULATED:  # a real one has its own
+            about["pace"] = pace.text(given["pace"])
         if given["policy"]:
             loaded = policies.load(given["policy"])
             about |= {"policy": loaded.name, "policy_sha256": loaded.sha256}

@@ -1,6 +1,6 @@
 """The visualizer: the mission as RViz and Foxglove draw it, on `path` and `markers`.
 
-It hears every pose, since the path has them all. Of everything else it keeps the newest, as it came, and
+It hears every pose, for the path: see `track`. Of everything else it keeps the newest, as it came, and
 decodes that only when it draws: a lockstep of a thousand steps a second is drawn a few times a second.
 """
 
@@ -45,6 +45,7 @@ class Visualizer(MissionNode):
         self._track = Track(self.scenario)
         self._newest: dict[str, tuple[int, bytes]] = {}  # by topic: time of publication, and the message
         self._changed = False
+        self._drawn = -1  # version of the track
         self.timer(1.0 / self.values["rate"], self._draw)
 
     def deactivate(self) -> None:
@@ -112,10 +113,12 @@ class Visualizer(MissionNode):
         if not self._changed:
             return
         self._changed = False
-        poses = self._track.poses
-        if poses:
+        poses: list[cdr.Pose] = []
+        if self._track.version != self._drawn:
+            self._drawn, poses = self._track.version, self._track.poses
+        if poses:  # it is latched: who comes later has it, too
             self.publish("path", cdr.path(poses))
-        self.publish("markers", drawing.markers(self.scenario, self._scene(poses[-1] if poses else None)))
+        self.publish("markers", drawing.markers(self.scenario, self._scene(self._track.newest)))
 
     def _scene(self, pose: cdr.Pose | None) -> drawing.Scene:
         """What is known now."""

@@ -22,17 +22,22 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env import observations
 from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import BagError, ParameterError
-from uav_dc_ros.recordings import steps
-from uav_dc_ros.recordings.rows import TABLES, Mission
+from uav_dc_ros.recordings import rows, steps
+from uav_dc_ros.recordings.rows import Mission
 from uav_dc_ros.recordings.steps import Steps
 from uav_dc_ros.recordings.tables import Format, Table
 from uav_dc_ros.recordings.transitions import Transition, Transitions
+from uav_dc_ros.recordings.vehicles import vehicle
+from uav_dc_ros.topics import SIMULATED
 
+ALL = tuple(rows.tables(real=True))
 EPILOG = f"""\
 Tables go into a new folder, a file each, one observation a row:
   steps     a row per step: pose, cell, phase, action, sum-rate, data, rewards
   users     a row per user and step: position, SINR (linear), rate, data, served, collected
   missions  a row per mission: seed, scenario, policy, outcome, totals
+  phases    of a real vehicle only: a row per phase it told, with the reason and the time
+Of a real vehicle, steps also have the reason of their phase, and how long the move to them took.
 Units are in the names of columns. Rewards are computed anew from recorded cells and data.
 
 Transitions go into a new .npz file, which numpy.load reads: observation, next_observation (float32 [T, D]),
@@ -40,7 +45,7 @@ action (int64 [T]), reward (float64 [T]), terminated, truncated (bool [T]); flig
 which tell where each comes from; and metadata, a JSON text. The trainer reads bags themselves:
 python -m uav_dc_ros.train --from-bags BAG.
 
-Tables: {", ".join(TABLES)}.
+Tables: {", ".join(ALL)}.
 """
 
 
@@ -70,8 +75,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def _tables(text: str) -> list[str]:
     names = text.split(",")
     for name in names:
-        if name not in TABLES:
-            raise argparse.ArgumentTypeError(f"{name!r}; expected some of {', '.join(TABLES)}")
+        if name not in ALL:
+            raise argparse.ArgumentTypeError(f"{name!r}; expected some of {', '.join(ALL)}")
     return names
 
 
@@ -95,8 +100,9 @@ def run(options: argparse.Namespace) -> int:
                 options.out, recorded, scenario, options.observation or "mission", options.bag.name
             )
         else:
-            names = options.tables or list(TABLES)
-            write_tables(options.out, recorded, scenario, reader.about, names, options.format or "parquet")
+            format: Format = options.format or "parquet"
+            flew = vehicle(reader, namespace)
+            write_tables(options.out, recorded, scenario, reader.about, options.tables, format, flew)
         for topic, n in sorted(recorded.orphans.items()):
             print(f"  {n} messages on {topic} came too late to be brought together with their step")
         for (topic, reason), n in sorted(recorded.rejected.items()):
@@ -137,33 +143,45 @@ def _new(path: Path) -> Iterator[Path]:
 
 
 def write_tables(
-    folder: Path, recorded: Steps, scenario: Scenario, about: dict[str, str], names: list[str], format: Format
+    folder: Path,
+    recorded: Steps,
+    scenario: Scenario,
+    about: dict[str, str],
+    names: list[str] | None,
+    format: Format,
+    vehicle: str = SIMULATED,
 ) -> None:
-    """Write tables into a new folder; a piece of each is in memory at a time.
+    """Write tables into a new folder, all or those named; a piece of each is in memory at a time.
 
     Raises:
         BagError: the folder exists or cannot be written; no step is recorded, or one of another world.
+        ParameterError: a table that this vehicle has not.
     """
+    columns = rows.tables(vehicle != SIMULATED)
+    names = names or list(columns)
+    for name in names:
+        if name not in columns:
+            raise ParameterError(f"--tables {name}: of a real vehicle only; expected {', '.join(columns)}")
     with _new(folder) as partial, ExitStack() as stack:
         (partial / "result").mkdir()
-        tables = {
-            name: stack.enter_context(Table(partial / "result", name, TABLES[name], format, about))
+        written = {
+            name: stack.enter_context(Table(partial / "result", name, columns[name], format, about))
             for name in names
         }
         n_missions = 0
         for _, steps_of_mission in groupby(recorded, lambda step: (step.flight, step.mission)):
-            mission = Mission(scenario, about)
+            mission = Mission(scenario, about, vehicle)
             for step in steps_of_mission:
-                for name, rows in mission.add(step).items():
-                    if name in tables:
-                        tables[name].add(rows)
-            if "missions" in tables:
-                tables["missions"].add(mission.summary())
+                for name, made in mission.add(step).items():
+                    if name in written and len(made["step"]):
+                        written[name].add(made)
+            if "missions" in written:
+                written["missions"].add(mission.summary())
             n_missions += 1
         if not n_missions:
             raise BagError("the bag holds no step of any mission; expected at least one")
         stack.close()  # everything is written before the folder takes its name
-    told = ", ".join(f"{table.count} rows of {name}" for name, table in tables.items())
+    told = ", ".join(f"{table.count} rows of {name}" for name, table in written.items())
     print(f"{folder}: {n_missions} mission{'s' * (n_missions != 1)}: {told}")
 
 

@@ -14,6 +14,7 @@ from rich.text import Text
 from uav_dc_ros import cli
 from uav_dc_ros.bags.storage import RECOVER
 from uav_dc_ros.recordings.missions import MissionSurvey
+from uav_dc_ros.recordings.step import printable
 from uav_dc_ros.recordings.survey import Survey, TopicSurvey, start_text, survey
 
 WIDTH = 80  # where there is no terminal
@@ -58,6 +59,8 @@ def show(found: Survey, console: Console) -> None:
     console.print(_topics(found))
     if found.missions:
         console.print(_missions(found.missions))
+        for line in _reasons(found.missions):
+            console.print(Text(line), soft_wrap=True)
 
 
 def _facts(found: Survey) -> list[tuple[str, str]]:
@@ -81,6 +84,8 @@ def _facts(found: Survey) -> list[tuple[str, str]]:
         facts.append(("seed", f"{found.missions[0].seed} (of its first mission)"))
     else:
         facts.append(("seed", "-"))
+    if "vehicle" in about:
+        facts.append(("vehicle", about["vehicle"]))
     if "pace" in about:
         facts.append(("pace", about["pace"]))
     libraries = dict.fromkeys(part.library for part in found.parts if part.library)
@@ -102,6 +107,19 @@ def _outcomes(missions: list[MissionSurvey]) -> str:
     shares = [m.collected / m.users for m in missions if m.collected is not None and m.users]
     collected = f"; {sum(shares) / len(shares):.1%} of the users collected" if shares else ""
     return f"{len(missions):,}: {outcomes}{collected}"
+
+
+def _reasons(missions: list[MissionSurvey]) -> list[str]:
+    """Why missions of real vehicles ended as they did."""
+    told = []
+    for mission in missions[:MISSIONS_MAX]:
+        if mission.reason:
+            flight = f" of flight {mission.flight}" if mission.flight else ""
+            where = f" in {mission.namespace}" if mission.namespace else ""
+            told.append(
+                f" mission {mission.mission}{flight}{where}: {mission.outcome}: {printable(mission.reason)}"
+            )
+    return told
 
 
 def _topics(found: Survey) -> Table:

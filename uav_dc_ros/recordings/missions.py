@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagError, UavDcError
-from uav_dc_ros.recordings.steps import STEP_TOPICS, RecordedStep, Steps, scenario
+from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps, scenario
 
 NOT_OVER = "not over"
 
@@ -21,6 +22,7 @@ class MissionSurvey:
         mission: its index in its flight.
         steps: steps flown.
         outcome: `landed`, `timeout`, `aborted`, or `not over`.
+        reason: why, as a real vehicle tells; of one that is not over, why it is as it is. May be empty.
         collected, users: users collected as the last rates tell, and all; None without rates.
         seed, scenario, fingerprint: as the vehicle says.
         missing: messages of its steps that the bag lacks, by topic.
@@ -31,6 +33,7 @@ class MissionSurvey:
     mission: int
     steps: int = 0
     outcome: str = NOT_OVER
+    reason: str = ""
     collected: int | None = None
     users: int | None = None
     seed: int | None = None
@@ -80,16 +83,21 @@ def _enter(mission: MissionSurvey, step: RecordedStep) -> None:
     if step.status is not None:
         mission.seed = step.status.seed
         mission.scenario, mission.fingerprint = step.status.scenario, step.status.fingerprint
+        mission.reason = step.told[-1].reason if step.told else ""
         if step.status.phase.is_over:
-            mission.outcome = str(step.status.phase)
+            mission.outcome, mission.reason = str(step.status.phase), step.status.reason
 
 
 def _enter_missing(mission: MissionSurvey, step: RecordedStep, *, last: bool) -> None:
-    """Enter what a step lacks. The last one has no move, and one that is not over may be without the rest."""
+    """Enter what a step lacks. The last one has no move, and one that is not over may be without the rest.
+
+    A real vehicle that has not come to a step yet is not measured.
+    """
+    waits = not step.is_measured
     has = {
-        "pose": step.position_m is not None,
-        "users": step.users is not None,
-        "rates": step.rates is not None,
+        "pose": step.position_m is not None or waits,
+        "users": step.users is not None or waits,
+        "rates": step.rates is not None or waits,
         "mission": step.status is not None,
         "move": step.move is not None or last,
     }

@@ -3,7 +3,7 @@
 Three books, each over the steps of one namespace in their order:
 
 Channel    SINR, rates, data and collected flags from recorded users and poses, as the monitor does it
-World      cells from recorded moves, the mission's books; in simulation poses, and users from the seed
+World      cells from recorded moves, the mission's books, users from the seed; in simulation poses, too
 Decisions  every move from the recorded observation, by the policy that flew
 
 A step that cannot be recomputed, since the bag lacks what it stands on, is counted with its reason; what
@@ -12,18 +12,20 @@ follows goes on from what was recorded. A number may differ by `tolerance`, rela
 
 from typing import Any, TypeAlias
 
+import msgspec
 import numpy as np
 
 from uav_dc_ros import messages, payloads
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings.compare import Book, Difference, difference
-from uav_dc_ros.recordings.steps import RecordedStep
+from uav_dc_ros.recordings.step import RecordedStep, is_later_only
 
 COLUMNS = ("sinr", "rate_bps", "served", "sum_rate_bps", "data_bits", "collected")  # causes before effects
 FIELDS = {"users": "users", "rates": "rates", "mission": "status", "move": "move"}
@@ -134,9 +136,11 @@ class World(Book):
     """The world's work done again: where the vehicle is, how the mission stands, where the users are.
 
     Args:
-        simulated: did our own world fly? Then poses, users and times follow from the seed, and the seeds of
-            a flight's missions from that of its first one.
-        lockstep: was every move awaited? Without it, a vehicle that gets no move in time hovers.
+        seeded: did our own world make the users? Then they follow from the seed, and the seeds of a flight's
+            missions from that of its first one.
+        real: was it a real vehicle? Otherwise poses and times follow from cells and steps.
+        lockstep: was every move awaited? Without it, a vehicle that gets no move in time hovers; a real one
+            waits.
 
     Attributes:
         hovered: steps with a move that was not flown.
@@ -144,20 +148,30 @@ class World(Book):
     """
 
     def __init__(
-        self, scenario: Scenario, *, simulated: bool, lockstep: bool, tolerance: float = 0.0
+        self,
+        scenario: Scenario,
+        *,
+        seeded: bool,
+        lockstep: bool,
+        real: bool = False,
+        tolerance: float = 0.0,
     ) -> None:
         super().__init__(tolerance=tolerance)
         self.hovered = 0
         self.seeds: dict[int, int] = {}
-        self._scenario, self._simulated, self._lockstep = scenario, simulated, lockstep
+        self._scenario, self._seeded, self._real = scenario, seeded, real
+        self._lockstep = lockstep or real
         self._before: RecordedStep | None = None
-        self._walk: tuple[int, int, np.random.Generator, Array] | None = None  # seed, step, users
+        self._crowd: Crowd | None = None
+        self._crowd_of = -1  # seed
 
     def add(self, step: RecordedStep) -> None:
         """Recompute a step's status, and in simulation its pose and users."""
         found = [
             difference(step, topic, *_first_unlike(getattr(step, FIELDS[topic]), other))
             for topic, other in step.others.items()
+            # A real vehicle that is ready for a step again has the same users around it, at another time.
+            if not (self._real and step.users and is_later_only(step.users, other))
         ]
         before, self._before = self._before, step
         reason = ""
@@ -166,8 +180,8 @@ class World(Book):
         else:
             told, reason = self._status(step, step.status, before)
             found += told
-            if self._simulated:
-                found += self._simulation(step, step.status)
+            if self._seeded:
+                found += self._made(step, step.status)
         if found or not reason:
             self.enter(found)
         else:
@@ -187,7 +201,10 @@ class World(Book):
         phase = Phase.READY
         if step.step and (terminated or truncated):
             phase = Phase.LANDED if landed else Phase.TIMEOUT
-        if status.phase is not phase and (status.phase, phase) != (Phase.ABORTED, Phase.READY):
+        stopped = (status.phase, phase) == (Phase.ABORTED, Phase.READY)
+        if self._real:  # it may be stopped on its way down, too; or the bag ends on the way
+            stopped = status.phase not in (Phase.READY, Phase.LANDED, Phase.TIMEOUT)
+        if status.phase is not phase and not stopped:
             found.append(difference(step, "mission", "phase", status.phase.value, phase.value))
         if step.step == 0:
             return found + self._cell(step, status, [scenario.start_cell]), ""
@@ -214,36 +231,38 @@ class World(Book):
             return []
         return [difference(step, "mission", "cell", list(status.cell), list(reached[0]))]
 
-    def _simulation(self, step: RecordedStep, status: messages.Mission) -> list[Difference]:
-        """What our own world tells beyond what any vehicle does."""
+    def _made(self, step: RecordedStep, status: messages.Mission) -> list[Difference]:
+        """What our own world makes beyond what any vehicle does."""
         scenario, mission = self._scenario, self._scenario.mission
         first = self.seeds.setdefault(step.flight, status.seed - step.mission)
         found = self.column(step, "mission", "seed", status.seed, first + step.mission)
         steps = step.mission * (mission.max_steps + 1) + step.step
         time_ns = round(steps * mission.step_s * 1e9)
-        centre_m = scenario.grid.centre_m(np.asarray(status.cell), like=np.zeros(3))
+        if not self._real:
+            found += self._poses(step, status, time_ns)
+        if step.users is not None:
+            users_m = self._users_m(max(first, 0) + step.mission, step.step)
+            users = payloads.users(scenario, users_m, mission=step.mission, step=step.step, time_ns=time_ns)
+            for name in (*(() if self._real else ("stamp_ns",)), "cluster", "x_m", "y_m"):
+                found += self.column(step, "users", name, getattr(step.users, name), getattr(users, name))
+        return found
+
+    def _poses(self, step: RecordedStep, status: messages.Mission, time_ns: int) -> list[Difference]:
+        """A simulated vehicle is at the centre of its cell, at the time of its step."""
+        found = []
+        centre_m = self._scenario.grid.centre_m(np.asarray(status.cell), like=np.zeros(3))
         for pose in step.poses:
             found += self.column(step, "pose", "stamp_ns", pose.stamp_ns, time_ns)
             for i, axis in enumerate(("x_m", "y_m", "z_m")):
                 found += self.column(step, "pose", axis, float(pose.position_m[i]), float(centre_m[i]))
-        if step.users is not None:
-            users_m = self._users_m(max(first, 0) + step.mission, step.step)
-            users = payloads.users(scenario, users_m, mission=step.mission, step=step.step, time_ns=time_ns)
-            for name in ("stamp_ns", "cluster", "x_m", "y_m"):
-                found += self.column(step, "users", name, getattr(step.users, name), getattr(users, name))
         return found
 
     def _users_m(self, seed: int, step: int) -> Array:
         """Users of the mission with a seed after some steps, metres, `[U, 2]`."""
-        shape = (self._scenario.n_users, 2)
-        if self._walk is None or self._walk[0] != seed or self._walk[1] > step:
-            rng = np.random.default_rng(seed)
-            self._walk = seed, 0, rng, world.place_users(self._scenario, rng.random(shape))
-        seed, now, rng, users_m = self._walk
-        for _ in range(step - now):
-            users_m = world.walk_users(self._scenario, users_m, rng.random(shape))
-        self._walk = seed, step, rng, users_m
-        return users_m
+        if self._crowd is None or self._crowd_of != seed or self._crowd.step > step:
+            self._crowd, self._crowd_of = Crowd(self._scenario, seed), seed
+        self._crowd.walk(step - self._crowd.step)
+        return self._crowd.positions_m
 
 
 class Decisions(Book):
@@ -258,7 +277,7 @@ class Decisions(Book):
     def add(self, step: RecordedStep) -> Array | None:
         """Decide a step anew; the Q-values `[A]`, where the decision is another one."""
         status, move = step.status, step.move
-        if status is None or status.phase not in (Phase.READY, Phase.ABORTED):
+        if status is None or status.phase not in (Phase.READY, Phase.LANDING, Phase.ABORTED):
             return None
         if move is None:
             if status.phase is Phase.READY:
@@ -287,7 +306,12 @@ class Decisions(Book):
 
 
 def _first_unlike(one: messages.Stepped, other: messages.Stepped) -> tuple[str, Any, Any]:
-    """Name of the first field in which two payloads differ, and both values."""
+    """Name of the first field in which two payloads differ, and both values.
+
+    A vehicle may tell a step in many phases: what it says of the step itself is what does not change.
+    """
+    if isinstance(one, messages.Mission) and isinstance(other, messages.Mission):
+        other = msgspec.structs.replace(other, phase=one.phase, reason=one.reason)
     for name in one.__struct_fields__:
         a, b = getattr(one, name), getattr(other, name)
         if a != b:

@@ -14,7 +14,11 @@ from uav_dc_ros.recordings.pages import compare
 from uav_dc_ros.recordings.pages.health import Health
 from uav_dc_ros.recordings.pages.missions import Flown, flown
 from uav_dc_ros.recordings.pages.page import Page
+from uav_dc_ros.recordings.pages.vehicle import Way, way
 from uav_dc_ros.recordings.pages.world import world
+from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.vehicles import vehicle
+from uav_dc_ros.topics import SIMULATED
 
 SUMMARIES_MAX = 2_000  # rows in the list of missions
 SYSTEM_ROOM = 150_000  # bytes kept for it, for latencies, nodes and faults
@@ -73,11 +77,14 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
         title = f"{scenario.name}: {options.bag.absolute().name}"
         page, health = Page("mission", title), Health(reader, name)
         recorded = steps.Steps(reader, name, round(scenario.mission.step_s * 1e9))
+        flew = vehicle(reader, name)
+        real = flew != SIMULATED
+        taken = way(reader, name, scenario) if real else None
         summaries: list[dict[str, Any]] = []
         held: list[int] = []
         total = 0
         full = False
-        for one in flown(_heard(recorded, health), scenario):
+        for one in flown(_heard(recorded, health), scenario, real):
             if options.mission is not None and one.index not in options.mission:
                 continue
             total += 1
@@ -86,7 +93,7 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
                 continue
             summaries.append(one.summary())
             # Missions are shown from the first one on: no later and smaller one fills a gap.
-            full = full or not page.add(f"mission-{total - 1}", _of_mission(one), SYSTEM_ROOM)
+            full = full or not page.add(f"mission-{total - 1}", _of_mission(one, taken), SYSTEM_ROOM)
             if not full:
                 held.append(total - 1)
         if not total:
@@ -100,6 +107,7 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
             "recorded": _date(reader.first_ns),
             "policy": reader.about.get("policy", "unknown"),
             "about": {k: reader.about[k] for k in ("pace", "policy_sha256") if k in reader.about},
+            **({"vehicle": flew} if real else {}),
             "version": __version__,
             "world": world(scenario),
             "missions": summaries,
@@ -113,14 +121,15 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
     return page, f"{len(held)}{left} mission{'s' if total > 1 else ''}"
 
 
-def _heard(recorded: steps.Steps, health: Health) -> Iterator[steps.RecordedStep]:
+def _heard(recorded: steps.Steps, health: Health) -> Iterator[RecordedStep]:
     for step in recorded:
         health.hear(step)
         yield step
 
 
-def _of_mission(one: Flown) -> dict[str, Any]:
-    return {"stride": one.stride, "course": one.course(), "table": one.table()}
+def _of_mission(one: Flown, taken: Way | None) -> dict[str, Any]:
+    told = {} if one.journey is None or taken is None else {"journey": one.journey.page(taken)}
+    return {"stride": one.stride, "course": one.course(), "table": one.table(), **told}
 
 
 def _date(at_ns: int) -> str:

@@ -10,8 +10,10 @@ from uav_dc_ros.core import reward as core_reward
 from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError
-from uav_dc_ros.recordings.steps import RecordedStep
+from uav_dc_ros.messages import Phase
+from uav_dc_ros.recordings.step import BEFORE_START, RecordedStep
 from uav_dc_ros.recordings.tables import Columns
+from uav_dc_ros.topics import SIMULATED
 
 _WHICH: Columns = {"flight": "int", "mission": "int", "step": "int"}
 # Of each table its columns. What is recorded per step holds at its end; `action` is decided there.
@@ -68,7 +70,28 @@ TABLES: dict[str, Columns] = {
         "total_reward": "float",
     },
 }
+# And more of a flight with a real vehicle.
+REAL: dict[str, Columns] = {
+    "steps": {
+        "reason": "text",  # of the phase
+        "flown_s": "float",  # from the begin of the move that led here until the vehicle was told to be here
+    },
+    "missions": {"vehicle": "text", "reason": "text"},
+    "phases": {
+        **_WHICH,
+        "time_s": "float",  # when it was published, since the epoch
+        "phase": "text",
+        "reason": "text",
+    },
+}
 Rows = Mapping[str, Sequence[Any]]
+
+
+def tables(real: bool) -> dict[str, Columns]:
+    """Columns of each table: those of a flight with a real vehicle, or with our own world's."""
+    if not real:
+        return TABLES
+    return {name: {**TABLES.get(name, {}), **REAL.get(name, {})} for name in (*TABLES, "phases")}
 
 
 class Mission:
@@ -77,10 +100,11 @@ class Mission:
     Args:
         scenario: the world, and how its agents are paid.
         about: what the recorder wrote about the bag.
+        vehicle: as `vehicles.vehicle` tells it.
     """
 
-    def __init__(self, scenario: Scenario, about: Mapping[str, str]) -> None:
-        self._scenario, self._about = scenario, about
+    def __init__(self, scenario: Scenario, about: Mapping[str, str], vehicle: str = SIMULATED) -> None:
+        self._scenario, self._about, self._vehicle = scenario, about, vehicle
         self._total: tuple[int, float] | None = None  # step, and r^t there
         self._last: RecordedStep | None = None
         self._status = self._rates = None  # type: Any  # the latest that are recorded
@@ -104,6 +128,7 @@ class Mission:
                 payloads.collection(step.rates, self._scenario)
         except MessageError as error:
             raise BagError(f"{step.name}: {error}") from None
+        before = self._last
         self._recorded += 1
         self._last, self._status = step, step.status or self._status
         self._rates = step.rates or self._rates
@@ -111,7 +136,12 @@ class Mission:
         self._last_ns = max(self._last_ns, *step.log_ns.values())
         if step.rates is not None and step.step > 0:
             self._sum_rates.append(step.rates.sum_rate_bps)
-        return {"steps": self._step(step), "users": self._users(step)}
+        rows: dict[str, Rows] = {"steps": self._step(step), "users": self._users(step)}
+        if self._vehicle != SIMULATED:
+            told = {"reason": step.status and step.status.reason, "flown_s": _flown_s(before, step)}
+            rows["steps"] = {**rows["steps"], **{name: [value] for name, value in told.items()}}
+            rows["phases"] = _phases(step)
+        return rows
 
     def _step(self, step: RecordedStep) -> Rows:
         users, rates, status, position_m = step.users, step.rates, step.status, step.position_m
@@ -185,7 +215,28 @@ class Mission:
             "mean_sum_rate_bps": float(np.mean(self._sum_rates)) if self._sum_rates else None,
             "total_reward": self._total and self._total[1],
         }
+        if self._vehicle != SIMULATED:
+            row |= {"vehicle": self._vehicle, "reason": status and status.reason}
         return {name: [value] for name, value in row.items()}
+
+
+def _flown_s(before: RecordedStep | None, step: RecordedStep) -> float | None:
+    """How long the move to a step took, by the clock of who flew it, seconds; None where it is not known."""
+    if before is None or before.step != step.step - 1:
+        return None
+    begun_ns = [told.publish_ns for told in before.told if told.phase is Phase.MOVING]
+    there_ns = [told.publish_ns for told in step.told if told.phase not in BEFORE_START]
+    return (there_ns[0] - begun_ns[0]) / 1e9 if begun_ns and there_ns else None
+
+
+def _phases(step: RecordedStep) -> Rows:
+    n = len(step.told)
+    return {
+        **{name: [value] * n for name, value in _which(step).items()},
+        "time_s": [told.publish_ns / 1e9 for told in step.told],
+        "phase": [told.phase.value for told in step.told],
+        "reason": [told.reason for told in step.told],
+    }
 
 
 def _which(step: RecordedStep) -> dict[str, Any]:

@@ -7,9 +7,8 @@ missing (a pose that was lost on the way). Each step is handed out once, with wh
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
@@ -17,9 +16,18 @@ import numpy as np
 from uav_dc_ros import messages, payloads, scenarios, topics
 from uav_dc_ros.bags.definitions import TYPESTORE, is_defined_so
 from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
-from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import BagError, MessageError, ScenarioError
+from uav_dc_ros.messages import Mission
+from uav_dc_ros.recordings.step import (
+    GROUND,
+    POSES_KEPT,
+    RecordedPose,
+    RecordedStep,
+    is_later_only,
+    is_same_status,
+    outweighs,
+)
 
 FRAME = "map"
 STEP_TOPICS = ("pose", "users", "rates", "mission", "move")
@@ -28,54 +36,8 @@ OPEN_MAX = 256  # steps that are held while the oldest lacks something
 OPEN_BYTES_MAX = 64 * 2**20  # of their messages
 RECENT_MAX = 1000  # steps handed out, of which is known what they had: as many as a latched topic repeats
 POSES_MAX = 10_000  # poses whose users have not come
-POSES_KEPT = 64  # of a step
 
 Key: TypeAlias = tuple[int, int, int]  # flight, mission, step
-
-
-class RecordedPose(NamedTuple):
-    """A pose: its stamp, x, y, altitude in metres `[3]`, and when it was received and published (ns)."""
-
-    stamp_ns: int
-    position_m: Array
-    log_ns: int
-    publish_ns: int
-
-
-@dataclass(kw_only=True)
-class RecordedStep:
-    """One step of a mission; None for what the bag does not have.
-
-    Attributes:
-        flight: counts from 0, one up whenever the vehicle begins again: two runs in one bag.
-        mission, step: index of the mission in its flight, steps flown.
-        position_m: x, y, altitude of the first pose of the step's own time, metres, `[3]`.
-        users, rates, status, move: the payloads; of repeated ones the first, but a status that ends the
-            mission takes the place of one that was ready for a move (an abort comes at the same step).
-        log_ns: when each was received, nanoseconds since the epoch, by topic.
-        publish_ns: when each was published, by topic.
-        poses: the first poses of the step's own time, by stamp: at most `POSES_KEPT`.
-        others: by topic the first payload that was said again for this step, and differently.
-    """
-
-    flight: int
-    mission: int
-    step: int
-    position_m: Array | None = None
-    users: messages.Users | None = None
-    rates: messages.Rates | None = None
-    status: messages.Mission | None = None
-    move: messages.Move | None = None
-    log_ns: dict[str, int] = field(default_factory=dict)
-    publish_ns: dict[str, int] = field(default_factory=dict)
-    poses: list[RecordedPose] = field(default_factory=list)
-    others: dict[str, messages.Stepped] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """The step in words."""
-        flight = f" of flight {self.flight}" if self.flight else ""
-        return f"mission {self.mission}, step {self.step}{flight}"
 
 
 def namespaces(reader: BagReader) -> list[str]:
@@ -185,7 +147,7 @@ class Steps:
             topic = self._topics[message.topic]
             try:
                 if topic == "pose":
-                    self._hear_pose(_pose(message))
+                    self._hear_pose(read_pose(message))
                     continue
                 payload = messages.decode(payloads.text_in_cdr(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
@@ -220,7 +182,12 @@ class Steps:
         (flight, *last), published_ns, before = self._newest[topic]
         if flight < self._flight or publish_ns <= published_ns:
             return False
-        return last > [0, 0] or (topic != "rates" and _start(payload) != _start(before))
+        if last > [0, 0]:
+            return True
+        if isinstance(payload, Mission) and payload.phase in GROUND:
+            # Of a real vehicle, and the flight before never left the ground.
+            return isinstance(before, Mission) and before.phase.is_over
+        return topic != "rates" and _start(payload) != _start(before)
 
     def _enter(self, key: Key, topic: str, payload: messages.Stepped, message: BagMessage) -> None:
         flight, mission, number = key
@@ -228,12 +195,24 @@ class Steps:
         self._bytes[key] = self._bytes.get(key, 0) + len(message.data)
         name = "status" if topic == "mission" else topic
         before = getattr(step, name)
-        if before is not None and not _ends(before, payload):
-            if payload == before or _ends(payload, before):
-                self.repeated[topic] += 1  # a vehicle that was stopped, and went on, is ready again
+        if before is not None:
+            if isinstance(payload, Mission) and is_same_status(payload, before):
+                newer = message.publish_time_ns > step.publish_ns[topic]
+                if not step.tell(payload, message.log_time_ns, message.publish_time_ns):
+                    self.repeated[topic] += 1
+                    return
+                if not outweighs(payload, before, newer):
+                    return
+            elif payload == before:
+                self.repeated[topic] += 1
+                return
             else:
-                step.others.setdefault(topic, payload)
-            return
+                known = step.others.get(topic)
+                if known is None or (is_later_only(known, before) and not is_later_only(payload, before)):
+                    step.others[topic] = payload
+                return
+        elif isinstance(payload, Mission):
+            step.tell(payload, message.log_time_ns, message.publish_time_ns)
         setattr(step, name, payload)
         step.log_ns[topic], step.publish_ns[topic] = message.log_time_ns, message.publish_time_ns
         if topic == "users":
@@ -249,6 +228,8 @@ class Steps:
         """Give a pose to a step, if it is of the step's own time, as the monitor has it."""
         if step.users is None or not 0 <= pose.stamp_ns - step.users.stamp_ns < self._step_ns:
             return
+        if len(step.poses) == POSES_KEPT and pose.stamp_ns > step.poses[-1].stamp_ns:
+            return  # a real vehicle tells twenty a second
         if any(p.stamp_ns == pose.stamp_ns and (p.position_m == pose.position_m).all() for p in step.poses):
             return
         insort(step.poses, pose, key=lambda one: one.stamp_ns)
@@ -293,14 +274,9 @@ class Steps:
 
 def _start(payload: messages.Stepped) -> object:
     """What stays the same when a flight tells its start again."""
-    return payload.seed if isinstance(payload, messages.Mission) else payload
-
-
-def _ends(before: messages.Stepped, now: messages.Stepped) -> bool:
-    """Whether it is the end of the mission, after a status that was ready."""
-    if not isinstance(before, messages.Mission) or not isinstance(now, messages.Mission):
-        return False
-    return not before.phase.is_over and now == msgspec.structs.replace(before, phase=now.phase) != before
+    if isinstance(payload, messages.Users):  # a real vehicle's have the time of a pose
+        return msgspec.structs.replace(payload, stamp_ns=0)
+    return payload.seed if isinstance(payload, Mission) else payload
 
 
 def _expect(reader: BagReader, topic: RecordedTopic, type: str) -> None:
@@ -317,7 +293,7 @@ def _expect(reader: BagReader, topic: RecordedTopic, type: str) -> None:
         )
 
 
-def _pose(message: BagMessage) -> RecordedPose:
+def read_pose(message: BagMessage) -> RecordedPose:
     """The pose in a message.
 
     Raises:

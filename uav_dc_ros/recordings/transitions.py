@@ -20,7 +20,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env import observations
 from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.recordings.steps import RecordedStep
+from uav_dc_ros.recordings.step import RecordedStep
 
 
 class Transition(NamedTuple):

@@ -19,8 +19,12 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, PolicyError
 from uav_dc_ros.recordings import steps
 from uav_dc_ros.recordings.compare import Book
+from uav_dc_ros.recordings.flights import Flights
 from uav_dc_ros.recordings.recompute import Channel, Decisions, World
-from uav_dc_ros.recordings.steps import RecordedStep, Steps
+from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.steps import Steps
+from uav_dc_ros.recordings.vehicles import is_real, vehicle
+from uav_dc_ros.topics import SIMULATED
 
 NEEDED = ("pose", "users", "rates", "mission")  # topics without which nothing can be recomputed
 SHOWN = 5  # decisions of another policy that are shown with their Q-values
@@ -34,6 +38,10 @@ Exit status 0: nothing differs; 1: something does, or, with --complete, somethin
 What a bag lacks cannot be recomputed; it is counted with its reason, and the last line then says 'in part'.
 Poses, and users from the seed, are recomputed for flights of this project's own world. Another machine's
 mathematics may differ in the last digit: --tolerance 1e-12 lets that pass, and counts it.
+
+A real vehicle's poses are what it measured itself. Its phases must follow each other as they may, no move may
+be flown twice, and users have the time of a pose; how far it was from the centres of its cells is told, and
+no difference: a step also ends when its time is over.
 """
 
 
@@ -79,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
     """
     with BagReader(options.bag) as reader:
         namespace = steps.namespace(reader, options.namespace)
-        _check_topics(reader, namespace)
+        _check_topics(reader, namespace, ("mission",) if is_real(reader, namespace) else NEEDED)
         scenario = steps.scenario(reader, namespace, options.scenario)
         other = Decisions(scenario, policies.load(options.policy)) if options.policy else None
         found = verify(reader, namespace, scenario, other, options.policy_dir, options.tolerance)
@@ -131,10 +139,13 @@ def verify(
     """
     about = reader.about
     lockstep = about.get("pace") == pace.LOCKSTEP
-    simulated = "seed" in about  # our recorder tells it, of our world
+    seeded = "seed" in about  # our recorder tells it, of our world
+    flew = vehicle(reader, namespace)
+    real = flew != SIMULATED
     policy, without = _policy(about, scenario, policy_dir)
     channel = Channel(scenario, tolerance)
-    world = World(scenario, simulated=simulated, lockstep=lockstep, tolerance=tolerance)
+    world = World(scenario, seeded=seeded, lockstep=lockstep, real=real, tolerance=tolerance)
+    flights = Flights(scenario) if real else None
     decisions = Decisions(scenario, policy) if policy else None
     recorded = Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
     otherwise: list[str] = []
@@ -144,8 +155,11 @@ def verify(
         n_other, n_before = 0, other.compared if other else 0
         for step in mission:
             n_steps += 1
-            channel.add(step)
+            if step.is_measured or step.users is not None or step.rates is not None:
+                channel.add(step)
             world.add(step)
+            if flights:
+                flights.add(step)
             if decisions:
                 decisions.add(step)
             if other and (q_values := other.add(step)) is not None:
@@ -168,11 +182,14 @@ def verify(
     lines = [*_lines("channel", channel), *_channel_notes(channel), *_lines("world", world)]
     if world.hovered:
         lines.append(f"  {world.hovered} moves were not flown: they came too late, and the vehicle hovered")
-    if simulated and any(str(seed) != about["seed"] for seed in world.seeds.values()):
+    if seeded and any(str(seed) != about["seed"] for seed in world.seeds.values()):
         seeds = ", ".join(map(str, world.seeds.values()))
         lines.append(f"  flown with seed {seeds}, though the bag is said to be of seed {about['seed']}")
-    if not simulated:
-        lines.append("  not flown by our own world, as far as the bag tells: poses and users are as recorded")
+    if not seeded:
+        what = "users" if real else "poses and users"
+        lines.append(f"  not flown by our own world, as far as the bag tells: {what} are as recorded")
+    if flights:
+        lines += flights.lines(flew)
     lines += _lines("decisions", decisions) if decisions else [f"decisions: not verified: {without}"]
     unread = recorded.rejected + recorded.orphans
     for (topic, reason), n in sorted(recorded.rejected.items()):
@@ -185,25 +202,28 @@ def verify(
         lines += otherwise
         if n_missions_other > LISTED:
             lines.append(f"  and in {n_missions_other - LISTED} missions more")
-    books: list[Book] = [channel, world, *([decisions] if decisions else [])]
+    books: list[Book] = [channel, world, *([flights] if flights else []), *([decisions] if decisions else [])]
     return Verification(
         flown,
         lines,
         differs=any(book.differing for book in books),
-        gaps=any(book.skipped for book in books) or decisions is None or bool(unread) or not simulated,
+        gaps=any(book.skipped for book in books) or decisions is None or bool(unread) or not seeded,
     )
 
 
-def _check_topics(reader: BagReader, namespace: str) -> None:
-    """Raises BagError for a bag that lacks a whole topic: nothing in it can be recomputed."""
+def _check_topics(reader: BagReader, namespace: str, needed: tuple[str, ...]) -> None:
+    """Raises BagError for a bag that lacks a whole topic: nothing in it can be recomputed.
+
+    A real vehicle whose mission ended before it left the ground has nobody measured.
+    """
     missing = [
         f"{namespace}/{name}"
-        for name in NEEDED
+        for name in needed
         if f"{namespace}/{name}" not in reader.topics or not reader.topics[f"{namespace}/{name}"].count
     ]
     if missing:
         raise BagError(
-            f"bag {reader.path} holds nothing on {', '.join(missing)}; expected {', '.join(NEEDED)}, from "
+            f"bag {reader.path} holds nothing on {', '.join(missing)}; expected {', '.join(needed)}, from "
             f"which missions are recomputed; its topics are {', '.join(sorted(reader.topics))}"
         )
 
@@ -247,6 +267,8 @@ def _candidates(name: str, folder: Path | None) -> Iterator[str | Path]:
 def _lines(title: str, book: Book) -> list[str]:
     """A book in words."""
     total = book.compared + book.skipped.total()
+    if not total:
+        return [f"{title}: the bag has no step for it"]
     told = f"{title}: {book.compared} of {total} steps recomputed"
     if not book.differing:
         lines = [f"{told}, equal {'to the last bit' if not book.within else 'within the tolerance'}"]

@@ -11,7 +11,8 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TOLD_MAX, Phase
 from uav_dc_ros.recordings.pages.diagnostics import Node, Report
 from uav_dc_ros.recordings.pages.missions import NO_END, Flown
-from uav_dc_ros.recordings.steps import STEP_TOPICS, RecordedStep, Steps
+from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps
 
 SAMPLES_MAX = 100_000  # of a latency: percentiles need no more
 FAULTS_MAX = 300  # rows told one by one
@@ -105,7 +106,11 @@ class Health:
             self._fault(flown.last_ns, name, f"{what}: {count}")
         if flown.outcome in (Phase.ABORTED, NO_END):
             told = "aborted" if flown.outcome == Phase.ABORTED else "its end is not in the bag"
-            self._fault(flown.last_ns, name, f"{told}, after step {flown.steps}")
+            why = f": {flown.reason}" if flown.reason else ""
+            self._fault(flown.last_ns, name, f"{told}, after step {flown.steps}{why}")
+        for step, word in flown.journey.words if flown.journey else ():
+            if word.holds:
+                self._fault(word.log_ns, name, f"step {step}: {word.reason}")
 
     def read(self) -> None:
         """Go through the bag once more, for its times and the nodes' diagnostics."""

@@ -26,6 +26,7 @@ open(async (page, data) => {
   const counts = STATES.map(() => make("b", {}, "0"));
   page.append(
     make("div", { id: "tiles" }),
+    make("p", { class: "warning", id: "why", hidden: true }),
     make("section", { "aria-labelledby": "flight-title" },
       make("h2", { id: "flight-title" }, "Flight"),
       make("div", { class: "grid wide-left" },
@@ -48,6 +49,7 @@ open(async (page, data) => {
       make("div", { class: "grid wide-right" },
         card("Data of each user over the steps", make("div", { class: "chart tall", id: "data" })),
         make("div", { class: "card", id: "users" }))),
+    make("div", { id: "vehicle" }),
     system(data.health),
     missionList(),
     make("footer", {}, footer()));
@@ -73,7 +75,8 @@ open(async (page, data) => {
   function drawScene() {
     const scene = at("scene");
     Plotly.purge(scene);
-    const flown = steps().map((one) => one.uav_m);
+    const { journey } = state.mission;
+    const flown = journey ? flownWay(journey, Infinity) : steps().map((one) => one.uav_m);
     const column = (i) => flown.map((p) => (p ? p[i] : null));
     const users = STATES.map(([name, words, shape]) => space.trace({
       name: words, mode: "markers", x: [], y: [], z: [], text: [], hovertemplate: "%{text}<extra></extra>",
@@ -90,6 +93,7 @@ open(async (page, data) => {
     ];
     const still = [
       ...space.world(world),
+      ...(journey ? [space.trace({ name: "cells", mode: "markers", x: journey.cells.x, y: journey.cells.y, z: journey.cells.z, hoverinfo: "skip", marker: { symbol: "square-open", size: space.flat ? 9 : 4, color: colour("dock"), line: { color: colour("dock"), width: 1.5 } } })] : []),
       space.trace({ name: "path", mode: "lines", x: column(0), y: column(1), z: column(2), line: { color: colour("ahead"), width: space.flat ? 1.5 : 2.5 }, hoverinfo: "skip" }),
     ];
     state.moving = moving.map((_, i) => still.length + i);
@@ -99,8 +103,9 @@ open(async (page, data) => {
 
   function moveScene() {
     const now = steps()[state.at];
-    const flown = steps().slice(0, state.at + 1).map((one) => one.uav_m).filter(Boolean);
-    const here = flown.at(-1);
+    const measured = steps().slice(0, state.at + 1).map((one) => one.uav_m).filter(Boolean);
+    const here = measured.at(-1);
+    const flown = state.mission.journey ? flownWay(state.mission.journey, now.step) : measured;
     const users = lastKnown("users_m");
     const foot = ring(here ?? [0, 0], here ? now.reach_m || 0.001 : 0.001);
     const disc = space.flat ? foot : space.disc(foot, 0.4, "");
@@ -149,7 +154,7 @@ open(async (page, data) => {
     const reward = (i) => steps().map((one) => one.reward[i]);
     const paid = (name, i, shade, more) => line(name, reward(i), shade, { hovertemplate: "%{y:.3f}", line: { color: colour(shade), width: 2, shape: "hv", ...more } });
     draw("reward", [paid("data", 0, "accent", { dash: "dash" }), paid("trajectory", 1, "warm", { dash: "dot" }), paid("total", 2, "ink")],
-      { yaxis: axis({ rangemode: "tozero", nticks: 5 }), xaxis: stepAxis(`step, ${world.step_s} s each`) });
+      { yaxis: axis({ rangemode: "tozero", nticks: 5 }), xaxis: stepAxis(stepTitle()) });
     const { user, cluster } = state.mission.table;
     const [dataScale, dataPrefix] = siScale(Math.max(world.r_min_bits, ...user.map((_, i) => state.mission.table.data_bits[i])));
     const held = user.map((_, u) => steps().map((one) => (one.data_bits ? one.data_bits[u] / dataScale : null)));
@@ -160,7 +165,7 @@ open(async (page, data) => {
       hovertemplate: `user %{customdata[0]}, cluster %{customdata[1]}, step %{x}: %{z:.2f} ${dataPrefix}bit<extra></extra>`,
       colorbar: { title: { text: `${dataPrefix}bit`, font: { size: 12 } }, thickness: 10, outlinewidth: 0, tickcolor: colour("faint"), len: 0.95, tickfont: { color: colour("muted") } },
     }], {
-      hovermode: "closest", xaxis: stepAxis(`step, ${world.step_s} s each`),
+      hovermode: "closest", xaxis: stepAxis(stepTitle()),
       yaxis: axis({ title: "users, by cluster", autorange: "reversed", showgrid: false, zeroline: false,
         tickmode: "array", ...middles(cluster) }),
       shapes: [cursor(), ...borders.map((y) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: y, y1: y, line: { color: colour("card"), width: 1.5 } }))],
@@ -177,6 +182,14 @@ open(async (page, data) => {
     return { tickvals: [...places.values()].map((rows) => rows[Math.floor(rows.length / 2)]), ticktext: [...places.keys()].map(String) };
   }
 
+  // A real vehicle takes the time that it needs, up to that of a step.
+  function stepTitle() { return `step, ${state.mission.journey ? "up to " : ""}${world.step_s} s each`; }
+
+  function secondsAt(step) {
+    const { journey } = state.mission;
+    return journey ? journey.cells.s[journey.cells.step.indexOf(step)] ?? 0 : step * world.step_s;
+  }
+
   function nearest(step) {
     let best = 0;
     steps().forEach((one, i) => { if (Math.abs(one.step - step) < Math.abs(steps()[best].step - step)) best = i; });
@@ -189,7 +202,7 @@ open(async (page, data) => {
     state.at = i;
     const now = steps()[i];
     slider.value = i;
-    const words = `step ${now.step} of ${state.summary.steps} · ${clock(now.step * world.step_s)} · ${now.n_collected}/${world.users} collected`;
+    const words = `step ${now.step} of ${state.summary.steps} · ${clock(secondsAt(now.step))} · ${now.n_collected}/${world.users} collected`;
     told.textContent = words + (now.action ? ` · next: ${now.action}` : "");
     slider.setAttribute("aria-valuetext", words);
     moveScene();
@@ -223,7 +236,7 @@ open(async (page, data) => {
     state.chosen = null;
     const one = state.summary;
     document.title = `${data.title} · ${missionName(one)}`;
-    sub.replaceChildren(make("b", {}, `${missionName(one)}, seed ${one.seed ?? "unknown"}`), ` · policy ${data.policy} · bag ${data.bag} · recorded ${data.recorded}`);
+    sub.replaceChildren(make("b", {}, `${missionName(one)}, seed ${one.seed ?? "unknown"}`), ` · policy ${data.policy} · ${data.vehicle ? `vehicle ${data.vehicle} · ` : ""}bag ${data.bag} · recorded ${data.recorded}`);
     const landed = one.outcome === "landed";
     at("tiles").replaceChildren(tiles([
       ["outcome", `${landed ? "✓" : "✕"} ${one.outcome}`, "", landed ? "good" : "bad"],
@@ -234,6 +247,9 @@ open(async (page, data) => {
       ["steps", `${one.steps}`, `of ${world.max_steps}`],
       ["reward", fixed(one.reward, 3)],
     ]));
+    at("why").hidden = !one.reason || landed;
+    at("why").textContent = one.reason ? `${one.outcome}: ${one.reason}` : "";
+    at("vehicle").replaceChildren(state.mission.journey ? vehicle(state.mission.journey) : "");
     slider.max = steps().length - 1;
     const notes = ["SINR and rate are means over the steps in which a user was served; click a user to find it in the trajectory."];
     if (state.mission.stride > 1) notes.push(`Shown is every ${state.mission.stride}th step; all figures are of all steps.`);
@@ -244,7 +260,7 @@ open(async (page, data) => {
     go(steps().length - 1);
   }
 
-  function draw() { drawScene(); drawCharts(); drawSystem(data.health); if (steps().length) go(state.at); }
+  function draw() { drawScene(); drawCharts(); drawSystem(data.health); if (state.mission.journey) drawVehicle(state.mission.journey); if (steps().length) go(state.at); }
 
   function userTable() {
     const columns = state.mission.table;

@@ -16,7 +16,8 @@ from uav_dc_ros.core import mission, radio, reward, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.recordings.steps import RecordedStep
+from uav_dc_ros.recordings.pages.vehicle import Journey
+from uav_dc_ros.recordings.step import RecordedStep
 
 STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart
 VALUES_MAX = 60_000  # steps times users: what a page can draw, and hold
@@ -31,24 +32,29 @@ class Flown:
     Args:
         scenario: the world that was flown.
         flight, index: which mission it is, see `RecordedStep`.
+        real: was it flown by a real vehicle?
 
     Attributes:
         seed: of its users; None where the bag does not tell.
         outcome: how it ended.
+        reason: why, as a real vehicle tells.
         steps: steps flown.
         data_bits, collected: of each user at the end, `[U]`.
         distance_m: length of the path flown, metres.
         faults: what is missing or cannot be true, counted in words.
         stride: every how many steps one is kept.
         last_ns: when the last message of it was received.
+        journey: what a real vehicle told of it; None of a simulated one.
     """
 
-    def __init__(self, scenario: Scenario, flight: int, index: int) -> None:
+    def __init__(self, scenario: Scenario, flight: int, index: int, real: bool = False) -> None:
         n_users = scenario.n_users
         self.scenario = scenario
         self.flight, self.index = flight, index
         self.seed: int | None = None
         self.outcome: str = NO_END
+        self.reason = ""
+        self.journey = Journey(scenario) if real else None
         self.steps = 0
         self.data_bits: Array = np.zeros(n_users)
         self.collected: Array = np.zeros(n_users, dtype=bool)
@@ -75,6 +81,8 @@ class Flown:
         self._expected = step.step + 1
         self.steps = max(self.steps, step.step)
         self.last_ns = max(step.log_ns.values(), default=self.last_ns)
+        if self.journey is not None:
+            self.journey.add(step)
         status = self._fitting(step.status, lambda it: payloads.check_world(it, self.scenario))
         rates = self._fitting(step.rates, lambda it: payloads.collection(it, self.scenario))
         users = self._fitting(step.users, lambda it: payloads.users_m(it, self.scenario))
@@ -84,21 +92,22 @@ class Flown:
             ("rates", rates),
             ("pose", step.position_m is not None),
         ):
-            if not there:
+            if not there and (name == "mission" or step.is_measured):
                 self.faults[f"steps without {name}"] += 1
         if status is not None:
             self.seed = status.seed
             self._cell = np.asarray(status.cell)
             if status.phase.is_over:
-                self.outcome = status.phase.value
+                self.outcome, self.reason = status.phase.value, status.reason
         if rates is not None:
             self._book(step.step, rates)
-        self._keep(step, self._fly(step.position_m, status), users, rates)
+        self._keep(step, self._fly(step.position_m, status if step.is_measured else None), users, rates)
 
     def summary(self) -> dict[str, Any]:
         """The mission in numbers, as run_all's `--summary` has them."""
         total, n = self._sum_rates_bps
         return {
+            **({"reason": self.reason} if self.reason else {}),
             "flight": self.flight,
             "mission": self.index,
             "seed": self.seed,
@@ -212,14 +221,14 @@ class Flown:
             self._kept = self._kept[:1] + [it for it in self._kept[1:] if it["step"] % self.stride == 0]
 
 
-def flown(steps: Iterator[RecordedStep], scenario: Scenario) -> Iterator[Flown]:
+def flown(steps: Iterator[RecordedStep], scenario: Scenario, real: bool = False) -> Iterator[Flown]:
     """The missions of a bag, one after the other; those steps alone are in memory that are shown."""
     now: Flown | None = None
     for step in steps:
         if now is None or (now.flight, now.index) != (step.flight, step.mission):
             if now is not None:
                 yield now
-            now = Flown(scenario, step.flight, step.mission)
+            now = Flown(scenario, step.flight, step.mission, real)
         now.add(step)
     if now is not None:
         yield now

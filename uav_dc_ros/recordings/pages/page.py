@@ -32,7 +32,7 @@ class Page:
     """
 
     def __init__(self, kind: str, title: str) -> None:
-        scripts = ("common", "system", kind) if kind == "mission" else ("common", kind)
+        scripts = ("common", "system", "vehicle", kind) if kind == "mission" else ("common", kind)
         self._parts = {
             "title": html.escape(title),
             "style": _text("style.css"),
