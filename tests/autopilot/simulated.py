@@ -17,6 +17,7 @@ class Vehicle:
     mode: Mode = Mode.OTHER
     armed: bool = False
     battery: float = 1.0
+    battery_v: float | None = None
     estimate_ok: bool = True
     frozen: bool = False  # its position does not come any more
     silent: bool = False  # nothing comes any more
@@ -79,6 +80,7 @@ class Vehicle:
             position_s=before.position_s if self.frozen else self.now_s,
             estimate_ok=self.estimate_ok,
             battery=self.battery,
+            battery_v=self.battery_v,
             vehicle_s=self.now_s,
             said=self.said,
         )

@@ -347,6 +347,24 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
             assert flown == list(range(len(flown)))
 
 
+def test_a_bridge_that_comes_back_to_a_vehicle_outside_the_fence_brings_it_home() -> None:
+    vehicle = Vehicle(position=Enu(2000.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
+    flight = Flight(ARMING, vehicle, standing=Standing(step=7, cell=(3, 3, 1), flies=True))
+    flight.until(Phase.ABORTED)
+    assert flight.executed == []
+    assert flight.bridge.reason.startswith("outside the fence when the bridge came back: 2000.0 m east")
+    assert SetMode(Mode.RETURN) in vehicle.asked
+
+
+def test_a_bridge_that_comes_back_knows_its_battery() -> None:
+    """Whose charge the autopilot counts wrongly: what its voltage was at rest is kept."""
+    first = Flight(vehicle=Vehicle(position=Enu(START.east_m, START.north_m, 0.0), battery_v=12.6))
+    first.until(Phase.MOVING)
+    first.vehicle.battery, first.vehicle.battery_v = 0.0, 12.3
+    second = Flight(ARMING, first.vehicle, standing=first.bridge.standing)
+    second.until(Phase.LANDED)
+
+
 def test_a_vehicle_that_flies_already_lands_where_that_is_wanted() -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
     flight = Flight(Settings(flying_at_start="land"), vehicle)

@@ -17,11 +17,14 @@ class Battery:
 
     Args:
         least: charge at which it is low, 0 to 1.
+        at_rest_v: as below, from before a bridge was killed.
+
+    Attributes:
+        at_rest_v: the highest voltage that was seen on the ground, motors off; None: none was.
     """
 
-    def __init__(self, least: float) -> None:
-        self.least = least
-        self._at_rest_v: float | None = None  # the highest one that was seen on the ground, motors off
+    def __init__(self, least: float, at_rest_v: float | None = None) -> None:
+        self.least, self.at_rest_v = least, at_rest_v
         self._smooth_v: float | None = None
         self._seen_s = 0.0  # vehicle time
 
@@ -41,7 +44,7 @@ class Battery:
         if known.battery_v is None:
             return
         if not known.armed:
-            self._at_rest_v = max(self._at_rest_v or 0.0, known.battery_v)
+            self.at_rest_v = max(self.at_rest_v or 0.0, known.battery_v)
         passed_s = max(0.0, known.vehicle_s - self._seen_s)
         before_v = known.battery_v if self._smooth_v is None else self._smooth_v
         self._smooth_v = known.battery_v + (before_v - known.battery_v) * math.exp(-passed_s / SMOOTH_S)
@@ -49,6 +52,6 @@ class Battery:
 
     def _holds(self) -> bool:
         """Is its voltage that of a battery which is far from empty. Nobody knows who never saw it at rest."""
-        if self._at_rest_v is None or self._smooth_v is None:
+        if self.at_rest_v is None or self._smooth_v is None:
             return False
-        return self._smooth_v >= FULL * self._at_rest_v
+        return self._smooth_v >= FULL * self.at_rest_v

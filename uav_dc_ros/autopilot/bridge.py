@@ -72,7 +72,7 @@ class Bridge:
         self._now_s = 0.0  # vehicle time
         self._steady_s = self._since_steady_s = 0.0  # steady clock: last tick, last change of phase
         self._descent = Descent()
-        self._watched = Watch(settings)
+        self._watched = Watch(settings, self.course.standing.at_rest_v)
         self._hold = Hold(self._watched)
         self._ground = Ground(self.course, settings, self.fence, self._watched)
 
@@ -113,6 +113,7 @@ class Bridge:
             flies=True,
             outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
             reason=self.reason if over else "",
+            at_rest_v=self._watched.battery.at_rest_v,
         )
 
     def move(self, step: int, action: Action) -> str | None:

@@ -22,6 +22,7 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
         flies: has the vehicle left the ground, or may it have?
         outcome: of a mission that was on its way down, or over; None: it goes on.
         reason: why it was.
+        at_rest_v: voltage of the battery before take-off; None: not told.
     """
 
     step: int
@@ -29,6 +30,7 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
     flies: bool = False
     outcome: Phase | None = None
     reason: str = ""
+    at_rest_v: float | None = None
 
 
 class Course:

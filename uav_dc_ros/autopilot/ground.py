@@ -55,10 +55,11 @@ class Ground:
         fault = self.watch.fault(now_s, known)
         if known.missing is not None or fault is not None or known.position is None:
             return Next(phase=Phase.CONNECTING, why=known.missing or fault or "no position yet")
-        if (breach := self.fence.breach(known.position)) is not None:
-            return Next(phase=Phase.CONNECTING, why=f"the vehicle is outside the fence: {breach}")
-        if self.course.standing.flies and (otherwise := self._left_alone(known)) is not None:
+        breach = self.fence.breach(known.position)
+        if self.course.standing.flies and (otherwise := self._left_alone(known, breach)) is not None:
             return otherwise
+        if breach is not None:
+            return Next(phase=Phase.CONNECTING, why=f"the vehicle is outside the fence: {breach}")
         if known.armed and known.on_ground is False and known.mode is Mode.COMMANDED:
             if self.settings.flying_at_start == "land":
                 why = "it flew already when the bridge came"
@@ -68,7 +69,7 @@ class Ground:
         # An autopilot may want to see setpoints before it follows any.
         return Next(phase=Phase.PREFLIGHT, why="connected", setpoint=known.position)
 
-    def _left_alone(self, known: Telemetry) -> Next | None:
+    def _left_alone(self, known: Telemetry, breach: str | None) -> Next | None:
         """Why a mission that was in the air is not taken up again, or goes on coming down; None: it is."""
         before = self.course.standing
         if before.outcome is not None and known.armed:
@@ -83,6 +84,9 @@ class Ground:
         if known.mode is not Mode.COMMANDED:
             why = f"in mode {known.mode_name or known.mode.value} when the bridge came back"
             return Next(phase=Phase.ABORTED, why=why)
+        if breach is not None:
+            why = f"outside the fence when the bridge came back: {breach}"
+            return Next(phase=Phase.LANDING, why=why, down=self.settings.then)
         return None
 
     def prepare(self, now_s: float, known: Telemetry, begun: bool) -> Next:

@@ -60,11 +60,15 @@ class Watch:
 
     Args:
         settings: what is wrong, and what is not.
+        at_rest_v: of the battery, see there.
+
+    Attributes:
+        battery: judges it.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, at_rest_v: float | None = None) -> None:
         self.settings = settings
-        self._battery = Battery(settings.least_battery)
+        self.battery = Battery(settings.least_battery, at_rest_v)
         self._believed: Telemetry | None = None  # the last one whose position could be true
 
     def link_is_lost(self, now_s: float, known: Telemetry) -> bool:
@@ -84,7 +88,7 @@ class Watch:
 
     def battery_is_low(self, known: Telemetry) -> str | None:
         """What is wrong with its charge; None: nothing, or it does not tell."""
-        return self._battery.low(known) if self.settings.least_battery > 0 else None
+        return self.battery.low(known) if self.settings.least_battery > 0 else None
 
     def _jumped(self, known: Telemetry) -> str | None:
         """Is the vehicle where it cannot have flown since it was somewhere believable."""
