@@ -19,68 +19,13 @@ import pytest
 
 from tests.autopilot.flight import Fake, fake
 from tests.conftest import Ros, finish, read_bag, wait_for
-from tests.small_worlds import config
 from uav_dc_ros import scenarios
-from uav_dc_ros.agents import network
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.crowd import Crowd
-from uav_dc_ros.core.grid import Action
-from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.registration import ENV_ID
 
 FIVE = scenarios.load("five_clusters")
 STEPS = 7  # of the low world's missions
-
-LOW = """
-name = "low"
-[grid]
-n_x = 8
-n_y = 2
-n_z = 1
-cell_m = 20.0
-altitude_min_m = 10.0
-altitude_step_m = 10.0
-[users]
-cluster_centres_m = [[60.0, 10.0]]
-users_per_cluster = 4
-cluster_radius_m = 10.0
-v_max_mps = 1.0
-[mission]
-start_m = [0.0, 0.0, 10.0]
-dock_m = [140.0, 0.0]
-step_s = 10.0
-max_steps = 7
-d_cons_m = 50.0
-r_min_bits = 1e7
-episode_end = "on_arrival"
-[radio]
-bandwidth_hz = 1e6
-tx_power_w = 5.0
-noise_power_dbm = -110.0
-ref_gain_db = -50.0
-path_loss_exponent = 2.0
-interference = "all"
-[reward]
-beta = 1.0
-zeta = 1.0
-r_plus = "binary"
-form = "episode"
-data_scale_bits = 1e7
-"""
-
-
-@pytest.fixture
-def low(tmp_path: Path) -> tuple[object, ...]:
-    """Options for a low world, where a flight takes a minute, and a policy that goes east to its dock."""
-    path = tmp_path / "low.toml"
-    path.write_text(LOW)
-    scenario: Scenario = scenarios.load(path)
-    made = config(scenario, name="eastward")
-    parameters = network.initial(made.architecture(scenario), np.random.default_rng(1))
-    zeros = {name: np.zeros_like(array) for name, array in parameters.items()}
-    zeros["advantage.bias"][int(Action.RIGHT)] = 1.0
-    policies.save(tmp_path / "eastward", made, zeros, lambda _: "# test\n")
-    return "--scenario", path, "--policy", tmp_path / "eastward"
 
 
 def beside(autopilot: Fake, *options: object) -> tuple[object, ...]:

@@ -15,6 +15,7 @@ from uav_dc_ros import messages, scenarios
 from uav_dc_ros.autopilot.bridge import Bridge, Standing
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
@@ -26,7 +27,7 @@ from uav_dc_ros.nodes.lease import Lease
 from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
 from uav_dc_ros.topics import TOPICS
 
-TICK_S = 0.05  # vehicle time
+TICK_S = 0.02  # vehicle time
 TICK_LEAST_S = 0.005  # steady time: a simulated vehicle may be faster than anybody can look
 SPEED_OVER_S = 0.5  # steady time over which the speed of the vehicle's time is measured
 OBEYS_S = 2.5  # for a vehicle to obey a bridge that stops
@@ -81,6 +82,7 @@ class AutopilotBridge(MissionNode):
         self._setpoint: Enu | None = None  # published last as `target`
         self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
         self._policy = Lease(self, TOPICS["move"])
+        run_when_due()  # this thread; those of the middleware stay as they are
         self.vehicle.open()
         self._timer = self.timer(TICK_S, self._tick)
         if self.taken_up:
