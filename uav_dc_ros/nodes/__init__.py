@@ -4,6 +4,7 @@ The tables, each the only list of its kind:
 
 table            NODES: what each node is, hears and says, when it starts, and how often again
 parameters       every parameter: description, unit, range
+bridge_parameters  those of the bridge: the way to the vehicle, and how carefully it is flown
 qos              profiles of the topics of `uav_dc_ros.topics`, and the peers that do not match
 
 What all nodes are made of, the lower ones first:
@@ -19,7 +20,9 @@ executable       what `ros2 run` starts: any of the nodes, by the name that it i
 
 The nodes:
 
-world            the vehicle in simulation, and the users who walk about
+world            the vehicle in simulation, and the users who walk about; surroundings: users around a real one
+bridge           a real vehicle; vehicles/ are the ways to it (MAVLink, MAVROS, PX4's topics); lease notices
+                 that a policy was killed
 channel_monitor  SINR, rates, and the data collected
 policy           decides moves with a trained policy; pairs brings together what belongs to one step
 recorder         writes the mission's bag; record, whatever anybody publishes (`bag record`); both are made of
@@ -30,6 +33,7 @@ live_view        serves the mission to Foxglove; foxglove_server is its server
 What run_all is made of:
 
 flight           one run: check everything, start, follow, stop, tell
+options          what of its options needs more than the command line to be checked
 supervisor       brings nodes up in order, starts dead ones again, takes them down in reverse
 launcher         a node as a child process
 observer         run_all's own eyes: the mission so far, and its summary
