@@ -6,6 +6,7 @@ The aircraft is what cannot exist here: see tests/autopilot/autopilot.py for wha
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -131,7 +132,7 @@ def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
 
 
 def test_a_pilot_arms_where_the_bridge_may_not(ros: Ros, low: tuple[object, ...]) -> None:
-    with fake("ardupilot", speed=8.0) as autopilot:
+    with fake("ardupilot", speed=16.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--bag", "bag"))
         assert process.stdout is not None
         shown = wait_for(process.stdout, "waiting for a pilot")
@@ -149,7 +150,7 @@ def test_a_pilot_arms_where_the_bridge_may_not(ros: Ros, low: tuple[object, ...]
 
 def test_a_killed_policy_makes_the_vehicle_hold(ros: Ros, low: tuple[object, ...]) -> None:
     """Within half a second, in the middle of a move, where it is; the policy comes back, and it goes on."""
-    with fake("ardupilot", speed=4.0) as autopilot:
+    with fake("ardupilot", speed=8.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 3), process)
         before = len(autopilot.all("setpoint"))
@@ -169,7 +170,7 @@ def test_a_killed_policy_makes_the_vehicle_hold(ros: Ros, low: tuple[object, ...
 @pytest.mark.parametrize("kind", ["ardupilot", pytest.param("px4", marks=pytest.mark.long)])
 def test_a_killed_bridge_takes_the_mission_up_again(ros: Ros, low: tuple[object, ...], kind: str) -> None:
     """ArduCopter hovers meanwhile; PX4 misses the stream, and returns: then the mission is over."""
-    with fake(kind, speed=4.0) as autopilot:
+    with fake(kind, speed=8.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 3), process)
         killed(ros, "bridge")
@@ -191,7 +192,7 @@ def test_a_killed_bridge_takes_the_mission_up_again(ros: Ros, low: tuple[object,
 
 @pytest.mark.long
 def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object, ...]) -> None:
-    with fake("ardupilot", speed=4.0) as autopilot:
+    with fake("ardupilot", speed=8.0) as autopilot:
         options = beside(autopilot, "--arm", "--bag", "bag", "--set", "bridge.flying_at_start=land")
         process = ros.start("uav_dc_ros.run_all", *low, *options, "--set", "bridge.then=land")
         until(lambda: flies_east(autopilot, 3), process)
@@ -210,7 +211,7 @@ def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object,
 def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
     ros: Ros, low: tuple[object, ...], number: signal.Signals, wanted: int
 ) -> None:
-    with fake("ardupilot", speed=4.0) as autopilot:
+    with fake("ardupilot", speed=8.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 2), process)
         process.send_signal(number)
@@ -229,8 +230,23 @@ def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
 
 
 @pytest.mark.long
+def test_a_journal_that_cannot_be_written_stops_no_flight(ros: Ros, low: tuple[object, ...]) -> None:
+    folder = ros.folder / "kept"
+    folder.mkdir()
+    with fake("ardupilot", speed=8.0) as autopilot:
+        options = beside(autopilot, "--arm", "--bag", "bag", "--set", f"bridge.journal={folder / 'flight'}")
+        process = ros.start("uav_dc_ros.run_all", *low, *options)
+        until(lambda: flies_east(autopilot, 2), process)
+        shutil.rmtree(folder)
+        status, output = finish(process)
+    assert status == 0, output
+    assert output.count("a bridge that is killed now will not know where it was: journal") == 1
+    check_steps(ros.folder / "bag")
+
+
+@pytest.mark.long
 def test_a_pilot_who_takes_over_keeps_the_vehicle(ros: Ros, low: tuple[object, ...]) -> None:
-    with fake("ardupilot", speed=4.0) as autopilot:
+    with fake("ardupilot", speed=8.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 2), process)
         autopilot.do("mode", "LOITER")

@@ -21,7 +21,7 @@ FLOWN = ["takeoff", *["ready", "moving"] * 7, "landing"]
 
 def test_a_mission_beside_mavros(ros: Ros, low: tuple[object, ...]) -> None:
     """Standard messages alone: a pilot arms, and lands; between, the policy flies."""
-    with fake(ros, "px4", "--speed", 8) as mavros:
+    with fake(ros, "px4", "--speed", 16) as mavros:
         process = ros.start("uav_dc_ros.run_all", *low, "--vehicle", "mavros", "--bag", "bag")
         assert process.stdout is not None
         shown = wait_for(process.stdout, "waiting for a pilot")
@@ -46,6 +46,7 @@ def test_arming_through_mavros_needs_its_messages(ros: Ros) -> None:
     assert "mavros_msgs" in output
 
 
+@pytest.mark.long
 def test_a_mission_on_px4_s_topics(
     ros: Ros, low: tuple[object, ...], tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -181,6 +181,7 @@ def test_the_bag_says_what_it_is_about(flown: Flown) -> None:
         "seed": "0",
         "missions": str(MISSIONS),
         "pace": "lockstep",
+        "vehicle": "simulated",
     }
     assert summary is not None
     assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}

@@ -11,7 +11,8 @@ from tests.conftest import Ros, finish
 from uav_dc_ros.nodes.parameters import EVERY
 from uav_dc_ros.nodes.table import NODES
 
-PROCESSES = [name for name, row in NODES.items() if row.process and not row.on_request]
+PROCESSES = [name for name, row in NODES.items() if row.process and name != "live_view"]
+NOBODY = "tcp:127.0.0.1:9"  # where no autopilot is
 
 
 class Asker:
@@ -70,16 +71,15 @@ def test_a_bad_policy_fails_at_configure_with_its_reason_and_a_good_one_heals_it
 
 
 def test_every_node_goes_all_ways_twice(ros: Ros, asker: Asker) -> None:
-    nodes = {
-        name: waiting(ros, name, *(["-p", f"bag:={ros.folder / name}"] if name == "recorder" else []))
-        for name in PROCESSES
-    }
+    given = {"recorder": ["-p", f"bag:={ros.folder / 'recorder'}"], "bridge": ["-p", f"connect:={NOBODY}"]}
+    nodes = {name: waiting(ros, name, *given.get(name, [])) for name in PROCESSES}
     for turn in range(2):
         for name in nodes:
             for transition, state in (
                 ("configure", "inactive"),
                 ("activate", "active"),
                 ("deactivate", "inactive"),
+                *((("activate", "active"), ("deactivate", "inactive")) if name != "recorder" else ()),
                 ("cleanup", "unconfigured"),
             ):
                 expected = {"success": True, "state": state}

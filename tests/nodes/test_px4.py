@@ -381,8 +381,8 @@ def test_the_stream_ends_a_second_after_those_who_decide(vehicle: px4.Px4, spun:
     vehicle.steer(goal)
     last_ns = time.time_ns()
     spun.pass_time(1.5, hand.say)
-    assert (hand.heartbeats[-1][0] - last_ns) / 1e9 == pytest.approx(px4.LIFE_S, abs=0.2)
-    assert (hand.setpoints[-1][0] - last_ns) / 1e9 == pytest.approx(px4.LIFE_S, abs=0.2)
+    for heard in (hand.heartbeats, hand.setpoints):  # best effort: the last ones may be lost on their way
+        assert 0.5 * px4.LIFE_S <= (heard[-1][0] - last_ns) / 1e9 <= px4.LIFE_S + 0.2
     before = len(hand.heartbeats)
     spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.steer(goal)))
 
@@ -705,7 +705,7 @@ def test_a_pilot_who_takes_over_has_it_at_once(flight: Flight) -> None:
     flight.do("mode 2")
     flight.finish()
     assert flight.log[-1][0] is Phase.ABORTED
-    assert flight.log[-1][2].startswith("taken over: mode POSCTL")
+    assert flight.log[-1][2].startswith("mode POSCTL: changed by a pilot")
     flight.spun.pass_time(0.3, flight.tick)  # what was on its way
     before = [told for told in flight.fake.events if told["event"] in ("command", "setpoint")]
     flight.spun.pass_time(0.5, flight.tick)
@@ -721,7 +721,8 @@ def test_when_nobody_decides_any_more_px4_takes_it_home(flight: Flight) -> None:
     assert flight.fake.all("mode")[-1]["why"] == "failsafe"
     flight.finish()
     phase, _, why = flight.log[-1]
-    assert (phase, why) == (Phase.ABORTED, "taken over: mode AUTO_RTL (failsafe)")
+    changed = "changed by a pilot or by the autopilot's failsafe"
+    assert (phase, why) == (Phase.ABORTED, f"mode AUTO_RTL (failsafe): {changed}")
 
 
 @pytest.mark.parametrize(
@@ -738,10 +739,15 @@ def test_without_a_position_it_holds_until_px4_gives_up(
     flight.until(lambda: flight.bridge.step == 2)
     flight.do("speed 0.5")  # so that it is plain who is the first
     flight.do(fault)
-    flight.finish()
-    (phase, step, why), end = flight.log[-2:]
+    flight.until(lambda: flight.bridge.phase is Phase.LANDING)
+    (phase, step, why), (_, _, end) = flight.log[-2:]
     assert (phase.is_over, why) == (False, f"holds: {reason}")
-    assert end == (Phase.ABORTED, step, f"taken over: mode {mode} (failsafe) (after: {reason})")
+    assert end.startswith(
+        f"mode {mode} (failsafe): changed by a pilot or by the autopilot's failsafe (after: {reason}"
+    )
+    flight.do(f"speed {SPEED}")
+    flight.finish()
+    assert flight.log[-1] == (Phase.ABORTED, step, end)
     assert flight.fake.all("mode")[-1]["why"] == "failsafe"
 
 

@@ -11,7 +11,8 @@ import pytest
 
 from tests.autopilot.flight import fake
 from tests.conftest import Ros, finish
-from tests.nodes.test_bridge import flies_east, killed, low, until  # noqa: F401
+from tests.nodes.conftest import low  # noqa: F401
+from tests.nodes.test_bridge import flies_east, killed, until
 from tests.recordings import flown, report_bags
 from tests.recordings.made import changing, copy, flight, said, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, read

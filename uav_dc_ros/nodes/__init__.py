@@ -20,7 +20,7 @@ executable       what `ros2 run` starts: any of the nodes, by the name that it i
 
 The nodes:
 
-world            the vehicle in simulation, and the users who walk about; surroundings: users around a real one
+world            the vehicle in simulation, and the users who walk about; surroundings, around a real one
 bridge           a real vehicle; vehicles/ are the ways to it (MAVLink, MAVROS, PX4's topics); lease notices
                  that a policy was killed
 channel_monitor  SINR, rates, and the data collected

@@ -56,23 +56,20 @@ class AutopilotBridge(MissionNode):
         settings = {name: values[name] for name in names}
         self.settings = Settings(**settings | {"then": Mode(values["then"])})
         self.journal = Journal(values["journal"])
-        kept = self._restore()
-        self.taken_up = kept is not None and kept.standing.flies
-        fence = Fence.around(self.scenario, values["fence_margin_m"])
-        self.bridge = Bridge(
-            self.scenario,
-            self.settings,
-            self._on_change,
-            standing=kept.standing if kept else None,
-            fence=fence,
-        )
-        self.vehicle: Vehicle = vehicles.make(self, values, self.scenario, kept.anchor if kept else "")
+        self.fence = Fence.around(self.scenario, values["fence_margin_m"])
+        vehicles.check(values["vehicle"], values["connect"], values["datum"], values["arm"])
+        self._restore()
 
     def activate(self) -> None:
         """Reach for the vehicle; the mission begins when the peers are ready, or goes on at once."""
+        kept = self._restore()
+        standing, anchor = (None, "") if kept is None else (kept.standing, kept.anchor)
+        self.bridge = Bridge(self.scenario, self.settings, self._on_change, standing, self.fence)
+        self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, anchor)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
-        self._begun = False
+        self._begun = standing is not None and standing.flies
+        self._forgets = False  # the journal cannot be written
         self._known = Telemetry()
         self._told: messages.Mission | None = None
         self._news: list[str] = []  # changes since the last diagnostics
@@ -85,9 +82,8 @@ class AutopilotBridge(MissionNode):
         run_when_due()  # this thread; those of the middleware stay as they are
         self.vehicle.open()
         self._timer = self.timer(TICK_S, self._tick)
-        if self.taken_up:
+        if self._begun:
             self.get_logger().warning(f"takes up a mission at step {self.bridge.step}")
-            self._begun = True
         else:
             self._tell()
 
@@ -155,6 +151,7 @@ class AutopilotBridge(MissionNode):
             raise MessageError("not_now", why)
 
     def _tick(self) -> None:
+        """Look at the vehicle, decide, steer."""
         self._known = known = self.vehicle.telemetry()
         self._keep_pace(known)
         self._publish_pose(known)
@@ -206,7 +203,12 @@ class AutopilotBridge(MissionNode):
             standing=self.bridge.standing,
             anchor=self.vehicle.anchor,
         )
-        self.journal.begin(msgspec.json.encode(kept))
+        try:
+            self.journal.begin(msgspec.json.encode(kept))
+        except NodeError as error:  # no reason to let go of a vehicle that flies
+            if not self._forgets:
+                self.get_logger().error(f"a bridge that is killed now will not know where it was: {error}")
+            self._forgets = True
         self._tell()
 
     def _tell(self) -> None:
@@ -232,11 +234,12 @@ class AutopilotBridge(MissionNode):
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """Where the mission and the vehicle stand."""
-        if self.state != "active":
+        if not self._is_active:
             return [], {}
         bridge, known, now_s = self.bridge, self._known, time.monotonic()
         aborted = bridge.phase is Phase.ABORTED
         warnings = [bridge.reason] if aborted or bridge.fault else []
+        warnings += ["the journal cannot be written"] if self._forgets else []
         values = {
             "phase": bridge.phase.value,
             "reason": bridge.reason,
