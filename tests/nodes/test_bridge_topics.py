@@ -21,12 +21,14 @@ FLOWN = ["takeoff", *["ready", "moving"] * 7, "landing"]
 
 def test_a_mission_beside_mavros(ros: Ros, low: tuple[object, ...]) -> None:
     """Standard messages alone: a pilot arms, and lands; between, the policy flies."""
-    with fake(ros, "px4", "--speed", 16) as mavros:
+    with fake(ros, "px4", "--speed", 6) as mavros:
         process = ros.start("uav_dc_ros.run_all", *low, "--vehicle", "mavros", "--bag", "bag")
         assert process.stdout is not None
         shown = wait_for(process.stdout, "waiting for a pilot")
         mavros.do("arm")
-        while "takeoff" not in shown:
+        for _ in range(60):
+            if "takeoff" in shown:
+                break
             time.sleep(0.3)
             mavros.do("mode OFFBOARD")  # which it refuses until it has seen a second of setpoints
             if mavros.all("mode"):
