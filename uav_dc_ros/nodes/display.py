@@ -16,6 +16,8 @@ from uav_dc_ros.messages import Mission, Phase
 from uav_dc_ros.nodes.observer import MissionSoFar, Summary
 
 REFRESH_S = 0.05
+DAILY = (Phase.READY, Phase.MOVING)  # phases of each step
+NEWS = ("at the start", "holds", "goes on")  # of them
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
 
 
@@ -77,9 +79,10 @@ class Display:
         if told == self._told or not status.reason:
             return
         self._told = told
-        daily = status.phase is Phase.MOVING or (status.phase is Phase.READY and "step" in status.reason)
-        if not daily:
-            self.console.print(f"{status.phase}: {status.reason}", markup=False)
+        if status.phase in DAILY and not status.reason.startswith(NEWS):
+            return
+        self._bar.update(self._task, description=status.phase.value)
+        self.console.print(f"{status.phase}: {status.reason}", markup=False)
 
     def node_line(self, node: str, line: str) -> None:
         """Pass on a line that a node printed."""
