@@ -41,7 +41,7 @@ KEYS = {
         *("DeviceAllow", "ProtectSystem", "ProtectHome", "PrivateTmp", "ProtectKernelTunables"),
         *("ProtectKernelModules", "ProtectControlGroups", "RestrictAddressFamilies", "RestrictNamespaces"),
         *("RestrictSUIDSGID", "LockPersonality", "NoNewPrivileges", "CapabilityBoundingSet"),
-        "SystemCallArchitectures",
+        *("SystemCallArchitectures", "LimitRTPRIO"),
     },
 }
 

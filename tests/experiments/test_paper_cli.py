@@ -65,6 +65,7 @@ def test_a_finished_sweep_is_drawn_again(smoke):
     assert_equal(before, Results.load(smoke))
 
 
+@pytest.mark.long
 def test_a_killed_sweep_goes_on_and_leaves_no_process(tmp_path):
     """Killed with shards of different lengths half done; the workers notice, and end."""
     options = ("--only", "lr", "batch", "reward3clusters", "--workers", 2)

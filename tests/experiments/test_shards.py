@@ -54,6 +54,7 @@ def test_workers_bring_what_one_process_brings(tmp_path, expected):
     assert sorted(os.listdir(tmp_path)) == sorted(shards.result_file(tmp_path, one).name for one in expected)
 
 
+@pytest.mark.long
 def test_a_killed_worker_is_replaced(tmp_path, expected, monkeypatch):
     killed = []
 

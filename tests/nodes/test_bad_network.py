@@ -153,7 +153,7 @@ def fly(
     from_the_start: bool = False,
     cut_s: float = 0.0,
 ) -> Flown:
-    """Fly a mission on two hosts; the link turns bad, and is cut at step 5, if it lasts so long."""
+    """Fly a mission on two hosts; the link turns bad before it, and is cut at step 5, if it lasts so long."""
     bag = ros.folder / "bag"
     nodes = ["world", "channel_monitor", "policy", "recorder"]
     shared = {"scenario": str(mission.scenario), "peers": nodes}
@@ -166,11 +166,10 @@ def fly(
         try:
             started |= start(ros, link, "b", {"recorder": shared | policy | {"bag": str(bag)}})
             started |= start(ros, link, "b", {"policy": shared | policy})
-            started |= start(
-                ros, link, "a", {"channel_monitor": shared, "world": shared | {"pace": str(pace)}}
-            )
+            started |= start(ros, link, "a", {"channel_monitor": shared})
+            link.set(**bad)  # before the world starts: its lockstep may take less time than this
+            started |= start(ros, link, "a", {"world": shared | {"pace": str(pace)}})
             listener.wait_for(0)
-            link.set(**bad)
             if cut_s:
                 listener.wait_for(5)
                 link.partition()

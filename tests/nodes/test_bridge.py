@@ -85,7 +85,9 @@ def simulated_cells(seed: int) -> list[list[int]]:
     return cells
 
 
-@pytest.mark.parametrize(("kind", "wire"), [("ardupilot", "tcp"), ("px4", "udp")])
+@pytest.mark.parametrize(
+    ("kind", "wire"), [("ardupilot", "tcp"), pytest.param("px4", "udp", marks=pytest.mark.long)]
+)
 def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
     """It takes off, flies the cells of the simulation with that seed among the same users, and lands."""
     with fake(kind, wire, speed=100.0) as autopilot:
@@ -131,6 +133,7 @@ def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
     assert changes == of_mission, "every change is in the diagnostics, too"
 
 
+@pytest.mark.long
 def test_a_pilot_arms_where_the_bridge_may_not(ros: Ros, low: tuple[object, ...]) -> None:
     with fake("ardupilot", speed=16.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--bag", "bag"))
@@ -227,6 +230,32 @@ def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
             assert "aborted" in output
             assert statuses(ros.folder / "bag")[-1]["reason"] == "the bridge was stopped"
         assert ros.gone()
+
+
+@pytest.mark.long
+def test_broken_moves_and_moves_out_of_turn_change_nothing(ros: Ros, low: tuple[object, ...]) -> None:
+    broken = {
+        '{"mission":0': "malformed",
+        '{"mission":0,"step":0}': "invalid",
+        '{"mission":1,"step":2,"action":"upward"}': "wrong_step",
+        '{"mission":0,"step":99,"action":"upward"}': "not_now",
+    }
+    with fake("ardupilot", speed=4.0) as autopilot:
+        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
+        until(lambda: flies_east(autopilot, 1), process)
+        probe = ros.stranger("probe")
+        assert probe.stdin is not None
+        for data in broken:
+            command = {"topic": "move", "data": data, "hearing": 2}
+            probe.stdin.write((json.dumps(command) + "\n") * 5)
+        probe.stdin.close()
+        status, output = finish(process)
+        probe.wait(30)
+    assert status == 0, output
+    assert "Traceback" not in output
+    check_steps(ros.folder / "bag")
+    for reason in broken.values():
+        assert f"move {reason} 5" in output
 
 
 @pytest.mark.long

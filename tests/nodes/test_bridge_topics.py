@@ -19,6 +19,7 @@ def phases(bag: Path) -> list[str]:
 FLOWN = ["takeoff", *["ready", "moving"] * 7, "landing"]
 
 
+@pytest.mark.long
 def test_a_mission_beside_mavros(ros: Ros, low: tuple[object, ...]) -> None:
     """Standard messages alone: a pilot arms, and lands; between, the policy flies."""
     with fake(ros, "px4", "--speed", 6) as mavros:

@@ -51,7 +51,7 @@ def test_ctrl_c_stops_everything_and_leaves_a_readable_bag(
         pytest.param("world", marks=pytest.mark.long),
         pytest.param("channel_monitor", marks=pytest.mark.long),
         "policy",
-        "recorder",
+        pytest.param("recorder", marks=pytest.mark.long),
     ],
 )
 def test_a_node_that_is_killed_is_started_again_and_the_vehicle_hovers_meanwhile(
