@@ -60,7 +60,7 @@ class Display:
     def step(self, now: MissionSoFar) -> None:
         """Show a step: on a terminal a few times a second, elsewhere a few lines a mission."""
         shown = now.step % self._every == 0 if self._bar.disable else time.monotonic() >= self._next_s
-        if not (shown or now.over):
+        if not (shown or now.over or now.step == self.scenario.mission.max_steps):
             return
         self._next_s = time.monotonic() + REFRESH_S
         title = "mission" if self.missions == 1 else f"mission {now.mission + 1} of {self.missions}"
