@@ -93,7 +93,7 @@ class AutopilotBridge(MissionNode):
         if self._begun and not bridge.is_over:
             bridge.stop("the bridge was stopped")
             deadline_s = time.monotonic() + OBEYS_S
-            while not (bridge.is_done_with(self._known)) and time.monotonic() < deadline_s:
+            while not bridge.is_done_with(self._known) and time.monotonic() < deadline_s:
                 self._tick()
                 time.sleep(TICK_LEAST_S)
         self._tell_diagnostics()  # the last changes, too
