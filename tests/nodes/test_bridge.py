@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from tests.autopilot.flight import Fake, fake
 from tests.conftest import Ros, finish, read_bag, wait_for
@@ -35,7 +36,10 @@ def beside(autopilot: Fake, *options: object) -> tuple[object, ...]:
 
 def statuses(bag: Path) -> list[dict[str, Any]]:
     """What the vehicle said, in order."""
-    return [payload for topic, payload in read_bag(bag) if topic == "/mission"]
+    with AnyReader([bag]) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic == "/mission"]
+        texts = [reader.deserialize(data, one.msgtype).data for one, _, data in reader.messages(wanted)]
+    return [json.loads(text) for text in texts]
 
 
 def check_steps(bag: Path, steps: int = STEPS) -> None:

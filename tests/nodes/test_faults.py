@@ -57,7 +57,7 @@ def test_ctrl_c_stops_everything_and_leaves_a_readable_bag(
 def test_a_node_that_is_killed_is_started_again_and_the_vehicle_hovers_meanwhile(
     ros: Ros, arguments: list[object], tmp_path: Path, node: str
 ) -> None:
-    process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", 80)  # steps of an eighth of a second
+    process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", 40)  # steps of a quarter of a second
     assert process.stdout is not None
     wait_for(process.stdout, FLYING)
     os.kill(ros.node(node), signal.SIGKILL)

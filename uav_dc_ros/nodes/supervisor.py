@@ -18,7 +18,7 @@ from uav_dc_ros.nodes.table import NODES
 RESTART_WINDOW_S = 60.0  # deaths longer ago are forgiven
 BACK_OFF_S = 0.2  # before the first restart; twice as long before each further one
 ANSWER_S = 1.0  # for an answer of a node; a dead one's service may stand in the graph for a while
-STOP_S = 5.0  # for a node to end after it was asked to
+STOP_S = 10.0  # for a node to end after it was asked to: a bridge waits for its vehicle to obey
 UP = ("unconfigured", "inactive", "active")  # the way up; each transition leads to the next
 TRANSITIONS = {"unconfigured": Transition.TRANSITION_CONFIGURE, "inactive": Transition.TRANSITION_ACTIVATE}
 
