@@ -78,12 +78,21 @@ def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Arra
     Raises:
         MessageError: another number of users than the scenario's.
     """
+    check_users(payload, scenario)
+    return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
+
+
+def check_users(payload: messages.Rates, scenario: Scenario) -> None:
+    """Refuse the rates of another scenario's users.
+
+    Raises:
+        MessageError: another number of users than the scenario's.
+    """
     if len(payload.data_bits) != scenario.n_users:
         raise MessageError(
             "layout",
             f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
         )
-    return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
 
 
 def check_world(payload: messages.Mission, scenario: Scenario) -> None:

@@ -167,7 +167,7 @@ class Observer(MissionNode):
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Follow the collection."""
-        payloads.collection(payload, self.scenario)
+        payloads.check_users(payload, self.scenario)
         self._hear(payload)
 
     def _hear(self, payload: messages.Mission | messages.Rates) -> None:

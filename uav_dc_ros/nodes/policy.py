@@ -41,7 +41,7 @@ class Policy(MissionNode):
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Note what has been collected by a step."""
-        payloads.collection(payload, self.scenario)  # refuse another scenario's rates before they wait
+        payloads.check_users(payload, self.scenario)  # before it waits
         self._hear(payload)
 
     def _hear(self, payload: messages.Mission | messages.Rates) -> None:

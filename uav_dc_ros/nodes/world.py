@@ -22,6 +22,7 @@ import numpy as np
 from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
+from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError
@@ -75,6 +76,7 @@ class World(MissionNode):
         self._phase: Phase | None = None  # none before the first mission
         self._action: Action | None = None  # that has come for this step
         self._seen_by_tick: tuple[int, int] | None = None
+        self._ahead: tuple[int, int, bytes] | None = None  # mission, step, and its `users`, encoded
         self._hovered = 0  # steps without a move in time
         self._overruns, self._overruns_told = 0, 0
         self._lateness_s: deque[float] = deque(maxlen=1000)
@@ -239,23 +241,24 @@ class World(MissionNode):
 
     def _tell(self) -> None:
         """Publish the state of this step. What the move waits for comes first."""
-        users_m = self._crowd.positions_m
-        position_m = self.scenario.grid.centre_m(self._cell, like=users_m)
-        time_ns = self._time_ns()
-        pose = cdr.pose(position_m, time_ns)
+        position_m = self.scenario.grid.centre_m(self._cell, like=self._crowd.positions_m)
+        pose = cdr.pose(position_m, self._time_ns(self._step))
         self.publish("pose", pose)
-        self.say(
-            "users",
-            payloads.users(
-                self.scenario,
-                self._crowd.positions_m,
-                mission=self._mission,
-                step=self._step,
-                time_ns=time_ns,
-            ),
-        )
+        if self._ahead is not None and self._ahead[:2] == (self._mission, self._step):
+            self.say_encoded("users", self._ahead[2])
+        else:
+            self.say_encoded("users", self._users(self._step, self._crowd.positions_m))
         self.say("mission", self._status())
         self.publish("target", pose)  # a simulated vehicle is where it was sent to
+        if self.pace is None and self._phase is Phase.READY:  # while the others are at work
+            self._ahead = self._mission, self._step + 1, self._users(self._step + 1, self._crowd.ahead_m())
+
+    def _users(self, step: int, users_m: Array) -> bytes:
+        """The users of a step, metres `[U, 2]`, as they are said."""
+        time_ns = self._time_ns(step)
+        return messages.encode(
+            payloads.users(self.scenario, users_m, mission=self._mission, step=step, time_ns=time_ns)
+        )
 
     def _status(self) -> messages.Mission:
         assert self._phase is not None, "a mission has begun"
@@ -271,9 +274,9 @@ class World(MissionNode):
             fingerprint=self.scenario.fingerprint,
         )
 
-    def _time_ns(self) -> int:
-        """Mission time of this step; missions follow each other one step apart."""
-        steps = self._mission * (self.scenario.mission.max_steps + 1) + self._step
+    def _time_ns(self, step: int) -> int:
+        """Mission time of a step; missions follow each other one step apart."""
+        steps = self._mission * (self.scenario.mission.max_steps + 1) + step
         return round(steps * self.scenario.mission.step_s * 1e9)
 
     def _now_ns(self) -> int:
@@ -281,7 +284,7 @@ class World(MissionNode):
         passed_s = 0.0
         if self.pace is not None and self._phase is Phase.READY:
             passed_s = (time.monotonic() - self._step_began_s) * self.pace
-        return self._time_ns() + round(min(passed_s, self.scenario.mission.step_s) * 1e9)
+        return self._time_ns(self._step) + round(min(passed_s, self.scenario.mission.step_s) * 1e9)
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """Where the mission stands, and whether its steps keep their time."""
