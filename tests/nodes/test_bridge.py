@@ -171,6 +171,7 @@ def test_a_killed_policy_makes_the_vehicle_hold(ros: Ros, low: tuple[object, ...
         check_steps(ros.folder / "bag")
         reasons = [status["reason"] for status in statuses(ros.folder / "bag")]
         assert "holds: the policy is gone" in reasons
+        assert "moving: holds: the policy is gone\n" in output, "it is told while it happens"
         assert "goes on after: holds: the policy is gone" in reasons
 
 

@@ -11,6 +11,7 @@ asking   when to utter a wish
 course   where a mission stands on the grid
 ground   before the first step
 descent  what brings a vehicle down
+beat     of a stream of setpoints
 priority running when it is due
 bridge   from connecting to landing: phases, steps, faults
 mavlink  a transport: an autopilot on MAVLink, over TCP, UDP or a serial line

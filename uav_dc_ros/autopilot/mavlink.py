@@ -17,6 +17,7 @@ import time
 from collections import deque
 from typing import Any, Self
 
+from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S, STREAM_VEHICLE_S, following
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, ONCE, Hearing
 from uav_dc_ros.autopilot.links import Address, Link, LinkDown, load_serial
@@ -32,9 +33,6 @@ LOCAL_NED = 1  # MAV_FRAME; the one that ArduPilot and PX4 both take
 POSITION_ONLY = 0xDF8  # POSITION_TARGET_TYPEMASK: ignore velocity, acceleration, yaw and its rate
 
 HEARTBEAT_S = 1.0
-STREAM_S = 0.05
-STREAM_VEHICLE_S = 0.2  # of a simulated vehicle whose time runs faster; PX4 wants more than 2 Hz of that
-LIFE_S = 1.0
 ASK_AGAIN_S = 3.0  # for a message that does not come
 OPEN_AGAIN_S = 0.5
 SILENCE_S = 10.0  # after which a link that says nothing is opened anew
@@ -203,7 +201,7 @@ class Mavlink:
                     wishes = list(self._wishes)
                     self._wishes.clear()
                 if due_anew := now_s >= heartbeat_s:
-                    heartbeat_s = _next(heartbeat_s, HEARTBEAT_S, now_s)
+                    heartbeat_s = following(heartbeat_s, HEARTBEAT_S, now_s)
                     if alive:
                         self._send_heartbeat()
                 if due_anew or self._hearing.wanted().keys() - self._asked_s.keys():
@@ -212,7 +210,7 @@ class Mavlink:
                     self._send_wish(wish)
                 due = now_s >= stream_s or setpoint != streamed
                 if due or vehicle_s - streamed_vehicle_s >= STREAM_VEHICLE_S:
-                    stream_s = _next(stream_s, STREAM_S, now_s) if now_s >= stream_s else stream_s
+                    stream_s = following(stream_s, STREAM_S, now_s) if now_s >= stream_s else stream_s
                     streamed_vehicle_s, streamed = vehicle_s, setpoint
                     if alive and setpoint is not None:
                         self._send_setpoint(setpoint, vehicle_s)
@@ -320,8 +318,3 @@ class Mavlink:
                 *(*ned, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
             )
         )
-
-
-def _next(due_s: float, period_s: float, now_s: float) -> float:
-    """When something is due again: on the beat, and without catching up on beats that were missed."""
-    return due_s + period_s if now_s < due_s + period_s else now_s + period_s

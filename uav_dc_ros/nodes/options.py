@@ -12,6 +12,9 @@ from uav_dc_ros.nodes import vehicles
 from uav_dc_ros.nodes.table import NODES
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
+# Parameters that are options of run_all.
+OPTIONS = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", "connect", "arm", "datum")
+
 
 def nodes(options: argparse.Namespace) -> list[str]:
     """Names of the nodes to start here.
@@ -53,8 +56,10 @@ def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[st
         if node not in nodes:
             raise ParameterError(f"{told}: expected a node that is started here: {', '.join(nodes)}")
         row = next((row for row in NODES[node].parameters if row.name == name), None)
+        if name in OPTIONS:
+            raise ParameterError(f"{told}: expected --{name}, which tells all nodes alike")
         if row is None:
-            known = ", ".join(row.name for row in NODES[node].parameters)
+            known = ", ".join(row.name for row in NODES[node].parameters if row.name not in OPTIONS)
             raise ParameterError(f"{told}: node {node} has no such parameter; expected some of {known}")
         try:
             value = text if isinstance(row.default, str) else msgspec.json.decode(text)

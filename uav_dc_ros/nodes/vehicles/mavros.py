@@ -46,6 +46,7 @@ from uav_dc_ros.nodes.vehicles.stream import Stream
 
 SETPOINT = "mavros/setpoint_position/local"
 DIAGNOSTICS = "/diagnostics"  # absolute, as diagnostic_updater publishes it
+LOOK_S = 1.0  # between two looks at who else is there
 BATTERY, STATUSTEXT = "mavros/battery", "mavros/statustext/recv"
 
 # Best effort hears publishers of either kind (MAVROS's sensor data are best effort), and reliable is heard by
@@ -95,6 +96,8 @@ class Mavros:
         self._subscriptions: dict[str, Any] = {}
         self._commands: Commands | None = None
         self._closed = False
+        self._looked_s = -math.inf  # when others were looked for last, and what is wrong with them
+        self._wrong: str | None = None
 
     def open(self) -> None:
         """Begin to listen."""
@@ -155,7 +158,9 @@ class Mavros:
         known = hearing.telemetry(now_s, self._commands.refusal, self._commands.said)
         if known.missing is not None or self._restarted:
             return known
-        return dataclasses.replace(known, missing=self._others())
+        if now_s - self._looked_s >= LOOK_S:
+            self._looked_s, self._wrong = now_s, self._others()
+        return dataclasses.replace(known, missing=self._wrong)
 
     def steer(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more.

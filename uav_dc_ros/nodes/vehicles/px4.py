@@ -22,15 +22,13 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uav_dc_ros.autopilot import dialects
+from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S, STREAM_VEHICLE_S, following
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned
 from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.nodes.vehicles.px4_hearing import COMPANION, Px4Hearing
 
-STREAM_S = 0.05
-STREAM_VEHICLE_S = 0.2  # of a simulated vehicle whose time runs faster; PX4 wants more than 2 Hz of that
-LIFE_S = 1.0
 POSE_S = 0.5
 LOOK_S = 1.0  # between two looks at which topics there are
 NOT_CONTROLLED = [math.nan] * 3
@@ -238,8 +236,8 @@ class Px4:
                 now_s = time.monotonic()
                 self._urgent, self._streamed_vehicle_s = False, self._hearing.vehicle_s
                 ned = self._wanted(now_s)
-            if now_s >= due_s:  # on the beat, and without catching up on beats that were missed
-                due_s = due_s + STREAM_S if now_s < due_s + STREAM_S else now_s + STREAM_S
+            if now_s >= due_s:
+                due_s = following(due_s, STREAM_S, now_s)
             try:
                 if ned is not None:
                     self._send(ned)

@@ -5,10 +5,8 @@ import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S, following
 from uav_dc_ros.autopilot.priority import run_when_due
-
-STREAM_S = 0.05
-LIFE_S = 1.0  # after the last sign of life of those who decide
 
 Target = TypeVar("Target")
 
@@ -70,8 +68,8 @@ class Stream(Generic[Target]):
                 now_s = time.monotonic()
                 alive = now_s - self._alive_s <= LIFE_S
                 sent = self._target
-            if now_s >= due_s:  # on the beat, and without catching up on beats that were missed
-                due_s = due_s + STREAM_S if now_s < due_s + STREAM_S else now_s + STREAM_S
+            if now_s >= due_s:
+                due_s = following(due_s, STREAM_S, now_s)
             if alive and sent is not None:
                 try:
                     self._send(sent)
