@@ -16,7 +16,6 @@ from uav_dc_ros.topics import SIMULATED, VEHICLES
 PROG = "python -m uav_dc_ros.run_all"
 PORT_MAX = 65535
 LIVE_PORT = 8765  # Foxglove's own default
-WATCHABLE_PACE = 90.0  # a mission of sixty steps of 15 s in ten seconds
 
 
 def parser() -> cli.Parser:
@@ -54,7 +53,7 @@ def parser() -> cli.Parser:
     options.add_argument(
         "--pace",
         type=_pace,
-        default=WATCHABLE_PACE,
+        default=pace.WATCHABLE,
         metavar="lockstep|FACTOR",
         help="as fast as the nodes can, or how many times faster than real time (default: %(default)g); a "
         "real vehicle has its own",

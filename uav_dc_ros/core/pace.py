@@ -8,6 +8,7 @@ if TYPE_CHECKING:  # a command line reads its pace before anything heavy is impo
     from uav_dc_ros.core.scenario import Scenario
 
 LOCKSTEP = "lockstep"
+WATCHABLE = 90.0  # a mission of sixty steps of 15 s in ten seconds
 PACE_MAX = 1e6
 TIME_MAX_S = 2.0**31  # the seconds of a ROS time are 32 bits with a sign
 PERIOD_MIN_S = 0.005  # of a step at a pace; one in lockstep takes a millisecond or two

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.nodes import vehicles
 from uav_dc_ros.nodes.table import NODES
@@ -87,6 +88,8 @@ def check_vehicle(options: argparse.Namespace, nodes: list[str]) -> None:
             raise ParameterError(f"--{name}: expected the node 'bridge' among --nodes")
     if simulated:
         return
+    if options.pace != pace.WATCHABLE:
+        raise ParameterError(f"--pace: expected none with --vehicle {options.vehicle}, which has its own")
     if options.missions != 1:
         raise ParameterError(f"--missions {options.missions}: expected 1 with --vehicle {options.vehicle}")
     if "bridge" in nodes:

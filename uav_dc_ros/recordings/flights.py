@@ -158,7 +158,8 @@ class Flights(Book):
             lines = [f"{told}, each follows as it may; {self.begun} moves were begun, none of them twice"]
         lines += self.apart.lines()
         if self.holds:
-            lines.append(f"  it held {self.holds} times: bag report tells why")
+            times = "once" if self.holds == 1 else f"{self.holds} times"
+            lines.append(f"  it held {times}: bag report tells why")
         if self.unposed:
             lines.append(f"  {self.unposed} steps have users at a time of which no pose is recorded")
         return lines + [f"  {n} not looked at: {reason}" for reason, n in self.skipped.most_common()]
