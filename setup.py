@@ -50,7 +50,7 @@ def ament():
         "entry_points": {
             "console_scripts": [
                 f"run_all = {NAME}.run_all:main",
-                *(f"{node} = {NAME}.nodes.executable:main" for node in NODES),
+                *(f"{node} = {NAME}.nodes.executable:main" for node in (*NODES, "container")),
             ]
         },
         "options": {

@@ -33,6 +33,11 @@ class Flown:
         told = [float(values["cpu [%]"]) for values in self.diagnostics[node][skip:]]
         return statistics.median(told) if told else float("nan")
 
+    def processes(self, nodes: tuple[str, ...]) -> list[list[str]]:
+        """The nodes, those of one process together."""
+        ids = {node: self.diagnostics[node][-1]["process id"] for node in nodes}
+        return [[node for node in nodes if ids[node] == of] for of in dict.fromkeys(ids.values())]
+
     def last(self, node: str, key: str) -> float:
         """The last value that a node told under a name; NaN if it never did."""
         told = [values[key] for values in self.diagnostics.get(node, []) if key in values]

@@ -5,7 +5,8 @@
 A step is three messages one after the other (world to monitor to policy to world), three more beside them,
 and the computations of all nodes; a bare round trip is two messages and nothing else. Each round measures
 the round trip with rclpy's SingleThreadedExecutor, with its experimental EventsExecutor and with the nodes'
-own, and then flies missions through world, channel monitor, policy and recorder.
+own, and then flies missions through world, channel monitor, policy and recorder: as a lockstep does it, with
+the first three in one process, and with a process for each.
 """
 
 import os
@@ -19,6 +20,7 @@ from flights import ENVIRONMENT, NODES, Flown, fly
 
 MISSIONS = 60
 ROUND_TRIPS = 3000
+WAYS = {"composed": "--compose", "a process for each node": "--no-compose"}
 EXECUTORS = ("SingleThreadedExecutor", "EventsExecutor", "DirectExecutor")
 BARE = """
 import os, statistics, sys, threading, time
@@ -90,7 +92,10 @@ def median(values: list[float]) -> float:
 
 def where(flown: Flown, rate_hz: float) -> None:
     """Print where the time of a step goes."""
-    cpu_ms = {name: flown.cpu_percent(name, skip=1) * 10 / rate_hz for name in (*NODES, "observer")}
+    cpu_ms = {
+        " + ".join(nodes): flown.cpu_percent(nodes[0], skip=1) * 10 / rate_hz
+        for nodes in flown.processes((*NODES, "observer"))
+    }
     told = ", ".join(f"{name} {ms:.2f}" for name, ms in cpu_ms.items())
     print(f"CPU per step, ms: {told}; together {sum(cpu_ms.values()):.2f}, of {os.cpu_count()} cores' time")
     ways = (
@@ -108,30 +113,34 @@ def main() -> None:
     """Print the rates of each round, their medians, and where the time goes."""
     rounds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     trips: dict[str, list[float]] = {executor: [] for executor in EXECUTORS}
-    steps_ms, ratios = [], []
+    steps_ms: dict[str, list[float]] = {way: [] for way in WAYS}
+    ratios: dict[str, list[float]] = {way: [] for way in WAYS}
+    flown: dict[str, Flown] = {}
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(rounds):
             for executor in EXECUTORS:
                 known_silent = executor == "EventsExecutor" and trips[executor]
                 trips[executor].append(float("nan") if known_silent else round_trip_ms(executor))
-            flown = fly(Path(folder), "--pace", "lockstep", "--missions", MISSIONS)
-            steps_ms.append(statistics.median(flown.step_ms))
-            ratios.append(steps_ms[-1] / trips["SingleThreadedExecutor"][-1])
             print(
                 f"bare round trip {trips['SingleThreadedExecutor'][-1]:.3f} ms, with the nodes' executor "
-                f"{trips['DirectExecutor'][-1]:.3f} ms; step {steps_ms[-1]:.3f} ms, "
-                f"{ratios[-1]:.1f} times the bare one"
+                f"{trips['DirectExecutor'][-1]:.3f} ms"
             )
+            for way, option in WAYS.items():
+                flown[way] = fly(Path(folder), "--pace", "lockstep", "--missions", MISSIONS, option)
+                steps_ms[way].append(statistics.median(flown[way].step_ms))
+                ratios[way].append(steps_ms[way][-1] / trips["SingleThreadedExecutor"][-1])
+                print(f"  {way}: step {steps_ms[way][-1]:.3f} ms, {ratios[way][-1]:.1f} times the bare one")
     print(f"medians of {rounds} rounds, {os.cpu_count()} cores")
     for executor in EXECUTORS:
         silent = not any(trip == trip for trip in trips[executor])
         told = "it called no callback" if silent else f"{median(trips[executor]):.3f} ms"
         print(f"bare round trip, {executor}: {told}")
-    print(
-        f"step: {median(steps_ms):.3f} ms, {1e3 / median(steps_ms):.0f} steps/s, "
-        f"{median(ratios):.1f} times the bare round trip"
-    )
-    where(flown, 1e3 / statistics.mean(flown.step_ms))
+    for way in WAYS:
+        print(
+            f"{way}: step {median(steps_ms[way]):.3f} ms, {1e3 / median(steps_ms[way]):.0f} steps/s, "
+            f"{median(ratios[way]):.1f} times the bare round trip"
+        )
+        where(flown[way], 1e3 / statistics.mean(flown[way].step_ms))
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ def main() -> None:
     rates = [STEPS / run["flight"] for run in flown]
     print(f"steps per second in flight: median {statistics.median(rates):.0f}")
     ratio = statistics.median(run["total"] / run["bare node"] for run in flown)
-    print(f"total / bare node: {ratio:.1f} (six processes on {os.cpu_count()} cores)")
+    print(f"total / bare node: {ratio:.1f} (four processes on {os.cpu_count()} cores)")
 
 
 if __name__ == "__main__":

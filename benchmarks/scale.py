@@ -32,6 +32,7 @@ def main() -> None:
             scenario.write_text(text)
             missions = max(1, round(SECONDS_WANTED * min(600, 450_000 / users) / 60))
             options = ("--scenario", scenario, "--policy", "five_clusters_dueling", "--pace", "lockstep")
+            options += ("--no-compose",)  # who takes how much
             flown = fly(Path(folder), *options, "--missions", missions)
             sizes = [flown.payload_bytes[topic] / 1e3 for topic in ("users", "rates")]
             cpu = "  ".join(f"{flown.cpu_percent(name, 1):>{len(name)}.0f}" for name in NODES)

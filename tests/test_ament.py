@@ -32,6 +32,7 @@ PEERS = [name for name in PROCESSES if NODES[name].needed and name != "bridge"]
 OTHERWISE = {
     "no_record": "record:=false",
     "summary": "run_all itself follows the missions and sums them up; under launch nobody does",
+    "compose": "a node of a launch file is a process; `ros2 run uav_dc_ros container` has several",
     "settings": "launch has ways of its own to set a node's parameters",
     "help": "ros2 launch --show-args",
     "version": "in package.xml",
@@ -122,7 +123,7 @@ def test_the_workspace_holds_what_ros2_looks_for(workspace):
     for path in shipped.rglob("*"):
         installed = share / path.relative_to(shipped)
         assert installed.is_dir() if path.is_dir() else installed.read_bytes() == path.read_bytes(), path
-    assert executables(prefix) == {*PROCESSES, "run_all"}
+    assert executables(prefix) == {*PROCESSES, "container", "run_all"}
     for name in executables(prefix):
         assert os.access(prefix / "lib" / "uav_dc_ros" / name, os.X_OK)
 

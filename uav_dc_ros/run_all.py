@@ -110,6 +110,12 @@ def parser() -> cli.Parser:
         help="nodes to start on this host, the others being started elsewhere (default: all)",
     )
     options.add_argument(
+        "--compose",
+        action=argparse.BooleanOptionalAction,
+        help="world, channel monitor and policy in one process (default: in lockstep, where they only wait "
+        "for one another)",
+    )
+    options.add_argument(
         "--live",
         type=_port,
         nargs="?",

@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 import uav_dc_ros
-from tests.conftest import Ros, each_once, read_bag
+from tests.conftest import Ros, each_once, finish, read_bag
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.grid import Action
@@ -193,9 +193,15 @@ def test_the_bag_says_what_it_is_about(flown: Flown) -> None:
         assert ("transient_local" if topic.latched else "volatile") in offered
 
 
-def test_the_same_seed_gives_the_same_payloads(flown: Flown, module_ros: Ros) -> None:
+def test_the_same_seed_gives_the_same_payloads_also_from_a_process_for_each_node(
+    flown: Flown, module_ros: Ros
+) -> None:
     bag = module_ros.folder / "again"
-    status, output = module_ros.run_all("--missions", 2, "--pace", "lockstep", "--bag", bag)
+    given = ("--missions", 2, "--pace", "lockstep", "--no-compose", "--bag", bag)
+    process = module_ros.start("uav_dc_ros.run_all", *given)
+    ids = {module_ros.node(name) for name in ("world", "channel_monitor", "policy", "recorder")}
+    status, output = finish(process)
+    assert len(ids) == 4
     assert status == 0, output
     again = Flown(status, output, bag, [])
     for topic in ("users", "rates", "mission", "move"):

@@ -18,7 +18,8 @@ import pytest
 from tests.conftest import Ros, finish, read_bag
 from uav_dc_ros.nodes.table import NODES
 
-KILLED = ["world", "channel_monitor", "policy", "recorder"]
+COMPOSED = ["world", "channel_monitor", "policy"]
+KILLED = [*COMPOSED, "recorder"]
 MISSIONS = 40
 
 
@@ -43,31 +44,42 @@ def payloads(bag: Path, topic: str) -> dict[tuple[int, int], Any]:
     return found
 
 
-def kill_until_it_ends(ros: Ros, process: subprocess.Popen[str], rng: random.Random, kills: int) -> list[str]:
-    """Kill nodes at random moments, none of them more often than it is started again; their names."""
-    killed: list[str] = []
+def kill_until_it_ends(
+    ros: Ros, process: subprocess.Popen[str], rng: random.Random, kills: int, *, composed: bool
+) -> list[str]:
+    """Kill nodes at random moments, none of them more often than it is started again; the processes' names.
+
+    The first to be killed is the process of several nodes, where there is one.
+    """
+    killed = []
+    deaths = dict.fromkeys(KILLED, 0)
     while len(killed) < kills and process.poll() is None:
         time.sleep(rng.uniform(0.0, 0.8))
-        name = rng.choice([name for name in KILLED if killed.count(name) < NODES[name].restarts])
+        name = rng.choice([name for name in KILLED if deaths[name] < NODES[name].restarts])
+        if composed and not killed:
+            name = "container"
         for process_id, command in ros.processes().items():
             if f"uav_dc_ros.nodes.{name} " in command:
                 os.kill(process_id, signal.SIGKILL)
                 killed.append(name)
+                for node in COMPOSED if name == "container" else [name]:
+                    deaths[node] += 1
                 break
     return killed
 
 
-def check_a_flight_with_kills(ros: Ros, kills: int, seed: int) -> int:
+def check_a_flight_with_kills(ros: Ros, kills: int, seed: int, *, composed: bool) -> int:
     """Fly once in peace, once with kills; how many came in time."""
     calm = flight(ros, "calm")
     status, output = finish(calm)
     assert status == 0, output
-    disturbed = flight(ros, f"disturbed{seed}")
-    killed = kill_until_it_ends(ros, disturbed, random.Random(seed), kills)
+    disturbed = flight(ros, f"disturbed{seed}", "--compose" if composed else "--no-compose")
+    killed = kill_until_it_ends(ros, disturbed, random.Random(seed), kills, composed=composed)
     status, output = finish(disturbed, 180.0)
     assert status == 0, output
     assert "Traceback" not in output
     assert output.count("killed by SIGKILL") == len(killed), output
+    assert output.count("its nodes go on in processes of their own") == composed, output
     assert summaries(ros.folder, f"disturbed{seed}") == summaries(ros.folder, "calm")
     for topic in ("users", "rates", "move"):
         expected = payloads(ros.folder / "calm", topic)
@@ -80,7 +92,7 @@ def check_a_flight_with_kills(ros: Ros, kills: int, seed: int) -> int:
 
 
 def test_missions_end_as_if_nobody_had_been_killed(ros: Ros) -> None:
-    assert check_a_flight_with_kills(ros, kills=10, seed=1) == 10
+    assert check_a_flight_with_kills(ros, kills=10, seed=1, composed=True) == 10
 
 
 @pytest.mark.long
@@ -89,7 +101,7 @@ def test_fifty_kills(ros: Ros) -> None:
     for seed in range(2, 7):
         for name in ("calm", "calm.json"):
             (ros.folder / name).rename(ros.folder / f"{name}_{seed}") if seed > 2 else None
-        total += check_a_flight_with_kills(ros, kills=10, seed=seed)
+        total += check_a_flight_with_kills(ros, kills=10, seed=seed, composed=seed % 2 == 0)
     assert total >= 40
 
 

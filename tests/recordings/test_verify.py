@@ -417,7 +417,9 @@ def test_a_paced_flight_may_hover_where_a_move_came_too_late(tmp_path, capsys):
 def test_missions_whose_nodes_were_killed_verify(ros: Ros, capsys):
     """What a monitor that was killed booked is in its journal; a world flies again what it had flown."""
     bag = ros.folder / "bag"
-    process = ros.start("uav_dc_ros.run_all", "--missions", 25, "--pace", "lockstep", "--bag", bag)
+    process = ros.start(
+        "uav_dc_ros.run_all", "--missions", 25, "--pace", "lockstep", "--no-compose", "--bag", bag
+    )
     for node in ("channel_monitor", "world", "policy"):
         os.kill(ros.node(node), signal.SIGKILL)
         time.sleep(0.7)

@@ -1,5 +1,6 @@
 """What a node tells about itself once a second: rates, latencies, what it rejected, restarts."""
 
+import os
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
@@ -42,7 +43,8 @@ class Meter:
         """Was anything rejected since the last report, and the values; begins a new period."""
         now_s, cpu_s = time.monotonic(), time.process_time()
         period_s = max(now_s - self._since_s, 1e-9)
-        values = {"cpu [%]": f"{100 * (cpu_s - self._cpu_s) / period_s:.1f}"}
+        # Nodes that share a process tell the same of it.
+        values = {"process id": str(os.getpid()), "cpu [%]": f"{100 * (cpu_s - self._cpu_s) / period_s:.1f}"}
         for topic, count in self._said.items():
             values[f"{topic} said [Hz]"] = f"{count / period_s:.1f}"
         for topic, count in self._heard.items():

@@ -48,6 +48,7 @@ class Flight:
             pace.check(self.scenario, options.pace, options.missions)
         self.rows = rows(() if self.is_simulated else ("bridge",))
         self.nodes = run_options.nodes(options)
+        self.together = run_options.together(options, self.nodes)
         self._settings = run_options.settings(options, self.nodes)
         run_options.check_vehicle(options, self.nodes)
         if options.live is not None:
@@ -73,15 +74,18 @@ class Flight:
             signal.signal(number, self._interrupt)
         status = 0
         remapped = ["--ros-args", "-r", f"__ns:={self.options.namespace}", "-r", "/clock:=clock"]
-        with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as journals, self.display:
+        with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, self.display:
+            folder = Path(temporary)
             runtime.give_way()
             rclpy.init(args=remapped, signal_handler_options=SignalHandlerOptions.NO)
-            parameters = self._parameters(Path(journals))
+            parameters = self._parameters(folder)
             seed = self.options.seed if "world" in self.nodes else None
             node = Observer(self.scenario, seed, self._peers(), self._on_status, self._on_step, self._on_end)
             executor = DirectExecutor(node.rest_s)
             executor.add_node(node)
-            with Supervisor(node, parameters, self.display.node_line, self.display.note) as supervisor:
+            with Supervisor(
+                node, parameters, self.together, folder, self.display.node_line, self.display.note
+            ) as supervisor:
                 try:
                     self._follow(supervisor, node, executor)
                 except NodeError as error:
@@ -168,7 +172,7 @@ class Flight:
             peers.remove("bridge")
         return peers
 
-    def _parameters(self, journals: Path) -> dict[str, dict[str, object]]:
+    def _parameters(self, folder: Path) -> dict[str, dict[str, object]]:
         """ROS parameters of the nodes to start."""
         options = self.options
         scenario = options.scenario
@@ -190,7 +194,7 @@ class Flight:
         started = {}
         for name in self.nodes:
             row = self.rows[name]
-            values = given | {"journal": str(journals / name)}
+            values = given | {"journal": str(folder / name)}
             if name == "world" and not self.is_simulated:
                 values["vehicle"] = EXTERNAL
             started[name] = {

@@ -27,10 +27,12 @@ class Journal:
         """Whole lines, without their ends; one that was not finished is taken away.
 
         Raises:
-            NodeError: the file cannot be read.
+            NodeError: the file cannot be read, or is none.
         """
         if self._path is None:
             return []
+        if self._path.exists() and not self._path.is_file():
+            raise NodeError(f"journal {self._path}: it is no file; expected one, or a new one")
         with self._told("read"):
             text = self._path.read_bytes() if self._path.exists() else b""
             whole, _, torn = text.rpartition(b"\n")

@@ -1,6 +1,6 @@
-"""Runs a node of the node table as a process.
+"""Runs a node of the node table as a process, or several in one.
 
-Such a node ends when its standard input ends, so no node outlives a run_all that was killed. What it prints
+Such a process ends when its standard input ends, so none outlives a run_all that was killed. What it prints
 is passed on with its name in front.
 """
 
@@ -12,41 +12,62 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
+from uav_dc_ros.errors import NodeError
+from uav_dc_ros.nodes import environment
 from uav_dc_ros.nodes.mission_node import SUPERVISED
 
 
 class NodeProcess:
-    """One node as a process of its own.
+    """A process of one node, or of several.
 
     Args:
-        name: of a row of the node table.
-        namespace: that it lives in; its clock is that of the namespace, too.
-        parameters: its ROS parameters.
-        restarts: how often it was started before.
-        on_line: called, from a thread, with each line that the node prints.
+        parameters: ROS parameters of its nodes, by name of their rows in the node table.
+        namespace: that they live in; their clock is that of the namespace, too.
+        restarts: how often they were started before.
+        folder: for a file with the parameters.
+        on_line: called, from a thread, with each line that the process prints.
+
+    Raises:
+        NodeError: the file cannot be written.
+
+    Attributes:
+        name: of the module that it runs.
+        who: it, in words.
     """
 
     def __init__(
         self,
-        name: str,
+        parameters: Mapping[str, Mapping[str, object]],
         namespace: str,
-        parameters: Mapping[str, object],
         restarts: int,
+        folder: Path,
         on_line: Callable[[str, str], None],
     ) -> None:
-        self.name = name
-        arguments = [sys.executable, "-m", f"uav_dc_ros.nodes.{name}", "--ros-args"]
-        arguments += ["-r", f"__ns:={namespace}", "-r", "/clock:=clock"]
-        for key, value in parameters.items():
-            arguments += ["-p", f"{key}:={json.dumps(value)}"]  # JSON is YAML: any text arrives as it is
-        environment = {**os.environ, SUPERVISED: str(restarts)}
+        names = list(parameters)
+        alone = len(names) == 1
+        self.name = names[0] if alone else "container"
+        self.who = f"node {self.name}" if alone else f"the container of {', '.join(names)}"
+        file = folder / f"{self.name}.yaml"
+        of_nodes = {f"/**/{name}": {"ros__parameters": values} for name, values in parameters.items()}
+        try:  # JSON is YAML: any text arrives as it is
+            file.write_text(json.dumps(of_nodes, ensure_ascii=False), "utf-8")
+        except (OSError, UnicodeEncodeError) as error:
+            raise NodeError(f"parameters of {self.who} cannot be written to {file}: {error}") from None
+        own = {SUPERVISED: str(restarts)}
+        if not alone and os.environ.get(environment.LINES) == environment.LINE_OF_NODE:
+            own[environment.LINES] = environment.LINE_OF_ONE_OF_MANY
         self.process = subprocess.Popen(
-            arguments,
+            [
+                *(sys.executable, "-m", f"uav_dc_ros.nodes.{self.name}", *([] if alone else names)),
+                *("--ros-args", "--params-file", str(file)),
+                *("-r", f"__ns:={namespace}", "-r", "/clock:=clock"),
+            ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env=environment,
+            env={**os.environ, **own},
             start_new_session=True,  # Ctrl-C reaches the launcher alone, which stops nodes in order
         )
         self._on_line = on_line

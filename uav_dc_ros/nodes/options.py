@@ -45,6 +45,21 @@ def nodes(options: argparse.Namespace) -> list[str]:
     return [name for name in known if name in wanted]
 
 
+def together(options: argparse.Namespace, nodes: list[str]) -> list[str]:
+    """Names of the nodes that share a process: in lockstep, unless told, those that wait for one another.
+
+    Raises:
+        ParameterError: it is asked for, and there are no two such nodes.
+    """
+    if not (options.pace is None if options.compose is None else options.compose):
+        return []
+    found = [name for name in nodes if NODES[name].composable]
+    if options.compose and len(found) < 2:
+        able = ", ".join(row.name for row in NODES.values() if row.composable)
+        raise ParameterError(f"--compose: expected two of {able} among --nodes {','.join(nodes)}")
+    return found
+
+
 def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[str, object]]:
     """Values of `--set`, checked, by node and parameter.
 

@@ -97,4 +97,4 @@ def run(options: argparse.Namespace) -> int:
     }
     environment.prepare(alone=False)  # what is recorded may come from anywhere
     remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
-    runtime.main(lambda: Record(values), remapped)
+    runtime.main(lambda: Record(values), arguments=remapped)

@@ -1,4 +1,4 @@
-"""Runs one node as a process: from its start to the last word."""
+"""Runs a node as a process, or several in one: from the start to the last word."""
 
 import contextlib
 import gc
@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
 import rclpy
@@ -74,12 +74,14 @@ def give_way() -> None:
 
 
 def main(
-    make: Callable[[], MissionNode], arguments: list[str] | None = None, *, gives_way: bool = True
+    *makes: Callable[[], MissionNode], arguments: list[str] | None = None, gives_way: bool = True
 ) -> NoReturn:
-    """Run one node until it is asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`.
+    """Run nodes until they are asked to stop: the body of `python -m uav_dc_ros.nodes.NAME`.
+
+    Several have one executor, and so one thread: their callbacks never run at the same time.
 
     Args:
-        make: makes the node.
+        makes: each makes a node; those that are to be started first stand first.
         arguments: ROS arguments; those of the command line, unless given.
         gives_way: see `give_way`.
     """
@@ -88,16 +90,18 @@ def main(
         give_way()
     status = NOT_BEGUN
     try:
-        node = _made(make, arguments)
-        executor = DirectExecutor(node.rest_s)
-        executor.add_node(node)
+        nodes = _made(makes, arguments)
+        rest_s = min(node.rest_s for node in nodes)
+        executor = DirectExecutor(rest_s)
+        for node in nodes:
+            executor.add_node(node)
         stopper = Stopper(executor.wake)
-        if _begin(node):
+        if _begin([node for node in nodes if node.values["autostart"]]):
             gc.freeze()  # what is there by now stays: no need to look at it again and again
-            if node.rest_s:
+            if rest_s:
                 os.nice(BACKGROUND)
             status = GAVE_UP
-            status = _run(node, executor, stopper)
+            status = _run(nodes, executor, stopper)
     except UavDcError as error:
         print(f"error: {error}", file=sys.stderr)
     # All is said and written. The middleware has been seen to hang while several of its participants leave
@@ -108,40 +112,48 @@ def main(
     os._exit(status)
 
 
-def _made(make: Callable[[], MissionNode], arguments: list[str] | None) -> MissionNode:
-    """Initialise ROS and make the node.
+def _made(makes: Iterable[Callable[[], MissionNode]], arguments: list[str] | None) -> list[MissionNode]:
+    """Initialise ROS and make the nodes.
 
     Raises:
         ParameterError: what stands after --ros-args makes no sense.
     """
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        return make()
+        return [make() for make in makes]
     except (_rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError, _rclpy.RCLError) as error:
         raise ParameterError(f"{error}; expected ROS arguments after --ros-args") from None
 
 
-def _begin(node: MissionNode) -> bool:
-    """Configure and activate a node that starts by itself; did it come so far."""
-    if not node.values["autostart"]:
-        return True
-    node.trigger_configure()
-    if node.state == "inactive":
+def _begin(nodes: Sequence[MissionNode]) -> bool:
+    """Configure and activate nodes that start by themselves; did all come so far."""
+    for node in nodes:
+        node.trigger_configure()
+        if node.state != "inactive":
+            return False
+    for node in nodes:
         node.trigger_activate()
-    return node.state == "active"
+        if node.state != "active":
+            return False
+    return True
 
 
-def _run(node: MissionNode, executor: DirectExecutor, stopper: Stopper) -> int:
-    """Spin until the node is asked to stop, and stop it safely, also when a callback failed."""
+def _run(nodes: Sequence[MissionNode], executor: DirectExecutor, stopper: Stopper) -> int:
+    """Spin until the nodes are asked to stop, and stop them safely, also when a callback failed."""
     try:
         executor.spin(lambda: stopper.requested)
-        if node.drains and node.state == "active":
+        if any(node.drains and node.state == "active" for node in nodes):
             deadline_s = time.monotonic() + DRAIN_S
             executor.spin(lambda: time.monotonic() > deadline_s, DRAIN_QUIET_S)
     finally:
-        if node.state != "finalized":
-            node.trigger_shutdown()
-        if node.meter.rejected:
-            told = ", ".join(f"{topic} {reason} {n}" for (topic, reason), n in node.meter.rejected.items())
-            node.get_logger().warning(f"rejected messages: {told}")
-    return 0 if node.failure is None else GAVE_UP
+        for node in reversed(nodes):
+            _shut_down(node)
+    return 0 if all(node.failure is None for node in nodes) else GAVE_UP
+
+
+def _shut_down(node: MissionNode) -> None:
+    if node.state != "finalized":
+        node.trigger_shutdown()
+    if node.meter.rejected:
+        told = ", ".join(f"{topic} {reason} {n}" for (topic, reason), n in node.meter.rejected.items())
+        node.get_logger().warning(f"rejected messages: {told}")

@@ -2,7 +2,8 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -24,7 +25,7 @@ TRANSITIONS = {"unconfigured": Transition.TRANSITION_CONFIGURE, "inactive": Tran
 
 
 class Supervised:
-    """One node: its process, and how far it has come.
+    """One node: its process, which others may share, and how far it has come.
 
     Attributes:
         state: of its life cycle, as last told; none before its process has answered.
@@ -91,6 +92,9 @@ class Supervisor:
     Args:
         asker: a node of this process, in the mission's namespace, that somebody spins.
         parameters: ROS parameters of each node to run, by name.
+        together: names of those that share a process. After its end each gets one of its own: the one that
+            was to blame shows itself, and takes nobody with it.
+        folder: for files of the processes.
         on_line: called, from threads, with each line that a node prints.
         on_note: called with what the user should know.
     """
@@ -99,18 +103,23 @@ class Supervisor:
         self,
         asker: Node,
         parameters: Mapping[str, Mapping[str, object]],
+        together: Collection[str],
+        folder: Path,
         on_line: Callable[[str, str], None],
         on_note: Callable[[str], None],
     ) -> None:
         self._namespace = asker.get_namespace()
+        self._together, self._folder = together, folder
         self._on_line, self._on_note = on_line, on_note
         self.nodes = [Supervised(name, values, asker) for name, values in parameters.items()]
         self._brought_up = False
 
     def __enter__(self) -> Self:
         """Start the processes."""
-        for node in self.nodes:
-            self._start(node)
+        shared = [node for node in self.nodes if node.row.name in self._together]
+        for nodes in (shared, *([node] for node in self.nodes if node not in shared)):
+            if nodes:
+                self._start(nodes)
         return self
 
     def __exit__(
@@ -124,10 +133,19 @@ class Supervisor:
         """How often each node was started again."""
         return {node.row.name: node.restarts for node in self.nodes}
 
-    def _start(self, node: Supervised) -> None:
-        again = node.row.again if node.restarts else {}
-        values = {**node.parameters, **again, "autostart": False}
-        node.begin(NodeProcess(node.row.name, self._namespace, values, node.restarts, self._on_line))
+    def _start(self, nodes: Sequence[Supervised]) -> None:
+        """Start a process of these nodes."""
+        parameters = {
+            node.row.name: {
+                **node.parameters,
+                **(node.row.again if node.restarts else {}),
+                "autostart": False,
+            }
+            for node in nodes
+        }
+        process = NodeProcess(parameters, self._namespace, nodes[0].restarts, self._folder, self._on_line)
+        for node in nodes:
+            node.begin(process)
 
     def tick(self) -> None:
         """Go on with whatever is to be done; to be called often.
@@ -138,9 +156,9 @@ class Supervisor:
         for node in list(self.nodes):
             if node.process is None:
                 if time.monotonic() >= node.start_s:
-                    self._start(node)
+                    self._start([node])
             elif node.process.ended:
-                self._bury(node)
+                self._bury(node.process)
             elif node.state != "active":
                 try:
                     node.climb(self._brought_up or self._lower_ranks_are_active(node))
@@ -155,28 +173,35 @@ class Supervisor:
             if other.row.rank < node.row.rank and (other.row.needed or other.row.on_request)
         )
 
-    def _bury(self, node: Supervised) -> None:
-        """A process has ended: start it again later, or give up."""
-        assert node.process is not None
-        name, row, now_s = node.row.name, node.row, time.monotonic()
-        status, how = node.process.process.returncode, node.process.how_it_ended()
-        node.process.close()
-        node.process, node.state = None, None
+    def _bury(self, process: NodeProcess) -> None:
+        """A process has ended: start its nodes again later, each by itself, or give up."""
+        told = f"{process.who} {process.how_it_ended()}"
+        process.close()
+        nodes = [node for node in self.nodes if node.process is process]
+        for node in nodes:
+            node.process, node.state = None, None
+        if process.process.returncode in (NOT_BEGUN, GAVE_UP):  # it told why; it would do so again
+            for node in nodes:
+                self._lose(node, told)
+            return
+        if len(nodes) > 1:
+            self._on_note(f"{told}; its nodes go on in processes of their own")
+        for node in nodes:
+            self._start_again_later(node, told if len(nodes) == 1 else f"node {node.row.name} ended with it")
+
+    def _start_again_later(self, node: Supervised, told: str) -> None:
+        """Let a node that died rest for a while, or, if it has died too often, give up."""
+        now_s, most = time.monotonic(), node.row.restarts
         node.deaths_s.append(now_s)
         while now_s - node.deaths_s[0] > RESTART_WINDOW_S:
             node.deaths_s.popleft()
         deaths = len(node.deaths_s)
-        if status in (NOT_BEGUN, GAVE_UP):  # it told why; it would do so again
-            self._lose(node, f"node {name} {how}")
-        elif deaths > row.restarts:
-            self._lose(node, f"node {name} {how} ({deaths} times within {RESTART_WINDOW_S:.0f} s)")
-        else:
-            node.restarts += 1
-            node.start_s = now_s + BACK_OFF_S * 2 ** (deaths - 1)
-            self._on_note(
-                f"node {name} {how}; it is started again ({deaths} of {row.restarts} within "
-                f"{RESTART_WINDOW_S:.0f} s)"
-            )
+        if deaths > most:
+            self._lose(node, f"{told} ({deaths} times within {RESTART_WINDOW_S:.0f} s)")
+            return
+        node.restarts += 1
+        node.start_s = now_s + BACK_OFF_S * 2 ** (deaths - 1)
+        self._on_note(f"{told}; it is started again ({deaths} of {most} within {RESTART_WINDOW_S:.0f} s)")
 
     def _lose(self, node: Supervised, why: str) -> None:
         """Do without a node from now on.

@@ -18,6 +18,8 @@ class NodeRow:
         parameters: its own, beside those that every node has.
         hears_all: does it keep every message until it gets to it, or the newest hundred?
         process: is it a process of its own, `python -m uav_dc_ros.nodes.NAME`?
+        composable: may it share a process with others (see `container`)? Those may that wait for one another
+            in every step.
         rank: nodes of a lower rank are brought up first, and taken down last: the recorder must hear the
             first word and the last, and the world starts the mission.
         restarts: how often a node that died is started again within `supervisor.RESTART_WINDOW_S`; once more
@@ -33,6 +35,7 @@ class NodeRow:
     parameters: tuple[p.Parameter, ...] = ()
     hears_all: bool = False
     process: bool = True
+    composable: bool = False
     rank: int = 1
     restarts: int = 3
     needed: bool = True
@@ -48,6 +51,7 @@ NODES: dict[str, NodeRow] = {
             publishes=("pose", "users", "mission", "target", "diagnostics", "clock"),
             subscribes=("move", "ready"),
             parameters=(p.SCENARIO, p.VEHICLE_OF_WORLD, p.SEED, p.MISSIONS, p.PACE, p.JOURNAL),
+            composable=True,
             rank=2,
         ),
         NodeRow(
@@ -67,12 +71,14 @@ NODES: dict[str, NodeRow] = {
             publishes=("rates", "ready", "diagnostics"),
             subscribes=("pose", "users"),
             parameters=(p.SCENARIO, p.JOURNAL),
+            composable=True,
         ),
         NodeRow(
             name="policy",
             publishes=("move", "ready", "diagnostics"),
             subscribes=("mission", "rates"),
             parameters=(p.POLICY, p.SCENARIO_OR_POLICYS),
+            composable=True,
         ),
         NodeRow(
             name="recorder",

@@ -1,0 +1,170 @@
+"""Several nodes in one process: what run_all puts there, and the container by itself.
+
+That such a mission is the same as one with a process for each node, to the last bit, and what happens when
+the container is killed: test_flight and test_kills.
+"""
+
+import json
+import resource
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.nodes.test_options import refused
+
+COMPOSED = ("world", "channel_monitor", "policy")
+
+
+@pytest.fixture
+def flight(small_scenario: Path, small_policy: Path) -> list[object]:
+    """Options of a small mission."""
+    return ["--scenario", small_scenario, "--policy", small_policy]
+
+
+def modules(ros: Ros) -> set[str]:
+    """Names of the processes that run nodes."""
+    commands = (command.split() for command in ros.processes().values())
+    return {
+        argument.removeprefix("uav_dc_ros.nodes.")
+        for command in commands
+        for argument in command
+        if argument.startswith("uav_dc_ros.nodes.")
+    }
+
+
+def flying(ros: Ros, *options: object) -> tuple[subprocess.Popen[str], set[str]]:
+    """A mission that has come to its fifth step, and the processes of its nodes."""
+    process = ros.start("uav_dc_ros.run_all", *options, "--bag", "bag", "--summary", "summary.json")
+    assert process.stdout is not None
+    wait_for(process.stdout, "step 5/30")
+    return process, modules(ros)
+
+
+@pytest.mark.parametrize(
+    ("options", "shares"),
+    [
+        (("--pace", 100), False),
+        (("--pace", 100, "--compose"), True),
+        (("--pace", "lockstep", "--missions", 200), True),
+        (("--pace", "lockstep", "--missions", 200, "--no-compose"), False),
+    ],
+    ids=["at a pace", "at a pace, asked for", "lockstep", "lockstep, asked for"],
+)
+def test_who_shares_a_process(
+    ros: Ros, flight: list[object], options: tuple[object, ...], shares: bool
+) -> None:
+    process, running = flying(ros, *flight, *options)
+    process.send_signal(signal.SIGINT)
+    status, output = finish(process)
+    assert status == 130, output
+    assert "Traceback" not in output
+    assert running == {"recorder", "visualizer", *(["container"] if shares else COMPOSED)}
+
+
+def test_a_composed_mission_says_who_shares_a_process(ros: Ros, flight: list[object]) -> None:
+    process, _ = flying(ros, *flight, "--pace", 100, "--compose")
+    status, output = finish(process)
+    assert status == 0, output
+    assert json.loads((ros.folder / "summary.json").read_text())["steps"] == 30
+    ids: dict[str, set[str]] = {}
+    for topic, message in read_bag(ros.folder / "bag"):
+        if topic == "/diagnostics":
+            for told in message.status:
+                values = {pair.key: pair.value for pair in told.values}
+                ids.setdefault(told.name, set()).add(values["process id"])
+    shared = {node: ids[node] for node in COMPOSED}
+    assert len(set.union(*shared.values())) == 1
+    assert len(set.union(*ids.values())) == len(ids) - len(COMPOSED) + 1
+
+
+def test_composing_what_cannot_be_composed(ros: Ros) -> None:
+    told = refused(ros, "--compose", "--nodes", "policy,recorder")
+    assert "--compose: expected two of world, channel_monitor, policy among --nodes policy,recorder" in told
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ((), "the following arguments are required: NODE"),
+        (("recorder",), "argument NODE: invalid choice: 'recorder' (choose from "),
+        (("world", "policy", "--ros-args", "-p"), "expected ROS arguments after --ros-args"),
+        (("world", "policy", "--ros-args", "-p", "seed:=1"), "seed: no such parameter of node policy"),
+    ],
+)
+def test_mistakes(ros: Ros, given: tuple[str, ...], told: str) -> None:
+    status, output = ros.run("uav_dc_ros.nodes.container", *given)
+    assert status == 2, output
+    assert told in output
+    assert "Traceback" not in output
+
+
+def parameters(folder: Path, **of_nodes: dict[str, Any]) -> Path:
+    """A file of parameters, as ROS reads it."""
+    path = folder / "mission.yaml"
+    path.write_text(
+        json.dumps({f"/**/{node}": {"ros__parameters": values} for node, values in of_nodes.items()})
+    )
+    return path
+
+
+def test_alone_it_flies_a_mission(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
+    """Started by hand, with the recorder and run_all's own eyes elsewhere."""
+    world = {"scenario": str(small_scenario), "peers": [*COMPOSED, "recorder", "observer"]}
+    file = parameters(
+        ros.folder,
+        world={**world, "pace": "lockstep"},
+        channel_monitor=world,
+        policy={**world, "policy": str(small_policy)},
+    )
+    given = ("policy", "world", "channel_monitor", "--ros-args", "--params-file", file, "-r", "__ns:=/uav1")
+    container = ros.start("uav_dc_ros.nodes.container", *given, "-r", "/clock:=clock")
+    seen = ("--namespace", "/uav1", "--nodes", "recorder", "--pace", "lockstep", "--bag", "bag")
+    status, output = ros.run_all("--scenario", small_scenario, "--policy", small_policy, *seen)
+    assert status == 0, output
+    container.send_signal(signal.SIGTERM)
+    status, output = finish(container)
+    assert status == 0, output
+    missions = [message for topic, message in read_bag(ros.folder / "bag") if topic == "/uav1/mission"]
+    assert [mission["step"] for mission in missions] == list(range(31))
+
+
+def test_one_node_that_cannot_begin_lets_none_begin(ros: Ros, small_policy: Path) -> None:
+    """The policy is for another world."""
+    file = parameters(
+        ros.folder,
+        world={"scenario": "three_clusters"},
+        channel_monitor={"scenario": "three_clusters"},
+        policy={"scenario": "three_clusters", "policy": str(small_policy)},
+    )
+    given = ("--ros-args", "--params-file", file)
+    status, output = ros.run("uav_dc_ros.nodes.container", *COMPOSED, *given)
+    assert status == 2, output
+    assert "[policy]: policy " in output
+    assert "Traceback" not in output
+
+
+def test_a_line_of_a_shared_process_says_whose_it_is(ros: Ros, flight: list[object]) -> None:
+    status, output = ros.run_all(*flight, "--pace", "lockstep", "--set", "channel_monitor.journal=/dev/full")
+    assert status == 1, output
+    told = "ERROR: channel_monitor: journal /dev/full: it is no file; expected one, or a new one"
+    assert f"container: {told}" in output
+    assert f"error: node channel_monitor could not be configured: {told}" in output
+
+
+def test_a_node_that_gives_up_takes_the_others_with_it(ros: Ros, flight: list[object]) -> None:
+    """The channel monitor's journal comes to a limit on the size of files; no recorder meets it first."""
+    process = ros.start(
+        "uav_dc_ros.run_all",
+        *(*flight, "--pace", "lockstep", "--no-record"),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, 8_000)),
+    )
+    status, output = finish(process)
+    assert status == 1, output
+    told = "error: the container of world, channel_monitor, policy ended with 3: error: journal "
+    assert told in output
+    assert "File too large" in output
+    assert "Traceback" not in output

@@ -1,0 +1,51 @@
+"""Several nodes in one process: a container, as ROS 2 calls it.
+
+    python -m uav_dc_ros.nodes.container world channel_monitor policy --ros-args --params-file mission.yaml
+
+Nodes that wait for one another in every step gain nothing from a core each, and pay for each message on its
+way from process to process: a thread that sends, one that receives, and a node that is woken. Inside one
+process the middleware hands a message over in the thread that publishes it. The price: a node that dies
+takes the others with it.
+"""
+
+import importlib
+import sys
+from typing import NoReturn
+
+from uav_dc_ros import cli
+from uav_dc_ros.nodes import runtime
+from uav_dc_ros.nodes.mission_node import MissionNode
+from uav_dc_ros.nodes.table import NODES
+
+COMPOSABLE = tuple(row.name for row in NODES.values() if row.composable)
+
+
+def parser() -> cli.Parser:
+    """The command line, up to --ros-args."""
+    options = cli.Parser(
+        prog="python -m uav_dc_ros.nodes.container",
+        description="Run several nodes in one process. Parameters follow --ros-args, as of any node; those "
+        "of one node come from a file (--params-file).",
+    )
+    options.add_argument("nodes", nargs="+", choices=COMPOSABLE, metavar="NODE", help=", ".join(COMPOSABLE))
+    return options
+
+
+def node_class(name: str) -> type[MissionNode]:
+    """The class of a row of the node table: `ChannelMonitor` in the module `channel_monitor`."""
+    module = importlib.import_module(f"uav_dc_ros.nodes.{name}")
+    found: type[MissionNode] = getattr(module, name.title().replace("_", ""))
+    return found
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the nodes until they are asked to stop."""
+    given = sys.argv[1:] if arguments is None else arguments
+    ros_at = given.index("--ros-args") if "--ros-args" in given else len(given)
+    wanted = parser().parse_args(given[:ros_at]).nodes
+    in_order = sorted(dict.fromkeys(wanted), key=lambda name: NODES[name].rank)
+    runtime.main(*(node_class(name) for name in in_order), arguments=given)
+
+
+if __name__ == "__main__":
+    main()
