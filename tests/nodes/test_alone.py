@@ -1,12 +1,15 @@
 """Each node alone, as on a robot: started by hand, in a namespace, with ROS parameters."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.conftest import Ros, finish, wait_for
+from uav_dc_ros.nodes.parameters import EVERY
+from uav_dc_ros.nodes.table import NODES
 
 NAMESPACE = ("-r", "__ns:=/uav1")
 
@@ -113,3 +116,19 @@ def test_a_parameter_that_makes_no_sense_is_one_line_and_status_2(
     assert len(output.splitlines()) == 1, output
     assert output.startswith(("error: ", "[ERROR] "))  # a value, or what was found when it was loaded
     assert told in output
+
+
+def test_help_tells_the_parameters(ros: Ros) -> None:
+    status, output = ros.run("uav_dc_ros.nodes.world", "--help")
+    assert status == 0, output
+    assert output.startswith("usage: python -m uav_dc_ros.nodes.world [-h] [--ros-args -p PARAMETER:=VALUE")
+    for row in (*NODES["world"].parameters, *EVERY):
+        assert re.search(rf"^  {row.name} +{re.escape(row.description)}", output, re.MULTILINE), row.name
+
+
+def test_arguments_that_ros_would_ignore_are_refused(ros: Ros) -> None:
+    status, output = ros.run("uav_dc_ros.nodes.world", "--seed", "3", "--ros-args", "-p", "seed:=4")
+    assert status == 2, output
+    assert output == (
+        "python -m uav_dc_ros.nodes.world: '--seed 3'; expected --ros-args first, and -p PARAMETER:=VALUE\n"
+    )

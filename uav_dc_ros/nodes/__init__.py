@@ -15,7 +15,9 @@ diagnostics      what a node counts, once a second
 journal          what a node that was killed must know again
 executor         one thread that handles what is ready
 fastdds          the middleware's settings
-runtime          one node as a process: from its start to the last word
+runtime          a node as a process, or several in one: from the start to the last word
+usage            the command line of a node: its parameters, for --help
+container        a process of several nodes
 executable       what `ros2 run` starts: any of the nodes, by the name that it is called
 
 The nodes:
@@ -35,7 +37,7 @@ What run_all is made of:
 flight           one run: check everything, start, follow, stop, tell
 options          what of its options needs more than the command line to be checked
 supervisor       brings nodes up in order, starts dead ones again, takes them down in reverse
-launcher         a node as a child process
+launcher         a node, or several, as a child process
 observer         run_all's own eyes: the mission so far, and its summary
 display          what the user sees of it
 

@@ -13,7 +13,7 @@ import sys
 from typing import NoReturn
 
 from uav_dc_ros import cli
-from uav_dc_ros.nodes import runtime
+from uav_dc_ros.nodes import runtime, usage
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.table import NODES
 
@@ -40,11 +40,10 @@ def node_class(name: str) -> type[MissionNode]:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the nodes until they are asked to stop."""
-    given = sys.argv[1:] if arguments is None else arguments
-    ros_at = given.index("--ros-args") if "--ros-args" in given else len(given)
-    wanted = parser().parse_args(given[:ros_at]).nodes
+    own, for_ros = usage.split(sys.argv[1:] if arguments is None else arguments)
+    wanted = parser().parse_args(own).nodes
     in_order = sorted(dict.fromkeys(wanted), key=lambda name: NODES[name].rank)
-    runtime.main(*(node_class(name) for name in in_order), arguments=given)
+    runtime.main(*(node_class(name) for name in in_order), arguments=for_ros)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes import fastdds
+from uav_dc_ros.nodes import fastdds, usage
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.mission_node import SUPERVISED, MissionNode
 
@@ -82,9 +82,11 @@ def main(
 
     Args:
         makes: each makes a node; those that are to be started first stand first.
-        arguments: ROS arguments; those of the command line, unless given.
+        arguments: ROS arguments; those of the command line, which may have no others, unless given.
         gives_way: see `give_way`.
     """
+    if arguments is None:
+        arguments = usage.ros_arguments(makes[0].__doc__ or "")
     fastdds.use_profiles()
     if gives_way:
         give_way()
@@ -112,7 +114,7 @@ def main(
     os._exit(status)
 
 
-def _made(makes: Iterable[Callable[[], MissionNode]], arguments: list[str] | None) -> list[MissionNode]:
+def _made(makes: Iterable[Callable[[], MissionNode]], arguments: list[str]) -> list[MissionNode]:
     """Initialise ROS and make the nodes.
 
     Raises:

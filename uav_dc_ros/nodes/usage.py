@@ -1,0 +1,48 @@
+"""The command line of a node: ROS arguments only; `--help` tells its parameters."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from uav_dc_ros import cli
+from uav_dc_ros.nodes.parameters import EVERY, Parameter
+from uav_dc_ros.nodes.table import NODES
+
+ROS_ARGUMENTS = "--ros-args"
+
+
+def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Arguments before those for ROS, and those for ROS."""
+    at = arguments.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in arguments else len(arguments)
+    return list(arguments[:at]), list(arguments[at:])
+
+
+def parser(name: str, description: str) -> cli.Parser:
+    """The command line of a row of the node table."""
+    rows = {row.name: row for row in (*NODES[name].parameters, *EVERY)}
+    return cli.Parser(
+        prog=f"python -m uav_dc_ros.nodes.{name}",
+        usage="%(prog)s [-h] [--ros-args -p PARAMETER:=VALUE ... -r __ns:=/NAMESPACE ...]",
+        description=description,
+        epilog="\n".join(["parameters:", *(_line(row) for row in rows.values())]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _line(row: Parameter) -> str:
+    """A parameter, its default, and what it is for."""
+    value = str(row.default).lower() if isinstance(row.default, bool) else row.default  # as ROS reads it
+    default = "" if value == "" else f" (default: {value})"
+    unit = f" [{row.unit}]" if row.unit else ""
+    return f"  {row.name:<20}  {row.description}{unit}{default}"
+
+
+def ros_arguments(description: str) -> list[str]:
+    """What stands on a node's command line for ROS; exits with 2 if there is more, which would be ignored."""
+    others, for_ros = split(sys.argv[1:])
+    command = parser(Path(sys.argv[0]).stem, description)
+    _, unknown = command.parse_known_args(others)
+    if unknown:
+        command.error(f"{' '.join(unknown)!r}; expected {ROS_ARGUMENTS} first, and -p PARAMETER:=VALUE")
+    return for_ros
