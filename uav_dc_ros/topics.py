@@ -5,7 +5,7 @@ Quality of service, with reasons:
 - *Offered reliable*: a lost message would leave a hole in a bag and make a lockstep wait. Only `clock` is
   offered best effort, as everywhere in ROS: the next one is worth more than a lost one.
 - *Asked best effort*: poses and the clock. An autopilot's bridge publishes its pose best effort, and a
-  subscription that asks for more than is offered hears nothing.
+  subscription that asks for more than is offered hears nothing. (The recorder asks for what is offered.)
 - *Latched* (transient local): what describes the state, so that whoever joins late, or again, learns it at
   once. A pose is not latched, since an autopilot's is not; a move is not, since an old one is worth nothing.
 - *Depth*: publishers keep as much as a node that was restarted, or a reader that fell behind, may want to

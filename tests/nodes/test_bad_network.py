@@ -31,9 +31,8 @@ from uav_dc_ros.core.grid import Action
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=f"no link: {unavailable()}")
 
 STEPS = 30
-# What a mission is. A pose is taken best effort, as an autopilot's has to be: on a bad link a bag lacks some.
-# The other topics tell of the mission, and of the nodes, a few times a second.
-RECORDED = ["users", "rates", "mission", "move", "target"]
+# What a mission is. The other topics tell of it, and of the nodes, a few times a second.
+RECORDED = ["users", "rates", "mission", "move", "pose", "target"]
 LOSS = {"loss": 0.2}
 DELAY = {"delay_s": 0.1, "jitter_s": 0.02}
 PATIENCE_S = 120.0

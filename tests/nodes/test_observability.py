@@ -161,11 +161,12 @@ def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[ob
     peer = python(ros, DEMANDING)
     assert peer.stdout is not None
     wait_for(peer.stdout, "listening")
-    status, output = ros.run_all(*options, "--no-record")
+    status, output = ros.run_all(*options, "--no-record", "--pace", 50)
     peer.kill()
     peer.communicate()
     assert status == 0, output
     assert output.count("world: WARN: /pose: /somebody/demanding does not match: its QoS: ") == 1, output
+    assert output.count("does not match") == 1, "nobody else is to blame"
 
 
 def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
@@ -181,6 +182,7 @@ def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
     assert world.stdout is not None
     told = wait_for(world.stdout, "does not match")
     assert "/target: /somebody/demanding does not match: its QoS: " in told
+    assert "Best effort publisher and reliable subscription; (told once)" in told
     world.terminate()
     peer.kill()
     peer.communicate()

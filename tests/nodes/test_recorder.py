@@ -111,6 +111,28 @@ def test_whatever_is_published_is_recorded_also_late_and_with_its_qos(ros: Ros) 
     assert custom(bag)["dropped"] == "{}"
 
 
+def test_poses_that_are_offered_best_effort_are_recorded_as_well(
+    ros: Ros, small_scenario: Path, small_policy: Path
+) -> None:
+    """An autopilot's bridge offers no better; of our own nodes, which do, the recorder asks for it."""
+    peers = 'peers:=["world", "channel_monitor", "policy", "recorder", "observer"]'
+    given = ("-p", f"scenario:={small_scenario}", "-p", peers, "-p", "pace:=100", "-r", "/clock:=clock")
+    override = "qos_overrides./pose.publisher.reliability:=best_effort"
+    world = ros.start("uav_dc_ros.nodes.world", "--ros-args", *given, "-p", override)
+    nodes = ("--nodes", "channel_monitor,policy,recorder,visualizer", "--bag", "bag")
+    status, output = ros.run_all("--scenario", small_scenario, "--policy", small_policy, *nodes)
+    assert status == 0, output
+    assert "does not match" not in output
+    world.send_signal(signal.SIGTERM)
+    status, output = finish(world)
+    assert status == 0, output
+    assert "does not match" not in output
+    bag = ros.folder / "bag"
+    assert offered(bag, "/pose") == {("best_effort", "volatile")}
+    with BagReader(bag) as reader:
+        assert reader.topics["/pose"].count + reader.dropped.get("/pose", 0) == 31
+
+
 @pytest.mark.long
 def test_topics_by_list_and_a_namespace(ros: Ros) -> None:
     recorder = record(ros, "--namespace", "/uav1", "--topics", "a,/elsewhere/b,never", "--compression", "lz4")

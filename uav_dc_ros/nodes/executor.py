@@ -18,6 +18,8 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context
 
 TURN_MAX = 100  # messages of one topic before the others get their turn
+# Quiet is what was so in as many turns: on a busy computer the middleware's thread may have had no time yet.
+QUIET_TURNS = 10
 BUSY_S = 0.003  # while messages keep coming, timers and services are looked at this often
 BUSY_NS = round(BUSY_S * 1e9)
 
@@ -61,12 +63,16 @@ class DirectExecutor:
         Raises:
             Exception: whatever a callback raises.
         """
-        self._heard_s = time.monotonic()
+        heard_s = self._heard_s = time.monotonic()
+        quiet_turns = 0
         with self._context.handle:
             while not stop():
-                self._turn(quiet_s)
-                if quiet_s is not None and time.monotonic() - self._heard_s > quiet_s:
-                    return
+                self._turn(None if quiet_s is None else quiet_s / QUIET_TURNS)
+                if quiet_s is not None:
+                    quiet_turns = quiet_turns + 1 if heard_s == self._heard_s else 0
+                    heard_s = self._heard_s
+                    if quiet_turns >= QUIET_TURNS and time.monotonic() - heard_s > quiet_s:
+                        return
                 if self.rest_s and not self._behind:
                     time.sleep(self.rest_s)
                 self._behind = False

@@ -79,7 +79,7 @@ class Hearing:
         self.publishers = 0
         self._node = node
         self._ear: _Ear
-        self._kind: Any = None  # the class of its messages; None: somebody else made the subscription
+        self._kind: Any = None  # the class of its messages; None: it is not to adapt
         self._profile: QoSProfile
         self._leaving: _Ear | None = None
         self._seen: set[tuple[int, int]] = set()  # messages, while two subscriptions hear them
@@ -90,9 +90,11 @@ class Hearing:
         """The subscription."""
         return self._ear.subscription
 
-    def add(self, subscription: Any) -> None:
-        """Use a subscription that somebody else has made, and will destroy."""
+    def add(self, subscription: Any, *, adapts: bool) -> None:
+        """Use a subscription that somebody else has made; one that does not adapt stays as it is."""
         self._ear = _Ear(subscription)
+        self._kind = subscription.msg_type if adapts else None
+        self._profile = subscription.qos_profile
 
     def subscribe(self, kind: Any, ends: Sequence[TopicEndpointInfo]) -> None:
         """Make a subscription that hears all of these publishers."""
@@ -175,11 +177,10 @@ class Hearing:
         return left
 
     def close(self) -> None:
-        """Let go of the subscriptions that were made here."""
+        """Let go of the subscriptions."""
         for ear in self._ears:
             ear.close()
-            if self._kind is not None:
-                self._node.destroy_subscription(ear.subscription)
+            self._node.destroy_subscription(ear.subscription)
         self._leaving = None
 
 

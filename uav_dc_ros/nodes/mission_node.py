@@ -72,6 +72,7 @@ class MissionNode(ManagedNode):
         self.rows = rows([name, *self.peers])
         self._timers_active: list[Any] = []
         self._diagnostics_timer: Any = None
+        self._seen_incompatible: set[tuple[str, str, str]] = set()  # at the last look: topic, peer, reason
         self._told_incompatible: set[tuple[str, str]] = set()
 
     # What the life cycle brings and takes.
@@ -224,7 +225,10 @@ class MissionNode(ManagedNode):
         rejected, values = self.meter.report()
         warnings, own = self.diagnose()
         ends = self.publishers_of.values(), self.subscriptions_of.values()
-        for topic, peer, reason in qos.incompatible(self, *ends):
+        found = set(qos.incompatible(self, *ends))
+        # Once is no matter: a recorder that meets a pose of lower quality asks for less a moment later.
+        lasting, self._seen_incompatible = found & self._seen_incompatible, found
+        for topic, peer, reason in sorted(lasting):
             if (topic, peer) not in self._told_incompatible:
                 self._told_incompatible.add((topic, peer))
                 self.get_logger().warning(f"{topic}: {peer} does not match: {reason} (told once)")

@@ -1,5 +1,6 @@
 """Quality of service: profiles from the topic table, and peers that do not match them."""
 
+import copy
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -8,7 +9,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
-from rclpy.duration import Duration
+from rclpy.duration import Duration, Infinite
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -101,11 +102,20 @@ def incompatible(
     for publisher in publishers:
         if node.count_subscribers(publisher.topic_name) != publisher.get_subscription_count():
             for end in node.get_subscriptions_info_by_topic(publisher.topic_name):
-                yield from _mismatch(publisher, end, publisher.qos_profile, end.qos_profile)
+                yield from _mismatch(publisher, end, _told(publisher.qos_profile), end.qos_profile)
     for subscription in subscriptions:
         if node.count_publishers(subscription.topic_name) != subscription.get_publisher_count():
             for end in node.get_publishers_info_by_topic(subscription.topic_name):
-                yield from _mismatch(subscription, end, end.qos_profile, subscription.qos_profile)
+                yield from _mismatch(subscription, end, end.qos_profile, _told(subscription.qos_profile))
+
+
+def _told(profile: QoSProfile) -> QoSProfile:
+    """A profile as the graph tells it: a duration of zero, which stands for none, is infinite there."""
+    told = copy.copy(profile)
+    for name in ("deadline", "lifespan", "liveliness_lease_duration"):
+        if getattr(profile, name) == Duration():
+            setattr(told, name, Infinite)
+    return told
 
 
 def _mismatch(

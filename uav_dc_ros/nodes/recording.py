@@ -11,6 +11,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,11 +131,19 @@ class BagNode(MissionNode):
     # What is heard.
 
     def subscribe(self, topic: Topic) -> Any:
-        """Subscribe to a topic of the row, for its bytes."""
+        """Subscribe to a topic of the row, for its bytes.
+
+        Also of a pose it asks for all that our nodes offer: best effort, a busy computer loses some. When one
+        comes that offers less, as an autopilot's does, it asks for less, unless that was overridden.
+        """
         assert self.writer is not None, "it was configured"
         name = self.resolve_topic_name(topic.name)
         hearing = Hearing(self, name, topic.type, self._hear(name, topic.name, topic))
-        hearing.add(self.create_raw_subscription(topic, hearing.callback))
+        override = f"qos_overrides.{name}.subscription."
+        overridden = any(given.startswith(override) for given in self._parameter_overrides)
+        all_of_it = replace(topic, asks_reliable=topic.reliable)
+        subscription = self.create_raw_subscription(all_of_it, hearing.callback)
+        hearing.add(subscription, adapts=not (topic.asks_reliable or overridden))
         self._hearings[name] = hearing
         return hearing.subscription
 
@@ -208,13 +217,17 @@ class BagNode(MissionNode):
         """Adapt to publishers that came or went."""
         hearing.settle()
         publishers = self.count_publishers(hearing.name)
-        if publishers == hearing.publishers or hearing.name not in self._announced:
+        if publishers == hearing.publishers:
             return
         ends = self.get_publishers_info_by_topic(hearing.name)
-        hearing.publishers = publishers
         hearing.adapt([end for end in ends if end.topic_type == hearing.type])
-        assert self.writer is not None, "timers end with the bag"
-        self.writer.keep_latched(hearing.name, publishers)
+        for label, ours in self.subscriptions_of.items():
+            if ours.topic_name == hearing.name:
+                self.subscriptions_of[label] = hearing.subscription
+        if hearing.name in self._announced:
+            hearing.publishers = publishers
+            assert self.writer is not None, "timers end with the bag"
+            self.writer.keep_latched(hearing.name, publishers)
 
     def _is_wanted(self, name: str, others: tuple[str, ...]) -> bool:
         if self.asked:
