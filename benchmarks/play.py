@@ -26,11 +26,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.write import BagWriter
-from uav_dc_ros.nodes import convert
+from uav_dc_ros.nodes import recorded_qos
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 STRING = "std_msgs/msg/String"
-QOS = convert.offered_qos(QoSProfile(depth=10), 10)
+QOS = recorded_qos.offered(QoSProfile(depth=10), 10)
 LISTENER = Path(__file__).parents[1] / "tests" / "nodes" / "listener.py"
 ENVIRONMENT = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 START_NS = 1_700_000_000 * 10**9

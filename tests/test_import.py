@@ -31,6 +31,14 @@ def test_the_package_alone_brings_nothing_heavy() -> None:
     assert python(f"import sys, uav_dc_ros; print(*[m for m in {heavy} if m in sys.modules])").strip() == ""
 
 
+@pytest.mark.parametrize("node", ["world", "channel_monitor", "policy", "bridge"])
+def test_a_node_that_flies_brings_nothing_that_it_does_not_need(node: str) -> None:
+    """It may have to be started again in the air, on a small computer."""
+    heavy = ("torch", "gymnasium", "matplotlib", "rich", "mcap", "rosbags", "ruamel")
+    code = f"import sys, uav_dc_ros.nodes.{node}; print(*[m for m in {heavy} if m in sys.modules])"
+    assert python(code).strip() == ""
+
+
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 

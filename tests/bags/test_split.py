@@ -13,7 +13,7 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
 from tests.bags.made import QOS, ROOT, STRING, in_bag, in_mcap, information, text
-from uav_dc_ros.bags import part
+from uav_dc_ros.bags.compression import COMPRESSIONS
 from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.series import CHUNKS_OF_A_PART
@@ -101,7 +101,7 @@ def test_a_latched_topic_of_several_publishers_repeats_one_message_of_each(tmp_p
     assert [data[8:9] for _, _, _, _, data in in_mcap(tmp_path / "bag" / "bag_1.mcap")] == [b"a", b"b", b"x"]
 
 
-@pytest.mark.parametrize("compression", part.COMPRESSIONS)
+@pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_chunks_are_compressed_as_asked(tmp_path: Path, compression: str) -> None:
     with BagWriter(tmp_path / "bag", {}, compression=compression) as bag:
         bag.add_topic("/a", STRING)

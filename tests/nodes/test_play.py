@@ -24,14 +24,14 @@ from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import ParameterError
-from uav_dc_ros.nodes import convert
 from uav_dc_ros.nodes import play as verb
+from uav_dc_ros.nodes import recorded_qos
 
 BAG, PLAY = "uav_dc_ros.bag", "play"
 MS = 10**6
 START_NS = 1_700_000_000 * 10**9
-VOLATILE = convert.offered_qos(QoSProfile(depth=10), 10)
-LATCHED = convert.offered_qos(QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL), 2)
+VOLATILE = recorded_qos.offered(QoSProfile(depth=10), 10)
+LATCHED = recorded_qos.offered(QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL), 2)
 WAIT = ("--wait-for-subscribers", 20)
 Messages = list[tuple[str, float, str]]  # topic, milliseconds from the beginning, text
 Heard = list[tuple[str, str, int, int]]  # topic, text, when published, when received, nanoseconds

@@ -11,7 +11,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8, dump_qos_v9
 from uav_dc_ros.bags.metadata import to_yaml
 from uav_dc_ros.bags.read import RecordedTopic
 from uav_dc_ros.errors import BagError
-from uav_dc_ros.nodes import convert, recorded_qos
+from uav_dc_ros.nodes import recorded_qos
 from uav_dc_ros.nodes.play_clock import PlayClock
 
 S = 10**9
@@ -75,7 +75,7 @@ FOREVER = QosTime(9223372036, 854775807)
 
 
 def offer(**changed: object) -> Qos:
-    return convert.offered_qos(QoSProfile(depth=4), 4)._replace(**changed)  # type: ignore[arg-type]
+    return recorded_qos.offered(QoSProfile(depth=4), 4)._replace(**changed)  # type: ignore[arg-type]
 
 
 def profile(*offers: Qos, per_s: float = 1.0, message_bytes: int = 100):  # type: ignore[no-untyped-def]

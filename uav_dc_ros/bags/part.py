@@ -16,11 +16,6 @@ from uav_dc_ros.bags.metadata import Part, information, to_yaml
 from uav_dc_ros.errors import BagError
 
 CHUNK_BYTES = 128 * 1024  # small: a chunk that was not finished is what a killed writer loses
-COMPRESSIONS = {
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-    "none": CompressionType.NONE,
-}
 _NUMBER = re.compile(r"_(\d+)\.mcap$")
 
 
@@ -81,7 +76,7 @@ class PartWriter:
     Args:
         path: the file; must not exist.
         name: the part's name, where the file has a temporary one.
-        compression: of its chunks, one of COMPRESSIONS.
+        compression: of its chunks, one of `compression.COMPRESSIONS`.
         chunk_bytes: size at which a chunk is finished, before compression.
 
     Raises (all methods): OSError, which whoever owns the bag puts into words.
@@ -100,7 +95,8 @@ class PartWriter:
         self._types: dict[int, str] = {0: ""}  # by schema; channel without schema: 0, as MCAP has it
         self._file = path.open("xb")
         try:
-            self._mcap = Writer(self._file, chunk_size=chunk_bytes, compression=COMPRESSIONS[compression])
+            compressed = CompressionType[compression.upper()]
+            self._mcap = Writer(self._file, chunk_size=chunk_bytes, compression=compressed)
             self._mcap.start(profile="ros2", library=f"uav_dc_ros {__version__}")
             self._file.flush()
         except OSError:

@@ -35,7 +35,7 @@ class BagWriter:
         folder: the bag's folder; must not exist, unless its writing is resumed.
         about: what the bag is about, stored inside as text by key. What earlier parts say of a key stays.
         resume: go on with a bag whose writer was killed: its parts are mended, and a new one is begun.
-        compression: of its chunks: one of part.COMPRESSIONS.
+        compression: of its chunks: one of `compression.COMPRESSIONS`.
         split_bytes: size of a part's file after which the next one is begun; 0: never. A part is larger by
             no more than a chunk, one message and its index.
         split_s: log time after which the next part is begun, seconds; 0: never.

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from uav_dc_ros.bags.part import COMPRESSIONS
+from uav_dc_ros.bags.compression import COMPRESSIONS
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.topics import SIMULATED, VEHICLES

@@ -10,7 +10,7 @@ from pathlib import Path
 import rclpy
 
 from uav_dc_ros import __version__, cli
-from uav_dc_ros.bags.part import COMPRESSIONS
+from uav_dc_ros.bags.compression import COMPRESSIONS
 from uav_dc_ros.nodes import environment, runtime
 from uav_dc_ros.nodes import parameters as p
 from uav_dc_ros.nodes.recording import BagNode
@@ -68,9 +68,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--split-bytes", type=cli.whole_number(0), default=0, metavar="N", help=p.SPLIT_BYTES.description
     )
     parser.add_argument("--split-s", type=float, default=0.0, metavar="S", help=p.SPLIT_S.description)
-    parser.add_argument(
-        "--compression", choices=tuple(COMPRESSIONS), default="zstd", help=p.COMPRESSION.description
-    )
+    parser.add_argument("--compression", choices=COMPRESSIONS, default="zstd", help=p.COMPRESSION.description)
     parser.add_argument(
         "--min-free-bytes",
         type=cli.whole_number(0),

@@ -1,4 +1,4 @@
-"""The QoS with which a recorded topic is published again.
+"""QoS as bags have it: that of a publisher, to be recorded, and that with which a topic is published again.
 
 A bag tells the QoS of each publisher that its recorder saw, but not which message was whose. One publisher
 stands for all of them, and offers the most that any of them did: each subscription that heard at least one
@@ -25,7 +25,39 @@ UNKNOWN_DEPTH = 10  # rosbag2's
 # messages half as many arrived in a second as with so many.
 WINDOW = 5000
 ACKNOWLEDGE_S = 0.02
+_FOREVER = QosTime(9223372036, 854775807)  # how ROS 2 writes an infinite duration
+_FOREVER_NS = 2**63 - 1
 FOREVER_S = 2**31 - 1  # and more: what recorders write for "no limit"; so is 0
+
+
+def offered(profile: QoSProfile, depth: int | None = None) -> Qos:
+    """The QoS that a publisher offers, as a bag stores it.
+
+    Args:
+        profile: as the graph tells it.
+        depth: messages that the publisher keeps, which discovery does not carry; None: not known.
+    """
+    return Qos(
+        history=QosHistory.UNKNOWN if depth is None else QosHistory.KEEP_LAST,
+        depth=depth or 0,
+        reliability=QosReliability[profile.reliability.name],
+        durability=QosDurability[profile.durability.name],
+        deadline=_qos_time(profile.deadline),
+        lifespan=_qos_time(profile.lifespan),
+        liveliness=(
+            QosLiveliness.MANUAL_BY_TOPIC
+            if profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC
+            else QosLiveliness.AUTOMATIC
+        ),
+        liveliness_lease_duration=_qos_time(profile.liveliness_lease_duration),
+        avoid_ros_namespace_conventions=profile.avoid_ros_namespace_conventions,
+    )
+
+
+def _qos_time(duration: Duration) -> QosTime:
+    """A duration; 0 stands for none given, which is an infinite one."""
+    given = 0 < duration.nanoseconds < _FOREVER_NS
+    return QosTime(*divmod(duration.nanoseconds, 10**9)) if given else _FOREVER
 
 
 def profile(topic: RecordedTopic, *, message_bytes: int, per_s: float) -> QoSProfile:

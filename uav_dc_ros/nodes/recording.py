@@ -17,7 +17,7 @@ from typing import Any
 
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
-from uav_dc_ros.nodes import convert, message_types, qos
+from uav_dc_ros.nodes import message_types, qos, recorded_qos
 from uav_dc_ros.nodes.hearing import Hearing
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.topics import TOPICS, Topic
@@ -189,7 +189,7 @@ class BagNode(MissionNode):
         self.writer.add_topic(
             name,
             type,
-            sorted({convert.offered_qos(profile, depth) for profile in profiles}, key=str),
+            sorted({recorded_qos.offered(profile, depth) for profile in profiles}, key=str),
             definition=message_types.definition(type),
             type_hash=min(hashes, default=""),
         )
