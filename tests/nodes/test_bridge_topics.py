@@ -22,7 +22,7 @@ FLOWN = ["takeoff", *["ready", "moving"] * 7, "landing"]
 @pytest.mark.long
 def test_a_mission_beside_mavros(ros: Ros, low: tuple[object, ...]) -> None:
     """Standard messages alone: a pilot arms, and lands; between, the policy flies."""
-    with fake(ros, "px4", "--speed", 6) as mavros:
+    with fake(ros, "px4", "--speed", 3) as mavros:
         process = ros.start("uav_dc_ros.run_all", *low, "--vehicle", "mavros", "--bag", "bag")
         assert process.stdout is not None
         shown = wait_for(process.stdout, "waiting for a pilot")

@@ -74,14 +74,14 @@ def lies(scenario: Scenario) -> dict[str, tuple[str, dict[str, Any]]]:
 
 
 def options(folder: Path) -> list[object]:
-    """A run of small missions in lockstep; an untrained policy does."""
+    """A run of small missions in lockstep, slow enough for a liar; an untrained policy does."""
     scenario = folder / "small.toml"
     if not scenario.exists():
         scenario.write_text(SMALL)
         saved(folder / "untrained", scenarios.load(scenario), name="untrained")
     nodes = ",".join(PEERS[:4])
     flown = ("--scenario", scenario, "--policy", folder / "untrained", "--missions", MISSIONS)
-    return [*flown, "--pace", "lockstep", "--nodes", nodes]
+    return [*flown, "--pace", "lockstep", "--no-compose", "--nodes", nodes]
 
 
 @pytest.fixture(scope="module")

@@ -179,9 +179,12 @@ class Observer(MissionNode):
         now = self.mission
         if now is not None and (mission.mission, mission.step) <= (now.mission, now.step):
             return  # a repeated step
+        if now is not None and now.over and mission.mission == now.mission:
+            return  # it was given up, and told so: its rates came too late
         position_m = self.scenario.grid.centre_m(np.asarray(mission.cell), like=np.zeros(1)).tolist()
         if now is None or mission.mission > now.mission:
-            self.close()
+            if min(self._ended, default=mission.mission) < mission.mission:
+                self.close()  # not this one: its end may be heard before its rates
             now = MissionSoFar(scenario=self.scenario, mission=mission.mission, seed=mission.seed)
             now.unheard_steps = mission.step
         else:
@@ -198,13 +201,13 @@ class Observer(MissionNode):
 
     def close(self, waited_s: float = 0.0) -> None:
         """End the mission that is followed, if it is over since `waited_s`: its last rates may never come."""
-        if self.mission is None and self._ended:  # it ended before its first step
+        if not self._ended or time.monotonic() - self._ended_s < waited_s:
+            return
+        if self.mission is None:  # it ended before its first step
             mission, end = next(iter(self._ended.items()))
             self.mission = MissionSoFar(scenario=self.scenario, mission=mission, seed=end.seed)
         now = self.mission
-        if now is None or now.over or now.mission not in self._ended:
-            return
-        if time.monotonic() - self._ended_s >= waited_s:
+        if not now.over and now.mission in self._ended:
             end = self._ended[now.mission]
             now.over, now.reason = True, end.reason
             self._on_end(now, end.phase)
