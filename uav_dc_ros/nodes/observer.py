@@ -144,8 +144,9 @@ class Observer(MissionNode):
         """Follow from here on."""
         self._steps = StepPairs()
         self._position_m: list[float] = []  # before the first step
-        self._ended: dict[int, messages.Mission] = {}  # missions that are over, and how
+        self._ended: dict[int, messages.Mission] = {}  # missions that are over, and how, until it is told
         self._ended_s = 0.0  # when the last one was
+        self._told = -1  # the last mission whose end was told
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Follow the vehicle.
@@ -157,13 +158,13 @@ class Observer(MissionNode):
         if self.seed is not None and payload.seed != self.seed + payload.mission:
             raise NodeError(ANOTHER_MISSION)
         self._on_status(payload)
-        if payload.phase.is_over and payload.mission not in self._ended:
+        if payload.phase.is_over and payload.mission > self._told and payload.mission not in self._ended:
             self._ended[payload.mission] = payload
             self._ended_s = time.monotonic()
         self._hear(payload)
         now = self.mission
         if now is not None and (now.mission, now.step) == (payload.mission, payload.step):
-            self.close()  # if this is its end, all of it was heard
+            self.close(before=now.mission + 1)  # if this is its end, all of it was heard
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Follow the collection."""
@@ -179,12 +180,11 @@ class Observer(MissionNode):
         now = self.mission
         if now is not None and (mission.mission, mission.step) <= (now.mission, now.step):
             return  # a repeated step
-        if now is not None and now.over and mission.mission == now.mission:
+        if mission.mission <= self._told:
             return  # it was given up, and told so: its rates came too late
         position_m = self.scenario.grid.centre_m(np.asarray(mission.cell), like=np.zeros(1)).tolist()
         if now is None or mission.mission > now.mission:
-            if min(self._ended, default=mission.mission) < mission.mission:
-                self.close()  # not this one: its end may be heard before its rates
+            self.close(before=mission.mission)
             now = MissionSoFar(scenario=self.scenario, mission=mission.mission, seed=mission.seed)
             now.unheard_steps = mission.step
         else:
@@ -197,20 +197,30 @@ class Observer(MissionNode):
         now.reason = mission.reason
         self._on_step(now)
         if now.over:
-            self._on_end(now, mission.phase)
+            self._tell_end(now, mission)
 
-    def close(self, waited_s: float = 0.0) -> None:
-        """End the mission that is followed, if it is over since `waited_s`: its last rates may never come."""
+    def close(self, waited_s: float = 0.0, before: int | None = None) -> None:
+        """End the missions that are over since `waited_s`: their last rates may never come.
+
+        Args:
+            waited_s: since the last of them was over.
+            before: only those before this one.
+        """
         if not self._ended or time.monotonic() - self._ended_s < waited_s:
             return
-        if self.mission is None:  # it ended before its first step
-            mission, end = next(iter(self._ended.items()))
-            self.mission = MissionSoFar(scenario=self.scenario, mission=mission, seed=end.seed)
-        now = self.mission
-        if not now.over and now.mission in self._ended:
-            end = self._ended[now.mission]
-            now.over, now.reason = True, end.reason
-            self._on_end(now, end.phase)
+        for mission in sorted(self._ended):
+            if before is not None and mission >= before:
+                return
+            end = self._ended[mission]
+            if self.mission is None or self.mission.mission < mission:  # it was over before its first rates
+                self.mission = MissionSoFar(scenario=self.scenario, mission=mission, seed=end.seed)
+            self.mission.over, self.mission.reason = True, end.reason
+            self._tell_end(self.mission, end)
+
+    def _tell_end(self, now: MissionSoFar, end: messages.Mission) -> None:
+        self._told = now.mission
+        self._ended.pop(now.mission, None)
+        self._on_end(now, end.phase)
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """How often nodes were started again."""

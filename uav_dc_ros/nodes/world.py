@@ -18,6 +18,7 @@ from collections import deque
 
 import msgspec
 import numpy as np
+from rclpy.duration import Duration
 
 from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.core import pace
@@ -35,6 +36,8 @@ from uav_dc_ros.nodes.surroundings import Surroundings
 from uav_dc_ros.nodes.table import WORLD_AROUND
 
 STALL_S = 1.0  # a lockstep that stands still for so long repeats its last messages
+CONFIRM_S = 1.0  # a lockstep waits for who hears of it no longer than so
+UNCONFIRMED_S = 0.02  # and than so, as long as one does not answer: it may have been killed
 CLOCK_PERIOD_S = 0.05
 USER_BYTES = 40  # of `users`, for each of them
 OVERRUN_S = 0.005  # a step at a pace that starts later than this after its time
@@ -78,6 +81,8 @@ class World(MissionNode):
         self._seen_by_tick: tuple[int, int] | None = None
         self._ahead: tuple[int, int, bytes] | None = None  # mission, step, and its `users`, encoded
         self._hovered = 0  # steps without a move in time
+        self._unconfirmed = 0  # steps since all who hear of them were known to have got them
+        self._all_confirm = True  # did they, the last time
         self._overruns, self._overruns_told = 0, 0
         self._lateness_s: deque[float] = deque(maxlen=1000)
         if self.surroundings is None:
@@ -210,9 +215,23 @@ class World(MissionNode):
         self.journal.append(b"%d" % int(action))
         self._move(action)
         self._step_began_s = time.monotonic()
+        if self.pace is None:
+            self._wait_for_the_slowest()
         self._tell()
         if self._phase is not Phase.READY and self._mission + 1 < self.values["missions"]:
             self._begin(self._mission + 1)
+
+    def _wait_for_the_slowest(self) -> None:
+        """Fly no further ahead of who hears of the steps than messages are kept for them: in lockstep only.
+
+        It knows of no time, and would leave behind whom a busy computer gives too little.
+        """
+        self._unconfirmed += 1
+        kept = min(self.publishers_of[topic].qos_profile.depth for topic in ("users", "mission"))
+        if self._unconfirmed > kept // 2:
+            patience = Duration(seconds=CONFIRM_S if self._all_confirm else UNCONFIRMED_S)
+            self._all_confirm = self.publishers_of["mission"].wait_for_all_acked(patience)
+            self._unconfirmed = 0
 
     def _move(self, action: Action) -> None:
         """One step of the world."""
