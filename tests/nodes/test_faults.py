@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import signal
 import time
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.conftest import Ros, each_once, finish, read_bag, wait_for
 
 # Each fixture `ros` asserts at its end that no process of the test is left.
 
@@ -158,3 +159,32 @@ def test_a_summary_names_no_bag_that_was_never_made(
     assert status == 130, output
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["bag"] is not None) == (tmp_path / "bag").is_dir()
+
+
+@pytest.mark.parametrize("who", ["recorder", "run_all"])
+def test_a_lockstep_waits_for_who_is_held_up(
+    ros: Ros, arguments: list[object], tmp_path: Path, who: str
+) -> None:
+    """Stopped for as long as it takes to fly more steps than messages are kept."""
+    missions = 120
+    process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", "lockstep", "--missions", missions)
+    assert process.stdout is not None
+    wait_for(process.stdout, "mission 5 of")
+    held_up = process.pid if who == "run_all" else ros.node(who)
+    os.kill(held_up, signal.SIGSTOP)
+    time.sleep(0.8)
+    os.kill(held_up, signal.SIGCONT)
+    status, output = finish(process)
+    assert status == 0, output
+    # Of the drawings only the newest is kept.
+    assert not re.search(r"dropped messages: .*/(users|rates|mission|move|pose|target) ", output), output
+    messages = read_bag(tmp_path / "bag")
+    expected = [(mission, step) for mission in range(missions) for step in range(31)]
+    for topic in ("users", "rates", "mission"):
+        told = each_once([(m["mission"], m["step"]) for name, m in messages if name == f"/{topic}"])
+        assert told == expected, topic
+    assert sum(name == "/pose" for name, _ in messages) >= len(expected)
+    summaries = json.loads((tmp_path / "summary.json").read_text())
+    assert [summary["steps"] for summary in summaries] == [30] * missions
+    rates = [m["sum_rate_bps"] for name, m in messages if name == "/rates" and m["mission"] == missions - 1]
+    assert summaries[-1]["sum_rate_bps"] == pytest.approx(sum(rates[-30:]) / 30)
