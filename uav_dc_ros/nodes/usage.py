@@ -19,8 +19,9 @@ def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def parser(name: str, description: str) -> cli.Parser:
-    """The command line of a row of the node table."""
-    rows = {row.name: row for row in (*NODES[name].parameters, *EVERY)}
+    """The command line of a row of the node table, or of a program of another name that runs one."""
+    own = NODES[name].parameters if name in NODES else ()
+    rows = {row.name: row for row in (*own, *EVERY)}
     return cli.Parser(
         prog=f"python -m uav_dc_ros.nodes.{name}",
         usage="%(prog)s [-h] [--ros-args -p PARAMETER:=VALUE ... -r __ns:=/NAMESPACE ...]",
