@@ -48,11 +48,12 @@ def flying(ros: Ros, *options: object) -> tuple[subprocess.Popen[str], set[str]]
     ("options", "shares"),
     [
         (("--pace", 100), False),
-        (("--pace", 100, "--compose"), True),
         (("--pace", "lockstep", "--missions", 200), True),
-        (("--pace", "lockstep", "--missions", 200, "--no-compose"), False),
+        pytest.param(("--pace", 100, "--compose"), True, marks=pytest.mark.long),
+        pytest.param(
+            ("--pace", "lockstep", "--missions", 200, "--no-compose"), False, marks=pytest.mark.long
+        ),
     ],
-    ids=["at a pace", "at a pace, asked for", "lockstep", "lockstep, asked for"],
 )
 def test_who_shares_a_process(
     ros: Ros, flight: list[object], options: tuple[object, ...], shares: bool

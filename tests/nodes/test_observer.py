@@ -44,7 +44,7 @@ def rates(scenario: Scenario, step: int) -> messages.Rates:
     )
 
 
-@pytest.mark.parametrize("heard", [STEPS + 1, 2, 0], ids=["all", "not the last", "none"])
+@pytest.mark.parametrize("heard", [STEPS + 1, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 0))])
 def test_the_end_is_heard_before_the_rates(
     ros: Ros, small_scenario: Path, small_policy: Path, heard: int
 ) -> None:
