@@ -15,9 +15,7 @@ from typing import NoReturn
 from uav_dc_ros import cli
 from uav_dc_ros.nodes import runtime, usage
 from uav_dc_ros.nodes.mission_node import MissionNode
-from uav_dc_ros.nodes.table import NODES
-
-COMPOSABLE = tuple(row.name for row in NODES.values() if row.composable)
+from uav_dc_ros.nodes.table import COMPOSABLE, NODES
 
 
 def parser() -> cli.Parser:

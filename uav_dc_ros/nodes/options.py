@@ -10,7 +10,7 @@ import msgspec
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.nodes import vehicles
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.table import COMPOSABLE, NODES
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
 # Parameters that are options of run_all.
@@ -53,9 +53,9 @@ def together(options: argparse.Namespace, nodes: list[str]) -> list[str]:
     """
     if not (options.pace is None if options.compose is None else options.compose):
         return []
-    found = [name for name in nodes if NODES[name].composable]
+    found = [name for name in nodes if name in COMPOSABLE]
     if options.compose and len(found) < 2:
-        able = ", ".join(row.name for row in NODES.values() if row.composable)
+        able = ", ".join(COMPOSABLE)
         raise ParameterError(f"--compose: expected two of {able} among --nodes {','.join(nodes)}")
     return found
 

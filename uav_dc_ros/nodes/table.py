@@ -131,6 +131,8 @@ NODES: dict[str, NodeRow] = {
     )
 }
 
+COMPOSABLE = tuple(row.name for row in NODES.values() if row.composable)
+
 # Around a real vehicle the world has the users only.
 WORLD_AROUND = replace(
     NODES["world"], publishes=("users", "ready", "diagnostics"), subscribes=("mission", "pose")

@@ -83,6 +83,8 @@ class World(MissionNode):
         self._hovered = 0  # steps without a move in time
         self._unconfirmed = 0  # steps since all who hear of them were known to have got them
         self._all_confirm = True  # did they, the last time
+        said = (self.publishers_of[topic] for topic in ("users", "mission") if topic in self.publishers_of)
+        self._unconfirmed_max = min(publisher.qos_profile.depth for publisher in said) // 2
         self._overruns, self._overruns_told = 0, 0
         self._lateness_s: deque[float] = deque(maxlen=1000)
         if self.surroundings is None:
@@ -227,8 +229,7 @@ class World(MissionNode):
         It knows of no time, and would leave behind whom a busy computer gives too little.
         """
         self._unconfirmed += 1
-        kept = min(self.publishers_of[topic].qos_profile.depth for topic in ("users", "mission"))
-        if self._unconfirmed > kept // 2:
+        if self._unconfirmed > self._unconfirmed_max:
             patience = Duration(seconds=CONFIRM_S if self._all_confirm else UNCONFIRMED_S)
             self._all_confirm = self.publishers_of["mission"].wait_for_all_acked(patience)
             self._unconfirmed = 0
