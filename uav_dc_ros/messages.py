@@ -118,6 +118,10 @@ class Mission(Stepped, frozen=True, kw_only=True):
         Meta(description="the cell that the UAV reached last: indices east, north, up"),
     ]
     remaining_steps: Annotated[Index, Meta(description="steps that the battery still allows")]
+    steps_not_reached: Annotated[
+        Index,
+        Meta(description="flown steps whose cell was not reached within the tolerance; 0 in simulation"),
+    ] = 0
     seed: Annotated[Seed, Meta(description="seed of this mission's users")]
     scenario: Annotated[Name, Meta(description="name of the scenario")]
     fingerprint: Annotated[

@@ -1,6 +1,7 @@
 """What passes between the bridge and a transport: telemetry one way, wishes the other."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
@@ -15,6 +16,27 @@ class Mode(StrEnum):
     RETURN = "return"  # RTL, AUTO.RTL
     LAND = "land"  # here: LAND, AUTO.LAND
     OTHER = "other"  # any other: somebody else flies
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Limits that the autopilot enforces by its own parameters. None: not enforced, or not reported.
+
+    Attributes:
+        fence_radius_m: of its circular fence, horizontal distance from home, metres.
+        fence_ceiling_m, fence_floor_m: of its altitude fence, metres above home.
+        polygon_fence: does it enforce a fence of another shape, which this system does not read?
+        speed_mps: horizontal speed towards a position target, m/s.
+        climb_mps, descent_mps: vertical speeds towards a position target, m/s, both positive.
+    """
+
+    fence_radius_m: float | None = None
+    fence_ceiling_m: float | None = None
+    fence_floor_m: float | None = None
+    polygon_fence: bool = False
+    speed_mps: float | None = None
+    climb_mps: float | None = None
+    descent_mps: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +58,13 @@ class Telemetry:
         missing: what has not come yet, though nobody flies without; None: all of it has.
         refusal: what the vehicle last refused, and why; None: nothing, or it did it after all.
         said: what it warned of in the last seconds, in its own words; empty: nothing.
+        home: where it returns to, in the grid's ENU frame; None: not reported.
+        target: position target that the autopilot reports, in the grid's ENU frame; None: not reported.
+        tilt_rad: angle between the vehicle's vertical axis and the vertical, 0 to pi; None: not reported.
+        limits: of the autopilot's own parameters; None: not reported.
+        other_controller: another system that commands this vehicle, with the evidence; None: none was seen.
+        system: the vehicle's identity on its link, such as `system 1`; empty: not known.
+        discarded: messages that were counted and ignored, by reason (late, repeated, impossible, ...).
     """
 
     heartbeat_s: float | None = None
@@ -53,6 +82,13 @@ class Telemetry:
     missing: str | None = None
     refusal: str | None = None
     said: str = ""
+    home: Enu | None = None
+    target: Enu | None = None
+    tilt_rad: float | None = None
+    limits: Limits | None = None
+    other_controller: str | None = None
+    system: str = ""
+    discarded: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
