@@ -29,6 +29,10 @@ class BagError(UavDcError):
     """A bag that cannot be written or read."""
 
 
+class BagDamagedError(BagError):
+    """A bag that is damaged, or whose recorder was killed: `recover` makes a whole one of the rest."""
+
+
 class ParameterError(UavDcError):
     """A ROS parameter of a node, or an option of a command, that makes no sense."""
 

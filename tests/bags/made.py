@@ -3,6 +3,7 @@
 import io
 import os
 import signal
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -89,6 +90,14 @@ def mcap_file(
     if finished:
         writer.finish()
     return file.getvalue()
+
+
+def bare(path: Path) -> Path:
+    """A file without its summary section, as MCAP allows."""
+    file = path.read_bytes()
+    (start,) = struct.unpack_from("<Q", file, len(file) - 8 - 20)
+    path.write_bytes(file[:start] + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + file[-8:])
+    return path
 
 
 def in_mcap(path: Path) -> list[tuple[str, int, int, int, bytes]]:

@@ -288,7 +288,7 @@ def test_parts_qos_and_records_are_kept(tmp_path: Path) -> None:
     recovered = recover(folder_of(tmp_path / "bag", files), tmp_path / "out")
     lines = told(recovered)
     assert lines[2] == "bag_1.mcap: nothing was recovered: an empty file"
-    assert lines[3].startswith("bag_2.mcap: nothing was recovered: no MCAP file: it starts with b'SQLite f'")
+    assert lines[3].startswith("bag_2.mcap: nothing was recovered: no MCAP file: it is SQLite storage")
     info = information(tmp_path / "out")
     assert info["relative_file_paths"] == ["out_0.mcap", "out_1.mcap"]
     assert info["custom_data"] == {"seed": "3", "lost_bytes": str(recovered.lost_bytes)}
@@ -306,7 +306,7 @@ def test_parts_qos_and_records_are_kept(tmp_path: Path) -> None:
     [
         (b"", "an empty file"),
         (b"\x89MCAP0\r\n", "8 bytes without a topic"),
-        (b"SQLite format 3\0", "no MCAP file: it starts with b'SQLite f'"),
+        (b"SQLite format 3\0", "no MCAP file: it is SQLite storage"),
         (bytes(5000), "no MCAP file"),
         (b"\x89MCAP0\r\n" + random.Random(0).randbytes(100_000), "100008 bytes without a topic"),
     ],

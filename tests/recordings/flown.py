@@ -73,6 +73,7 @@ class Flight:
         self.vehicle = Vehicle(position=Enu(x_m, y_m, 0.0))
         self.bridge: Bridge | None = self._bridge()
         self._beat, self._policy, self._begun_ns = beat, policy, begun_ns
+        self._sent_ns = 0
         self._dead_until_s = 0.0
         self._patience_s, self._ready_since_s = patience_s, 0.0
         self._sway = np.random.default_rng(seed)
@@ -100,6 +101,11 @@ class Flight:
         self._standing, self._setpoint = self.bridge.standing, self.bridge.setpoint
         self.bridge, self._dead_until_s = None, self.vehicle.now_s + DEAD_S
 
+    def set_clock(self, by_s: float) -> None:
+        """Set the clock of the machine forward, or back."""
+        self._begun_ns += round(by_s * 1e9)
+        self._sent_ns = 0
+
     @property
     def now_ns(self) -> int:
         """The time of the machine."""
@@ -124,7 +130,7 @@ class Flight:
         vehicle.pass_time(TICK_S, bridge.setpoint)
 
     def _say(self, topic: str, payload: messages.Payload | bytes) -> None:
-        sent_ns = max(self.now_ns, self.told[-1].publish_time_ns + 1000 if self.told else 0)
+        sent_ns = self._sent_ns = max(self.now_ns, self._sent_ns + 1000)
         self.told.append(said(topic, payload, sent_ns)._replace(log_time_ns=sent_ns + LATENCY_NS))
 
     def _tell(self) -> None:

@@ -136,7 +136,7 @@ def test_faults_are_told_and_a_good_bag_has_none(made):
         ("mission 0", "steps that are not in the bag: 1"),
         ("mission 0", "steps without pose: 1"),
         ("policy", "late; restarts: 2"),
-        ("rates", "unreadable messages (malformed): 1"),
+        ("rates", "unreadable messages (malformed): 1: JSON is malformed: invalid character (byte 4)"),
     ]
     (node,) = data["data"]["health"]["nodes"]
     assert (node["warnings"], node["restarts"], node["reports"]) == (2, "2", 3)

@@ -39,6 +39,9 @@ class InMemory:
     def messages(self, names):
         return (message for message in self._told if message.topic in names)
 
+    def received(self, names):
+        return ((0, message) for message in self.messages(names))
+
 
 def read(told, namespace="", step_ns=STEP_NS):
     stream = Steps(InMemory(told), namespace, step_ns)

@@ -35,6 +35,10 @@ MAGIC = b"\x89MCAP0\r\n"
 FRAME = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 COMPRESSIONS = ("", "zstd", "lz4")
+CDR = "cdr"  # how ROS 2 serialises messages
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+PAYLOAD_MAX_BYTES = 2**30  # of a message that is compressed by itself
+TIME_MAX_NS = 2**63 - 1  # MCAP has unsigned times, ROS 2 and tables have not
 PRIVATE = 0x80  # opcodes from here on belong to applications
 FOOTER_BYTES = 20
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size and CRC, length of the compression's name
@@ -177,6 +181,21 @@ def inflate_torn(compression: str, data: bytes) -> bytes:
     except Exception:  # of zstandard, lz4
         return b""
     return plain
+
+
+def plain(payload: bytes) -> bytes:
+    """The CDR payload of a message, decompressed where rosbag2 compressed each message by itself.
+
+    CDR begins with a zero byte, a zstd frame does not. A frame that is damaged stays as it is.
+    """
+    if not payload.startswith(ZSTD_MAGIC):
+        return payload
+    try:
+        if 0 <= zstandard.get_frame_parameters(payload).content_size <= PAYLOAD_MAX_BYTES:
+            return zstandard.ZstdDecompressor().decompress(payload)
+    except (zstandard.ZstdError, MemoryError):
+        pass
+    return payload
 
 
 class Frames:

@@ -186,10 +186,18 @@ def write_metadata(folder: Path, parts: Sequence[Part]) -> None:
 
 
 def read_metadata(folder: Path) -> dict[str, Any] | None:
-    """What metadata.yaml says; None if it is missing, or says nothing of a bag."""
+    """What metadata.yaml says; None if it is missing, or says nothing of a bag.
+
+    Raises:
+        BagError: it is there, and cannot be read.
+    """
     try:
         told = YAML(typ="safe").load(folder / FILE_NAME)["rosbag2_bagfile_information"]
-    except (OSError, ValueError, YAMLError, KeyError, TypeError, RecursionError):
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise BagError(f"{folder / FILE_NAME} cannot be read: {error.strerror}") from None
+    except (ValueError, YAMLError, KeyError, TypeError, RecursionError):
         return None
     return told if isinstance(told, dict) else None
 
@@ -203,7 +211,7 @@ def is_told(folder: Path, parts: Sequence[Part]) -> bool:
         counts = {
             row["topic_metadata"]["name"]: row["message_count"] for row in told["topics_with_message_count"]
         }
-        names = told["relative_file_paths"]
+        names = [Path(name).name for name in told["relative_file_paths"]]  # some writers put folders before
     except (KeyError, TypeError):
         return False
     return names == [part.name for part in parts] and counts == total(parts).counts

@@ -16,7 +16,8 @@ from uav_dc_ros.bags.metadata import Part, information, to_yaml
 from uav_dc_ros.errors import BagError
 
 CHUNK_BYTES = 128 * 1024  # small: a chunk that was not finished is what a killed writer loses
-_NUMBER = re.compile(r"_(\d+)\.mcap$")
+MCAP = ".mcap"
+_NUMBER = re.compile(r"_(\d+)\.\w+$")
 
 
 def number(path: Path) -> int:
@@ -25,9 +26,20 @@ def number(path: Path) -> int:
     return int(found[1]) if found else -1
 
 
-def part_paths(folder: Path) -> list[Path]:
-    """The MCAP files of a bag in the order of their numbers; hidden files are none of them."""
-    paths = [path for path in folder.glob("*.mcap") if not path.name.startswith(".")]
+def part_paths(folder: Path, suffix: str = MCAP) -> list[Path]:
+    """The storage files of a bag in the order of their numbers; hidden files are none of them.
+
+    Args:
+        folder: the bag's.
+        suffix: of the files.
+
+    Raises:
+        BagError: the folder cannot be read.
+    """
+    try:
+        paths = [path for path in folder.iterdir() if path.suffix == suffix and not path.name.startswith(".")]
+    except OSError as error:
+        raise BagError(f"bag {folder} cannot be read: {error.strerror}") from None
     return sorted(paths, key=lambda path: (number(path), path.name))
 
 

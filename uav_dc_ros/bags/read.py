@@ -3,28 +3,33 @@
 Each part that our recorder writes repeats latched messages of earlier parts at its head, for who has no other
 part: of the parts of one folder they are left out, except of the first one there.
 
-A bag is a rosbag2 folder with MCAP files, with or without metadata.yaml, or one MCAP file. Folders in
-rosbag2's SQLite storage are read, too. What a killed recorder left is recovered first.
+A bag is a rosbag2 folder with MCAP or SQLite files, with or without metadata.yaml, or one such file. What a
+killed recorder left is recovered first.
 """
 
 import heapq
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
+from functools import cached_property
+from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from uav_dc_ros.bags.mcap_storage import open_mcap
+from uav_dc_ros.bags.receipt import SET_BACK_NS, in_order
+from uav_dc_ros.bags.sqlite_storage import open_sqlite
 from uav_dc_ros.bags.storage import (
+    SQLITE_MAGIC,
     BagMessage,
     RecordedTopic,
     Storage,
-    open_sqlite,
+    reading,
     storage_files,
 )
-from uav_dc_ros.errors import BagError
 
 __all__ = ["BagMessage", "BagReader", "RecordedTopic"]
 
@@ -33,7 +38,7 @@ class BagReader:
     """A bag that is read; a context manager.
 
     Args:
-        path: the bag's folder, or one of its MCAP files.
+        path: the bag's folder, or one of its files.
         torn: read files that lack their end, or are damaged, as far as they go. They are read once more,
             to know what they hold.
 
@@ -68,7 +73,10 @@ class BagReader:
             if part.dropped is not None:
                 self.dropped = dict(Counter(self.dropped or {}) + Counter(part.dropped))
             for topic in part.topics:
-                self._enter(topic)
+                if topic.name in self.topics:
+                    self.topics[topic.name].join(topic)
+                else:
+                    self.topics[topic.name] = replace(topic)
         with_messages = [part for part in self.storages if any(topic.count for topic in part.topics)]
         self.first_ns = min((part.first_ns for part in with_messages), default=0)
         self.last_ns = max((part.last_ns for part in with_messages), default=0)
@@ -116,18 +124,49 @@ class BagReader:
             yield from heapq.merge(*streams[:together], key=attrgetter("log_time_ns"))
             del streams[:together]
 
-    def _enter(self, topic: RecordedTopic) -> None:
-        known = self.topics.get(topic.name)
-        if known is None:
-            self.topics[topic.name] = topic
-            return
-        if known.type != topic.type:
-            raise BagError(f"bag {self.path}: topic {topic.name} is of type {known.type} and {topic.type}")
-        if not known.count and topic.count:
-            known.offered_qos = topic.offered_qos
-        known.count += topic.count
+    @cached_property
+    def set_back_ns(self) -> int:
+        """By how much the clock was set back, at most, while the bag was recorded, nanoseconds; 0: never.
+
+        Raises:
+            BagError: the bag is damaged there.
+        """
+        most_ns = max((part.set_back_ns() for part in self.storages), default=0)
+        if not self._is_side_by_side:
+            for before, after in pairwise(part for part in self.storages if _names(part)):
+                most_ns = max(most_ns, before.last_ns - after.first_ns)
+        return most_ns if most_ns > SET_BACK_NS else 0
+
+    def received(self, topics: Collection[str]) -> Iterator[tuple[int, BagMessage]]:
+        """Messages in the order of their receipt, each with how often the clock had been set back by then.
+
+        That is the order of their log times, but for a clock that was set back: then it is that in which they
+        were recorded, as far as they lie no further apart than `receipt.WAITING_BYTES`.
+
+        Raises:
+            BagError: the bag is damaged there.
+        """
+        if not self.set_back_ns:
+            return ((0, message) for message in self.messages(topics))
+        streams = [part.recorded(topics) for part in self.storages]
+        if self._is_side_by_side:
+            return in_order(heapq.merge(*streams, key=attrgetter("log_time_ns")))
+        return in_order(chain(*streams))
+
+    @property
+    def _is_side_by_side(self) -> bool:
+        """Whether its files hold different topics, as those of several recorders, not one after the other."""
+        names = [name for part in self.storages for name in _names(part)]
+        return len(set(names)) == len(names)
 
     def _open(self, path: Path, torn: bool, *, repeats: bool) -> Storage:
-        if path.is_dir():
+        with reading(path), path.open("rb") as file:
+            is_sqlite = file.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
+        if is_sqlite:
             return open_sqlite(path, self._closing)
         return open_mcap(path, self._closing, torn=torn, repeats=repeats)
+
+
+def _names(part: Storage) -> list[str]:
+    """Topics with messages."""
+    return [topic.name for topic in part.topics if topic.count]

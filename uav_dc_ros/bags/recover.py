@@ -9,14 +9,15 @@ import contextlib
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from uav_dc_ros.bags.mend import copy
 from uav_dc_ros.bags.metadata import LOST, METADATA_NAME, Part, total, write_metadata
 from uav_dc_ros.bags.part import PartWriter
 from uav_dc_ros.bags.scan import Damage, Scan, has_end
-from uav_dc_ros.bags.storage import mcap_files
+from uav_dc_ros.bags.storage import foreign, storage_files
+from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.errors import BagError
 
 TOLD_MAX = 20  # damaged places of a file that are told one by one
@@ -32,6 +33,7 @@ class RecoveredPart:
         had_end: whether it had an end, unharmed.
         expected: messages that it once held, as its end tells; None without an end.
         damages: what could not be used, as it lies in the file.
+        unreadable: messages that were recovered, and cannot be decoded.
         why: why nothing was recovered.
     """
 
@@ -40,6 +42,7 @@ class RecoveredPart:
     had_end: bool = False
     expected: int | None = None
     damages: Sequence[Damage] = ()
+    unreadable: Unreadable = field(default_factory=Unreadable)
     why: str = ""
 
     @property
@@ -80,7 +83,7 @@ def recover(path: Path, folder: Path) -> Recovered:
     """
     if folder.exists() or folder.is_symlink():
         raise BagError(f"bag folder {folder} exists already; expected a new one")
-    sources = mcap_files(path)
+    sources = storage_files(path)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         temporary.mkdir(parents=True)
@@ -120,7 +123,7 @@ def _recover_part(source: Path, path: Path) -> RecoveredPart:
         if not scan.size:
             return RecoveredPart(source=source, why="an empty file")
         if not scan.is_mcap():
-            return RecoveredPart(source=source, why=f"no MCAP file: it starts with {scan.magic!r}")
+            return RecoveredPart(source=source, why=f"no MCAP file: it {foreign(scan.magic)}")
         writer = PartWriter(path)
         try:
             copy(scan, writer)
@@ -142,6 +145,7 @@ def _recover_part(source: Path, path: Path) -> RecoveredPart:
             had_end=has_end(file),
             expected=statistics.message_count if statistics is not None else None,
             damages=scan.damages,
+            unreadable=scan.unreadable,
         )
 
 
@@ -175,6 +179,7 @@ def told(recovered: Recovered) -> list[str]:
             state = "whole" if part.had_end and not part.damages else "damaged" if part.had_end else "no end"
             of = f" of {part.expected:,}" if part.lost_messages and part.expected is not None else ""
             lines.append(f"{part.source.name} ({state}): {part.part.message_count:,}{of} messages recovered")
+        lines += [f"  {line}" for line in part.unreadable.lines()]
         lines += [f"  lost {_lost(damage, start_ns)}" for damage in part.damages[:TOLD_MAX]]
         if len(part.damages) > TOLD_MAX:
             lines.append(f"  and {len(part.damages) - TOLD_MAX:,} places more")

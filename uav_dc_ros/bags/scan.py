@@ -6,6 +6,7 @@ frames of the records are read here, and only what lies inside a whole frame goe
 """
 
 import os
+import struct
 import zlib
 from bisect import bisect_left
 from collections.abc import Generator, Iterator
@@ -21,29 +22,36 @@ from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metadata, Schema
 from mcap.summary import Summary
 
+from uav_dc_ros import payloads
 from uav_dc_ros.bags.frames import (
+    CDR,
     COMPRESSIONS,
     FOOTER_BYTES,
     FRAME,
     MAGIC,
     MESSAGE,
+    TIME_MAX_NS,
     ChunkHead,
     Frames,
     frames,
     inflate_torn,
     parse,
+    plain,
     unpack,
 )
 from uav_dc_ros.bags.metadata import Part, is_latched
-from uav_dc_ros.errors import BagError
+from uav_dc_ros.bags.unreadable import Unreadable
+from uav_dc_ros.errors import BagDamagedError, BagError, MessageError
+from uav_dc_ros.topics import JSON
 
 _END_BYTES = FRAME.size + FOOTER_BYTES + len(MAGIC)
+_FOOTER = struct.Struct("<QQI")  # start of the summary, of its offsets, and CRC
 DAMAGES_MAX = 10_000  # places that are told apart; the last one takes in what follows
 _KEPT = (Schema, Channel, Metadata, Attachment)  # the rest is an index: it is made anew
 
 
 def has_end(file: IO[bytes]) -> bool:
-    """Whether an MCAP file has a summary, unharmed, a footer and the closing magic.
+    """Whether an MCAP file has a footer and the closing magic; and its summary, if any, is unharmed.
 
     Raises:
         OSError: the disk is gone.
@@ -56,8 +64,9 @@ def has_end(file: IO[bytes]) -> bool:
     opcode, length = FRAME.unpack_from(end)
     if end[-len(MAGIC) :] != MAGIC or (opcode, length) != (Opcode.FOOTER, FOOTER_BYTES):
         return False
-    start = int.from_bytes(end[FRAME.size : FRAME.size + 8], "little")
-    crc = int.from_bytes(end[-len(MAGIC) - 4 : -len(MAGIC)], "little")
+    start, offsets_start, crc = _FOOTER.unpack_from(end, FRAME.size)
+    if start == 0:  # without a summary, which is optional
+        return offsets_start == 0 and crc in (0, zlib.crc32(end[: FRAME.size + 16]))
     if not len(MAGIC) <= start < size - _END_BYTES:
         return False
     if crc == 0:  # MCAP's way to say that there is none
@@ -65,6 +74,28 @@ def has_end(file: IO[bytes]) -> bool:
     file.seek(start)
     # The summary is small, some ten bytes for each chunk and topic. Its CRC takes in the footer up to itself.
     return zlib.crc32(file.read(size - start - len(MAGIC) - 4)) == crc
+
+
+def metadata_records(path: Path, file: IO[bytes]) -> Iterator[Metadata]:
+    """The metadata records of a finished MCAP file, without an index; chunks, which hold none, are skipped.
+
+    Raises:
+        BagDamagedError: what lies between them is damaged.
+        OSError: the disk is gone.
+    """
+    looked, at, opcode = Frames(file), len(MAGIC), 0
+    while opcode not in (Opcode.DATA_END, Opcode.FOOTER):
+        frame = looked.read(at, FRAME.size)
+        opcode, length = FRAME.unpack(frame) if len(frame) == FRAME.size else (0, 0)
+        if opcode == Opcode.METADATA:
+            record = parse(opcode, looked.read(at + FRAME.size, length))
+            if isinstance(record, Metadata):
+                yield record
+            else:
+                opcode = 0
+        if opcode == 0:
+            raise BagDamagedError(f"{path} is damaged: what lies at byte {at} is no record")
+        at += FRAME.size + length
 
 
 @dataclass
@@ -101,7 +132,10 @@ class Scan:
         part: what was read until now.
         library: what wrote the file, in its own words.
         lag_ns: how much earlier than one before it a message was until now, nanoseconds.
+        set_back_ns: how much earlier than the one before it on its topic.
         damages: what could not be used until now, as it lies in the file.
+        unreadable: messages that are whole, and whose payload is no CDR.
+        compressed: topics of whose messages rosbag2 compressed each by itself; they come decompressed.
         size: of the file when it was opened, bytes; what is appended later is not read.
         magic: its first bytes.
 
@@ -113,15 +147,19 @@ class Scan:
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self.part = Part(path.name)
         self.damages: list[Damage] = []
+        self.unreadable = Unreadable()
+        self.compressed: set[str] = set()
         self.path = path
         self.library = ""
-        self.lag_ns = 0
+        self.lag_ns = self.set_back_ns = 0
         self._file = file
         self._frames = Frames(file)
         self.size = self._frames.size
         self.magic = self._frames.read(0, len(MAGIC))
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, str] = {}
+        self._cdr: set[int] = set()  # channels
+        self._times_ns: dict[str, int] = {}  # log time of the last message by topic
         self._latched: set[str] = set()
         self._last_ns: int | None = None
         self._chunked = False
@@ -261,14 +299,21 @@ class Scan:
                 self._lose(self._at, FRAME.size + len(content), "messages of a topic that is lost")
                 return
             topic = self._channels[channel]
+            log_time_ns, publish_time_ns = min(log_time_ns, TIME_MAX_NS), min(publish_time_ns, TIME_MAX_NS)
             self.part.count(topic, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
             self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
-            self._last_ns = log_time_ns
+            self.set_back_ns = max(self.set_back_ns, self._times_ns.get(topic, 0) - log_time_ns)
+            self._last_ns = self._times_ns[topic] = log_time_ns
             for damage in reversed(self.damages):
                 if damage.before_ns is not None:
                     break
                 damage.before_ns = log_time_ns
             data = content[MESSAGE.size :]
+            if channel in self._cdr:
+                payload, data = data, plain(data)
+                if data is not payload:
+                    self.compressed.add(topic)
+                self._check(topic, data)
             if topic in self._latched:
                 self.part.latest[topic] = data, publish_time_ns
             yield Message(channel, log_time_ns, data, publish_time_ns, sequence)
@@ -282,6 +327,16 @@ class Scan:
             yield record
         elif record is None and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE):
             self._lose(self._at, FRAME.size + len(content), "a record that is none")
+
+    def _check(self, topic: str, data: bytes) -> None:
+        """Look whether a payload is CDR, as far as that can be told without its type; of a text, whole."""
+        try:
+            if self.part.topics[topic]["type"] == JSON:
+                payloads.text_in_cdr(data)
+            else:
+                payloads.byte_order(data)
+        except MessageError as error:
+            self.unreadable.enter(topic, error)
 
     def _announced(self, channel_id: int) -> Iterator[McapRecord]:
         """A channel, with its schema, as the summary repeats them: the chunk that had them is damaged."""
@@ -303,6 +358,8 @@ class Scan:
             if record.id in self._channels or record.schema_id not in self._schemas:
                 return False
             self._channels[record.id] = record.topic
+            if record.message_encoding == CDR:
+                self._cdr.add(record.id)
             type = self._schemas[record.schema_id]
             self.part.announce(record.topic, type, record.message_encoding, record.metadata)
             if is_latched(self.part.topics[record.topic]):

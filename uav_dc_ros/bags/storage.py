@@ -1,23 +1,43 @@
-"""The storage files of a bag: MCAP through mcap, rosbag2's SQLite through rosbags."""
+"""What the storage files of a bag have in common, where they lie, and what goes wrong while they are read."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+import re
+import sqlite3
+import stat
+import struct
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from rosbags.interfaces import ConnectionExtRosbag2
-from rosbags.rosbag2 import Reader
-from rosbags.rosbag2.metadata import dump_qos_v9
+import zstandard
+from mcap.exceptions import McapError
 
-from uav_dc_ros.bags.metadata import read_metadata, to_yaml
 from uav_dc_ros.bags.part import part_paths
 from uav_dc_ros.bags.scan import Damage
-from uav_dc_ros.errors import BagError, UavDcError
+from uav_dc_ros.errors import BagDamagedError, BagError
 
-SQLITE = "*.db3"
-COMPRESSED = "*.mcap.zstd"  # files that rosbag2 compressed as a whole
+SQLITE = ".db3"
+SQLITE_MAGIC = b"SQLite format 3\0"
 RECOVER = "python -m uav_dc_ros.bag recover"
+# What files that are no storage files begin with, and what they are.
+FOREIGN = {
+    b"\x28\xb5\x2f\xfd": "is compressed as a whole (zstd); expected it unpacked, as `zstd -d` does",
+    b"\x04\x22\x4d\x18": "is compressed as a whole (lz4); expected it unpacked, as `lz4 -d` does",
+    b"\x1f\x8b": "is compressed as a whole (gzip); expected it unpacked, as `gunzip` does",
+    b"\xfd7zXZ\0": "is compressed as a whole (xz); expected it unpacked, as `xz -d` does",
+    b"BZh": "is compressed as a whole (bzip2); expected it unpacked, as `bunzip2` does",
+    b"PK\x03\x04": "is a ZIP archive; expected it unpacked",
+    SQLITE_MAGIC[:8]: "is SQLite storage, which needs no recovery; expected an MCAP file",
+    b"#ROSBAG": "is a bag of ROS 1; expected one of ROS 2, as `rosbags-convert` makes of it",
+}
+# What mcap, struct, zstandard, lz4 (RuntimeError) and sqlite3 raise for damaged bytes. Anything else, such as
+# a TypeError, is a mistake of ours.
+_DAMAGE = (
+    McapError, struct.error, zstandard.ZstdError, sqlite3.Error, RuntimeError, ValueError, EOFError,
+    LookupError, OverflowError, MemoryError,
+)  # fmt: skip
+_PACKED = re.compile(r"\.(mcap|db3)\.\w+$")
 
 
 class BagMessage(NamedTuple):
@@ -50,6 +70,7 @@ class RecordedTopic:
         serialization: of the messages, `cdr` in ROS 2.
         offered_qos: the publishers' QoS, rosbag2's YAML; empty where the bag does not tell.
         count: messages.
+        other_types: further types that messages of this topic have; ROS 2 allows one only.
     """
 
     name: str
@@ -59,123 +80,120 @@ class RecordedTopic:
     serialization: str = "cdr"
     offered_qos: str = ""
     count: int = 0
+    other_types: tuple[str, ...] = ()
+
+    def join(self, other: "RecordedTopic") -> None:
+        """Enter what another channel, or another file, has of this topic."""
+        if not self.count and other.count:
+            self.offered_qos = other.offered_qos
+        self.count += other.count
+        new = {other.type, *other.other_types} - {self.type, *self.other_types}
+        self.other_types += tuple(sorted(new))
+
+
+Messages = Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
 
 
 @dataclass(kw_only=True)
 class Storage:
-    """A storage file: what it holds, and its messages between two log times (the second one excluded).
+    """A storage file: what it holds, and its messages.
 
     Attributes:
-        about, dropped: as those of `metadata.Part`.
+        messages: those between two log times (the second one excluded), in the order of their log times.
+        recorded: those of some topics, or all, in the order in which they were recorded.
+        set_back_ns: by how much the log time went back, at most, from one message of a topic to the next,
+            nanoseconds; looks through the file.
+        about, dropped, repeated: as those of `metadata.Part`; repeated messages are those left out.
         library: what wrote it, in its own words.
         damages: what of it cannot be used; told only where it was read as far as it goes.
         has_end: whether it is finished.
+        has_index: whether its messages can be found without reading all of it.
+        compressed: topics of whose messages rosbag2 compressed each by itself, among those read until now.
     """
 
     path: Path
     topics: list[RecordedTopic]
     first_ns: int
     last_ns: int
-    messages: Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
+    messages: Messages
+    recorded: Callable[[Collection[str] | None], Iterator[BagMessage]]
+    set_back_ns: Callable[[], int]
     about: dict[str, str] = field(default_factory=dict)
     dropped: dict[str, int] | None = None
+    repeated: dict[str, int] = field(default_factory=dict)
     library: str = ""
     damages: Sequence[Damage] = ()
     has_end: bool = True
+    has_index: bool = True
+    compressed: set[str] = field(default_factory=set)
 
 
 def storage_files(path: Path) -> list[Path]:
-    """The storage files of a bag, in their order; for SQLite storage the folder itself.
+    """The storage files of a bag, in their order: MCAP files, or those of SQLite storage.
 
     Raises:
-        BagError: there is no bag, or one that is compressed as a whole.
+        BagError: there is no bag, or one that cannot be read.
     """
-    if path.is_dir() and not part_paths(path) and any(path.glob(SQLITE)):
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise BagError(f"bag {path}: no such folder or file") from None
+    except (OSError, ValueError) as error:
+        raise BagError(f"bag {path} cannot be read: {getattr(error, 'strerror', error)}") from None
+    if stat.S_ISREG(mode):
         return [path]
-    return mcap_files(path)
+    if not stat.S_ISDIR(mode):
+        raise BagError(f"bag {path}: expected a folder or a file")
+    found = part_paths(path) or part_paths(path, SQLITE)
+    if found:
+        return found
+    packed = sorted(file.name for file in path.iterdir() if _PACKED.search(file.name))
+    if packed:
+        raise BagError(
+            f"bag {path} holds {packed[0]}, which is compressed as a whole; expected its files unpacked, as "
+            "`zstd -d` does"
+        )
+    raise BagError(
+        f"bag {path} holds no MCAP file; expected at least one (*.mcap), or SQLite storage (*.db3)"
+    )
 
 
-def mcap_files(path: Path) -> list[Path]:
-    """The MCAP files of a bag, in their order.
+def foreign(beginning: bytes) -> str:
+    """What a file is that is no MCAP file, by its first bytes, and what was expected."""
+    for magic, told in FOREIGN.items():
+        if beginning.startswith(magic):
+            return told
+    return f"starts with {beginning!r}; expected an MCAP file, or SQLite storage"
 
-    Raises:
-        BagError: there are none.
+
+def set_back_ns(times: Iterable[tuple[object, int]]) -> int:
+    """The most by which a message's log time is earlier than that of the one before it on its topic, ns.
+
+    Args:
+        times: topic (or channel) and log time of each message, those of a topic in their order.
     """
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise BagError(f"bag {path}: no such folder or file")
-    found = part_paths(path)
-    if not found and any(path.glob(COMPRESSED)):
-        raise BagError(f"bag {path} holds {COMPRESSED}; expected *.mcap, as `zstd -d` makes of them")
-    if not found:
-        raise BagError(f"bag {path} holds no MCAP file; expected at least one (*.mcap)")
-    mode = str((read_metadata(path) or {}).get("compression_mode", "")).lower()
-    if mode == "message":  # the chunks' own compression is another thing
-        raise BagError(f"bag {path} holds messages that rosbag2 compressed one by one; expected plain ones")
-    return found
+    most_ns, last_ns = 0, dict[object, int]()
+    for topic, time_ns in times:
+        most_ns = max(most_ns, last_ns.get(topic, 0) - time_ns)
+        last_ns[topic] = time_ns
+    return most_ns
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """What goes wrong with a file, in words."""
+    try:
+        yield
+    except OSError as error:
+        raise BagError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
 @contextmanager
 def damage(path: Path, help: str = f"; {RECOVER} brings back what is whole") -> Iterator[None]:
     """What goes wrong inside the libraries, in words; nothing of ours is to be called in it."""
     try:
-        yield
-    except OSError as error:
-        raise BagError(f"{path} cannot be read: {error.strerror or error}") from None
-    except UavDcError:
-        raise
-    except Exception as error:  # of mcap, struct, zstandard, lz4, sqlite3, rosbags: damaged bytes
+        with reading(path):
+            yield
+    except _DAMAGE as error:
         told = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BagError(f"{path} is damaged: {told}{help}") from None
-
-
-def open_sqlite(folder: Path, closing: ExitStack) -> Storage:
-    """A folder in rosbag2's SQLite storage.
-
-    Raises:
-        BagError: it cannot be read.
-    """
-    try:
-        reader = Reader(folder)
-        reader.open()
-        closing.callback(reader.close)
-    except Exception as error:  # of rosbags, sqlite3, YAML: damaged, or no bag
-        raise BagError(f"bag {folder} cannot be read: {error}") from None
-    topics = []
-    for connection in reader.connections:
-        assert isinstance(connection.ext, ConnectionExtRosbag2), "a bag of ROS 2"
-        topics.append(
-            RecordedTopic(
-                name=connection.topic,
-                type=connection.msgtype,
-                definition=connection.msgdef.data.encode(),
-                encoding=connection.msgdef.format.name.lower(),
-                serialization=connection.ext.serialization_format,
-                offered_qos=to_yaml(dump_qos_v9(connection.ext.offered_qos_profiles)),
-                count=connection.msgcount,
-            )
-        )
-
-    def messages(
-        topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[BagMessage]:
-        wanted = [one for one in reader.connections if topics is None or one.topic in topics]
-        if not wanted:
-            return
-        stream = reader.messages(wanted, start=start_ns, stop=end_ns)
-        while True:
-            with damage(folder, ""):
-                found = next(stream, None)
-            if found is None:
-                return
-            connection, time_ns, data = found
-            yield BagMessage(connection.topic, connection.msgtype, bytes(data), time_ns, time_ns)
-
-    return Storage(
-        path=folder,
-        topics=topics,
-        first_ns=reader.start_time,
-        last_ns=reader.end_time - 1,  # rosbags ends after the last message
-        messages=messages,
-    )
+        raise BagDamagedError(f"{path} is damaged: {told}{help}") from None

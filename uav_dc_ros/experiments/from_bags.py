@@ -63,7 +63,7 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
     missions: set[tuple[int, str, int, int]] = set()
     n = 0
     for i, bag in enumerate(bags):
-        n_before = n
+        n_before, unreadable = n, list[str]()
         with BagReader(bag) as reader:
             for namespace in steps.namespaces(reader):
                 recorded = Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
@@ -72,10 +72,10 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
                     training.remember(transition)
                     missions.add((i, namespace, transition.flight, transition.mission))
                     n += 1
+                unreadable += recorded.rejected.lines()
         if n == n_before:
-            raise TrainingError(
-                f"bag {bag} holds no transition; expected missions with `mission` and `rates`"
-            )
+            why = "; ".join(unreadable) or "expected missions with `mission` and `rates`"
+            raise TrainingError(f"bag {bag} holds no transition; {why}")
     return Remembered(
         bags=tuple(map(str, bags)), missions=len(missions), transitions=n, held=training.n_remembered
     )

@@ -105,8 +105,8 @@ def run(options: argparse.Namespace) -> int:
             write_tables(options.out, recorded, scenario, reader.about, options.tables, format, flew)
         for topic, n in sorted(recorded.orphans.items()):
             print(f"  {n} messages on {topic} came too late to be brought together with their step")
-        for (topic, reason), n in sorted(recorded.rejected.items()):
-            print(f"  {n} messages on {topic} cannot be read: {reason}")
+        for line in recorded.rejected.lines():
+            print(f"  {line}")
     return 0
 
 
@@ -179,7 +179,7 @@ def write_tables(
                 written["missions"].add(mission.summary())
             n_missions += 1
         if not n_missions:
-            raise BagError("the bag holds no step of any mission; expected at least one")
+            raise BagError(f"the bag holds no step of any mission; {_nothing(recorded)}")
         stack.close()  # everything is written before the folder takes its name
     told = ", ".join(f"{table.count} rows of {name}" for name, table in written.items())
     print(f"{folder}: {n_missions} mission{'s' * (n_missions != 1)}: {told}")
@@ -214,7 +214,8 @@ def write_transitions(
                 _append(columns, transition, kinds)
                 n += 1
         if not n:
-            raise BagError(f"the bag holds no transition: {dict(stream.skipped) or 'no step'}")
+            why = dict(stream.skipped) or f"no step; {_nothing(recorded)}"
+            raise BagError(f"the bag holds no transition: {why}")
         metadata = {
             "version": __version__,
             "bag": source,
@@ -236,6 +237,11 @@ def write_transitions(
         print(f"  {stream.deduced} actions are deduced from the cells: no move was recorded, or not flown")
     for reason, count in stream.skipped.most_common():
         print(f"  {count} left out: {reason}")
+
+
+def _nothing(recorded: Steps) -> str:
+    """Why there is nothing, or what was expected."""
+    return "; ".join(recorded.rejected.lines()) or "expected at least one"
 
 
 def _append(columns: Mapping[str, IO[bytes]], transition: Transition, kinds: Mapping[str, Any]) -> None:

@@ -99,7 +99,8 @@ class Flights(Book):
         self.unposed = self.holds = self.begun = 0
         self._scenario = scenario
         self._before: RecordedStep | None = None
-        self._stamp_ns: tuple[tuple[int, int], int] = (-1, -1), 0  # flight and mission, users' time
+        # Flight, mission, how often the clock had been set back, and the users' time.
+        self._stamp_ns: tuple[tuple[int, int, int], int] = (-1, -1, 0), 0
 
     def add(self, step: RecordedStep) -> None:
         """Look at a step."""
@@ -137,11 +138,11 @@ class Flights(Book):
         return found
 
     def _time(self, step: RecordedStep) -> list[Difference]:
-        """Users have the time of a pose, and a later one with each step."""
+        """Users have the time of a pose, and a later one with each step, unless the clock was set back."""
         if step.users is None:
             return []
         which, last_ns = self._stamp_ns
-        now_ns, mission = step.users.stamp_ns, (step.flight, step.mission)
+        now_ns, mission = step.users.stamp_ns, (step.flight, step.mission, step.clock)
         self._stamp_ns = mission, now_ns
         self.unposed += not step.poses or step.poses[0].stamp_ns != now_ns
         if which == mission and now_ns <= last_ns:

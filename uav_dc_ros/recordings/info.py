@@ -71,6 +71,12 @@ def _facts(found: Survey) -> list[tuple[str, str]]:
     n_parts = len(found.parts)
     parts = f"{n_parts} parts" if n_parts > 1 else "1 part"
     facts.append(("holds", f"{found.messages:,} messages, {_size(found.size_bytes)} in {parts}"))
+    if found.compressed:
+        facts.append(("compressed", f"each message by itself, of {len(found.compressed)} topics (zstd)"))
+    if bare := [part.name for part in found.parts if not part.has_index]:
+        facts.append(("index", f"none in {', '.join(bare)}: read from beginning to end"))
+    if found.set_back_s:
+        facts.append(("clock", f"set back by {found.set_back_s:,.3f} s while it was recorded"))
     scenarios = {(one.scenario, one.fingerprint) for one in found.missions if one.scenario is not None}
     if "scenario" in about:
         scenarios.add((about["scenario"], about.get("scenario_fingerprint")))
@@ -134,7 +140,7 @@ def _topics(found: Survey) -> Table:
         hz = "-" if topic.mean_hz is None else f"{topic.mean_hz:,.2f}"
         table.add_row(
             Text(topic.name),
-            Text(topic.type.rsplit("/", 1)[-1]),
+            Text(", ".join(type.rsplit("/", 1)[-1] for type in (topic.type, *topic.other_types))),
             f"{topic.messages:,}",
             *n_dropped,
             hz,

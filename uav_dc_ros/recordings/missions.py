@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.errors import BagError, UavDcError
+from uav_dc_ros.errors import BagDamagedError, BagError, UavDcError
 from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps, scenario
 
@@ -66,13 +66,12 @@ def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list
             before = step
             if step.status is not None and step.status.phase.is_over:
                 _enter_missing(found[-1], step, last=True)
+    except BagDamagedError:
+        raise
     except BagError as error:
-        if any(storage.damages for storage in reader.storages) or "damaged" in str(error):
-            raise
         problems.append(str(error))
         return found
-    for (topic, reason), n in sorted(steps.rejected.items()):
-        problems.append(f"{n:,} messages of {topic}{where} cannot be read: {reason}")
+    problems += (f"{line}{where}" for line in steps.rejected.lines())
     return found
 
 

@@ -12,7 +12,6 @@ follows goes on from what was recorded. A number may differ by `tolerance`, rela
 
 from typing import Any, TypeAlias
 
-import msgspec
 import numpy as np
 
 from uav_dc_ros import messages, payloads
@@ -25,7 +24,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings.compare import Book, Difference, difference
-from uav_dc_ros.recordings.step import RecordedStep, is_later_only
+from uav_dc_ros.recordings.step import RecordedStep, is_later_only, with_standing_of
 
 COLUMNS = ("sinr", "rate_bps", "served", "sum_rate_bps", "data_bits", "collected")  # causes before effects
 FIELDS = {"users": "users", "rates": "rates", "mission": "status", "move": "move"}
@@ -311,7 +310,7 @@ def _first_unlike(one: messages.Stepped, other: messages.Stepped) -> tuple[str, 
     A vehicle may tell a step in many phases: what it says of the step itself is what does not change.
     """
     if isinstance(one, messages.Mission) and isinstance(other, messages.Mission):
-        other = msgspec.structs.replace(other, phase=one.phase, reason=one.reason)
+        other = with_standing_of(other, one)
     for name in one.__struct_fields__:
         a, b = getattr(one, name), getattr(other, name)
         if a != b:

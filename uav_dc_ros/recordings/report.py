@@ -98,7 +98,8 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
                 held.append(total - 1)
         if not total:
             wanted = "" if options.mission is None else f" {', '.join(map(str, options.mission))}"
-            raise BagError(f"bag {options.bag}: no step of a mission{wanted} is in it")
+            why = "; ".join(recorded.rejected.lines())
+            raise BagError(f"bag {options.bag}: no step of a mission{wanted} is in it{why and f': {why}'}")
         health.count(recorded)
         health.read()
         data = {

@@ -224,9 +224,11 @@ def _flown_s(before: RecordedStep | None, step: RecordedStep) -> float | None:
     """How long the move to a step took, by the clock of who flew it, seconds; None where it is not known."""
     if before is None or before.step != step.step - 1:
         return None
-    begun_ns = [told.publish_ns for told in before.told if told.phase is Phase.MOVING]
-    there_ns = [told.publish_ns for told in step.told if told.phase not in BEFORE_START]
-    return (there_ns[0] - begun_ns[0]) / 1e9 if begun_ns and there_ns else None
+    begun = next((told for told in before.told if told.phase is Phase.MOVING), None)
+    there = next((told for told in step.told if told.phase not in BEFORE_START), None)
+    if begun is None or there is None or begun.clock != there.clock:
+        return None
+    return (there.publish_ns - begun.publish_ns) / 1e9
 
 
 def _phases(step: RecordedStep) -> Rows:

@@ -19,21 +19,29 @@ BEFORE_START = (*GROUND, Phase.TAKEOFF)
 
 
 class RecordedPose(NamedTuple):
-    """A pose: its stamp, x, y, altitude in metres `[3]`, and when it was received and published (ns)."""
+    """A pose: its stamp, x, y, altitude in metres `[3]`, and when it was received and published (ns).
+
+    `place` is that of its message among all that were received.
+    """
 
     stamp_ns: int
     position_m: Array
     log_ns: int
     publish_ns: int
+    place: int = 0
 
 
 class Told(NamedTuple):
-    """A phase that the vehicle told, why, and when that was received and published (ns)."""
+    """A phase that the vehicle told, why, and when that was received and published (ns).
+
+    `clock` is how often the recorder's clock had been set back by then: only times of one clock compare.
+    """
 
     phase: Phase
     reason: str
     log_ns: int
     publish_ns: int
+    clock: int = 0
 
     @property
     def holds(self) -> bool:
@@ -55,6 +63,8 @@ class RecordedStep:
         told: every phase and reason of the vehicle, in the order in which they were published: at most
             `TOLD_KEPT`.
         untold: how many more there were, in the middle.
+        place: of its latest message among all that were received.
+        clock: how often the recorder's clock had been set back when its users were received.
         log_ns: when each was received, nanoseconds since the epoch, by topic.
         publish_ns: when each was published, by topic.
         poses: the first poses of the step's own time, by stamp: at most `POSES_KEPT`.
@@ -72,6 +82,8 @@ class RecordedStep:
     move: messages.Move | None = None
     told: list[Told] = field(default_factory=list)
     untold: int = 0
+    place: int = 0
+    clock: int = 0
     log_ns: dict[str, int] = field(default_factory=dict)
     publish_ns: dict[str, int] = field(default_factory=dict)
     poses: list[RecordedPose] = field(default_factory=list)
@@ -102,7 +114,7 @@ class RecordedStep:
                 yield told
             before = told.phase
 
-    def tell(self, payload: Mission, log_ns: int, publish_ns: int) -> bool:
+    def tell(self, payload: Mission, log_ns: int, publish_ns: int, clock: int = 0) -> bool:
         """Note what the vehicle says of this step; tells whether it was something new.
 
         A vehicle that says why it is in a phase may be in it twice. One that gives no reasons repeats itself.
@@ -112,7 +124,8 @@ class RecordedStep:
             again = publish_ns == told.publish_ns or not reason or told is self.told[-1]
             if again and (phase, reason) == told[:2]:
                 return False
-        insort(self.told, Told(phase, reason, log_ns, publish_ns), key=lambda one: one.publish_ns)
+        told = Told(phase, reason, log_ns, publish_ns, clock)
+        insort(self.told, told, key=lambda one: (one.clock, one.publish_ns))
         if len(self.told) > TOLD_KEPT:  # how it began, and how it ended, tells most
             del self.told[TOLD_KEPT // 2]
             self.untold += 1
@@ -124,9 +137,16 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
+def with_standing_of(one: Mission, other: Mission) -> Mission:
+    """A word on a step with all that may change while the step lasts as in another one."""
+    return msgspec.structs.replace(
+        one, phase=other.phase, reason=other.reason, steps_not_reached=other.steps_not_reached
+    )
+
+
 def is_same_status(one: Mission, other: Mission) -> bool:
-    """Whether two words on a step differ in nothing but phase and reason."""
-    return msgspec.structs.replace(one, phase=other.phase, reason=other.reason) == other
+    """Whether two words on a step differ in nothing but what may change while it lasts."""
+    return with_standing_of(one, other) == other
 
 
 def is_later_only(one: messages.Stepped, other: messages.Stepped) -> bool:
@@ -137,9 +157,12 @@ def is_later_only(one: messages.Stepped, other: messages.Stepped) -> bool:
 
 
 def outweighs(now: Mission, before: Mission, newer: bool) -> bool:
-    """Whether a word on a step takes the place of another one: `newer` tells whether it was said later."""
+    """Whether a word on a step takes the place of another one: `newer` tells whether it was said later.
+
+    Of several ends the last one holds; it was ready as of the first time.
+    """
     weights = _weight(now), _weight(before)
-    return weights[0] > weights[1] or (newer and weights == (0, 0))
+    return weights[0] > weights[1] or (newer and weights in ((0, 0), (2, 2)))
 
 
 def _weight(status: Mission) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from uav_dc_ros import messages, payloads, scenarios, topics
 from uav_dc_ros.bags.definitions import TYPESTORE, is_defined_so
 from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
+from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import BagError, MessageError, ScenarioError
 from uav_dc_ros.messages import Mission
@@ -120,7 +121,7 @@ class Steps:
     """
 
     def __init__(self, reader: BagReader, namespace: str, step_ns: int = 2**63) -> None:
-        self.rejected: Counter[tuple[str, str]] = Counter()
+        self.rejected = Unreadable()
         self.orphans: Counter[str] = Counter()
         self.repeated: Counter[str] = Counter()
         self._reader = reader
@@ -136,41 +137,49 @@ class Steps:
         self._recent: dict[Key, frozenset[str]] = {}  # what the steps handed out last had
         self._poses: deque[RecordedPose] = deque(maxlen=POSES_MAX)
         self._flight = 0
-        self._newest: dict[str, tuple[Key, int, messages.Stepped]] = {}  # by topic: key, publish time
+        # By topic: key, how often the clock had been set back, and publish time.
+        self._newest: dict[str, tuple[Key, tuple[int, int], messages.Stepped]] = {}
+        self._starts: set[tuple[str, int]] = (
+            set()
+        )  # topic and publish time of each word on the flight's start
         self._done: Key = (-1, -1, -1)  # the step handed out last
         self._done_over = True
-        self._last_log_ns = 0  # when the latest message of those handed out was received
+        self._last_place = -1  # of the latest message of those handed out
 
     def __iter__(self) -> Iterator[RecordedStep]:
         """Start at the beginning of the bag; once."""
-        for message in self._reader.messages(list(self._topics)):
+        for place, (clock, message) in enumerate(self._reader.received(list(self._topics))):
             topic = self._topics[message.topic]
             try:
                 if topic == "pose":
-                    self._hear_pose(read_pose(message))
+                    self._hear_pose(read_pose(message)._replace(place=place))
                     continue
                 payload = messages.decode(payloads.text_in_cdr(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
-                self.rejected[topic, error.reason] += 1
+                self.rejected.enter(topic, error)
                 continue
             assert isinstance(payload, messages.Stepped), "the topics of steps"
-            if self._begins_again(topic, payload, message.publish_time_ns):
+            published = clock, message.publish_time_ns
+            if self._begins_again(topic, payload, published):
                 yield from self._hand_out(wait=False)
-                late = [pose for pose in self._poses if pose.log_ns > self._last_log_ns]
+                late = [pose for pose in self._poses if pose.place > self._last_place]
                 self._poses = deque(late, POSES_MAX)
                 self._flight += 1
+                self._starts.clear()
             key = (self._flight, payload.mission, payload.step)
+            if key[1:] == (0, 0):
+                self._starts.add((topic, message.publish_time_ns))
             if topic not in self._newest or key >= self._newest[topic][0]:
-                self._newest[topic] = key, message.publish_time_ns, payload
+                self._newest[topic] = key, published, payload
             if key <= self._done:
                 known = topic in self._recent.get(key, ())
                 (self.repeated if known else self.orphans)[topic] += 1
                 continue
-            self._enter(key, topic, payload, message)
+            self._enter(key, topic, payload, message, place, clock)
             yield from self._hand_out(wait=True)
         yield from self._hand_out(wait=False)
 
-    def _begins_again(self, topic: str, payload: messages.Stepped, publish_ns: int) -> bool:
+    def _begins_again(self, topic: str, payload: messages.Stepped, published: tuple[int, int]) -> bool:
         """Whether it is the first word of another flight.
 
         Who tells steps goes forward. A start that is told after later steps, and was published later, is that
@@ -179,8 +188,8 @@ class Steps:
         """
         if topic == "move" or topic not in self._newest or (payload.mission, payload.step) != (0, 0):
             return False
-        (flight, *last), published_ns, before = self._newest[topic]
-        if flight < self._flight or publish_ns <= published_ns:
+        (flight, *last), newest, before = self._newest[topic]
+        if flight < self._flight or published <= newest or (topic, published[1]) in self._starts:
             return False
         if last > [0, 0]:
             return True
@@ -189,7 +198,9 @@ class Steps:
             return isinstance(before, Mission) and before.phase.is_over
         return topic != "rates" and _start(payload) != _start(before)
 
-    def _enter(self, key: Key, topic: str, payload: messages.Stepped, message: BagMessage) -> None:
+    def _enter(
+        self, key: Key, topic: str, payload: messages.Stepped, message: BagMessage, place: int, clock: int
+    ) -> None:
         flight, mission, number = key
         step = self._open.setdefault(key, RecordedStep(flight=flight, mission=mission, step=number))
         self._bytes[key] = self._bytes.get(key, 0) + len(message.data)
@@ -197,10 +208,10 @@ class Steps:
         before = getattr(step, name)
         if before is not None:
             if isinstance(payload, Mission) and is_same_status(payload, before):
-                newer = message.publish_time_ns > step.publish_ns[topic]
-                if not step.tell(payload, message.log_time_ns, message.publish_time_ns):
+                if not step.tell(payload, message.log_time_ns, message.publish_time_ns, clock):
                     self.repeated[topic] += 1
                     return
+                newer = step.told[-1].publish_ns == message.publish_time_ns
                 if not outweighs(payload, before, newer):
                     return
             elif payload == before:
@@ -212,10 +223,12 @@ class Steps:
                     step.others[topic] = payload
                 return
         elif isinstance(payload, Mission):
-            step.tell(payload, message.log_time_ns, message.publish_time_ns)
+            step.tell(payload, message.log_time_ns, message.publish_time_ns, clock)
         setattr(step, name, payload)
         step.log_ns[topic], step.publish_ns[topic] = message.log_time_ns, message.publish_time_ns
+        step.place = max(step.place, place)
         if topic == "users":
+            step.clock = clock
             for pose in self._poses:
                 self._offer(step, pose)
 
@@ -237,6 +250,7 @@ class Steps:
         first = step.poses[0]
         step.position_m = first.position_m
         step.log_ns["pose"], step.publish_ns["pose"] = first.log_ns, first.publish_ns
+        step.place = max(step.place, first.place)
 
     def _hand_out(self, *, wait: bool) -> Iterator[RecordedStep]:
         while self._open:
@@ -253,14 +267,14 @@ class Steps:
             if len(self._recent) > RECENT_MAX:
                 del self._recent[next(iter(self._recent))]
             self._done, self._done_over = key, step.status is not None and step.status.phase.is_over
-            self._last_log_ns = max(self._last_log_ns, *step.log_ns.values())
+            self._last_place = max(self._last_place, step.place)
             if step.users is not None:
-                self._forget_poses(step.users.stamp_ns, max(step.log_ns.values()))
+                self._forget_poses(step.users.stamp_ns, step.place)
             yield step
 
-    def _forget_poses(self, begun_ns: int, received_ns: int) -> None:
+    def _forget_poses(self, begun_ns: int, place: int) -> None:
         """Drop poses up to a step's begin; one that was received after the step may be another flight's."""
-        kept = (p for p in self._poses if p.stamp_ns > begun_ns or p.log_ns > received_ns)
+        kept = (p for p in self._poses if p.stamp_ns > begun_ns or p.place > place)
         self._poses = deque(kept, POSES_MAX)
 
     def _is_whole(self, key: Key) -> bool:
@@ -281,6 +295,9 @@ def _start(payload: messages.Stepped) -> object:
 
 def _expect(reader: BagReader, topic: RecordedTopic, type: str) -> None:
     """Raises BagError for a topic that is not of our type, as ROS 2 Jazzy defines it."""
+    if topic.other_types:
+        types = ", ".join(sorted((topic.type, *topic.other_types)))
+        raise BagError(f"bag {reader.path}: topic {topic.name} is of the types {types}; expected {type} only")
     if (topic.type, topic.serialization) != (type, "cdr"):
         raise BagError(
             f"bag {reader.path}: topic {topic.name} is of type {topic.type or '(none)'} "
@@ -299,6 +316,7 @@ def read_pose(message: BagMessage) -> RecordedPose:
     Raises:
         MessageError: no pose, or none in the frame `map`.
     """
+    payloads.byte_order(message.data)
     try:
         pose: Any = TYPESTORE.deserialize_cdr(message.data, topics.POSE)
     except Exception as error:  # of struct, numpy, rosbags: whatever the bytes make of it

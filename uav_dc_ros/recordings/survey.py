@@ -14,7 +14,7 @@ from uav_dc_ros.bags.definitions import TYPESTORE
 from uav_dc_ros.bags.metadata import FILE_NAME, LOST, Part, is_told, read_metadata
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.storage import Storage
-from uav_dc_ros.errors import BagError
+from uav_dc_ros.errors import BagDamagedError, BagError
 from uav_dc_ros.recordings.missions import MissionSurvey, look_through, mission_problems
 from uav_dc_ros.recordings.steps import namespaces
 
@@ -27,6 +27,7 @@ class TopicSurvey:
     """A topic: its messages, and how they follow each other by their log times.
 
     Attributes:
+        other_types: further types of its messages; ROS 2 allows one only.
         messages: how many.
         dropped: messages that the recorder heard of, but does not have, as it says itself.
         first_s, last_s: log times after the bag's first message, seconds; None without messages.
@@ -37,6 +38,7 @@ class TopicSurvey:
 
     name: str
     type: str
+    other_types: list[str] = field(default_factory=list)
     messages: int = 0
     dropped: int = 0
     first_s: float | None = None
@@ -48,12 +50,23 @@ class TopicSurvey:
 
 @dataclass(kw_only=True)
 class PartSurvey:
-    """A file of a bag; `library` is what wrote it, in its own words."""
+    """A file of a bag.
+
+    Attributes:
+        messages: all that it holds.
+        repeated: those of them that repeat latched messages of earlier parts; the bag's are without these.
+        library: what wrote it, in its own words.
+        has_end: whether it is finished.
+        has_index: whether it tells where its messages are; MCAP leaves that to the writer.
+        lost_bytes: what of it cannot be used.
+    """
 
     name: str
     messages: int
+    repeated: int
     library: str
     has_end: bool
+    has_index: bool
     lost_bytes: int
 
 
@@ -65,6 +78,8 @@ class Survey:
         complete: whether nothing is known to be missing.
         problems: what is missing, a line each.
         recoverable: whether `recover` makes a whole bag of it.
+        set_back_s: by how much the clock was set back, at most, while it was recorded; 0: never.
+        compressed: topics of whose messages rosbag2 compressed each by itself.
         start_ns: log time of the first message, nanoseconds since the epoch.
         restarts: how often nodes were started again while it was recorded, by node.
         ros_distro: of metadata.yaml; None without one.
@@ -78,6 +93,8 @@ class Survey:
     size_bytes: int
     start_ns: int
     duration_s: float
+    set_back_s: float
+    compressed: list[str]
     messages: int
     parts: list[PartSurvey]
     topics: list[TopicSurvey]
@@ -96,14 +113,14 @@ def survey(path: Path) -> Survey:
     try:
         with BagReader(path) as reader:
             return _survey(reader, None)
-    except BagError as error:
+    except BagDamagedError as error:
         with BagReader(path, torn=True) as reader:
             if not (reader.topics or reader.about):
                 raise
             return _survey(reader, error)
 
 
-def _survey(reader: BagReader, error: BagError | None) -> Survey:
+def _survey(reader: BagReader, error: BagDamagedError | None) -> Survey:
     """Look through an open bag; `error` tells why it had to be opened as far as it goes."""
     problems: list[str] = []
     for storage in reader.storages:
@@ -111,32 +128,42 @@ def _survey(reader: BagReader, error: BagError | None) -> Survey:
     recoverable = bool(problems) or error is not None
     if error is not None and not problems:
         problems.append(str(error))
-    told = read_metadata(reader.path) if reader.path.is_dir() else None
-    problems += _metadata_problems(reader, told)
+    told: dict[str, Any] = {}
+    if reader.path.is_dir():
+        try:
+            told = read_metadata(reader.path) or {}
+            problems += _metadata_problems(reader, bool(told))
+        except BagError as unreadable:
+            problems.append(str(unreadable))
     problems += _lost(reader)
     dropped = reader.dropped or {}
     problems += [f"{n:,} messages of {topic} were dropped" for topic, n in sorted(dropped.items()) if n]
     found, restarts = _topics(reader, dropped)
+    problems += _miscounted(reader, found)
     missions: list[MissionSurvey] = []
     for namespace in namespaces(reader):
         missions += look_through(reader, namespace, problems)
     problems += mission_problems(reader, missions)
-    distro = told.get("ros_distro") if told is not None else None
+    distro = told.get("ros_distro")
     return Survey(
         path=str(reader.path),
         complete=not problems,
         problems=problems,
         recoverable=recoverable,
-        size_bytes=sum(_size(part) for part in reader.parts),
+        size_bytes=sum(part.stat().st_size for part in reader.parts),
         start_ns=reader.first_ns,
         duration_s=(reader.last_ns - reader.first_ns) / 1e9,
-        messages=reader.message_count,
+        set_back_s=reader.set_back_ns / 1e9,
+        compressed=sorted({topic for storage in reader.storages for topic in storage.compressed}),
+        messages=sum(topic.messages for topic in found),
         parts=[
             PartSurvey(
                 name=storage.path.name,
-                messages=sum(topic.count for topic in storage.topics),
+                messages=sum(topic.count for topic in storage.topics) + sum(storage.repeated.values()),
+                repeated=sum(storage.repeated.values()),
                 library=storage.library,
                 has_end=storage.has_end,
+                has_index=storage.has_index,
                 lost_bytes=sum(damage.n_bytes for damage in storage.damages),
             )
             for storage in reader.storages
@@ -160,11 +187,9 @@ def _damages(storage: Storage) -> Iterator[str]:
         yield f"{storage.path.name}: {n_bytes:,} bytes lost at {n_places:,} places more"
 
 
-def _metadata_problems(reader: BagReader, told: dict[str, Any] | None) -> Iterator[str]:
-    """A folder's metadata.yaml must tell its parts; one MCAP file needs none, and SQLite is read by it."""
-    if not reader.path.is_dir() or reader.parts == (reader.path,):
-        return
-    if told is None:
+def _metadata_problems(reader: BagReader, told: bool) -> Iterator[str]:
+    """A folder's metadata.yaml must tell its parts; `told`: does it say anything of a bag."""
+    if not told:
         there = (reader.path / FILE_NAME).exists()
         yield f"{FILE_NAME} {'says nothing of a bag' if there else 'is missing'}"
         return
@@ -173,10 +198,18 @@ def _metadata_problems(reader: BagReader, told: dict[str, Any] | None) -> Iterat
         part = Part(storage.path.name)
         for topic in storage.topics:
             part.topics[topic.name] = {"offered_qos_profiles": []}
-            part.counts[topic.name] = part.counts.get(topic.name, 0) + topic.count
+            part.counts[topic.name] = topic.count + storage.repeated.get(topic.name, 0)
         parts.append(part)
     if not is_told(reader.path, parts):
         yield f"{FILE_NAME} tells other files, or other numbers of messages, than there are"
+
+
+def _miscounted(reader: BagReader, found: list[TopicSurvey]) -> Iterator[str]:
+    """An index must tell as many messages as there are."""
+    for topic in found:
+        told = reader.topics[topic.name].count if topic.name in reader.topics else 0
+        if told != topic.messages:
+            yield f"{topic.name} has {topic.messages:,} messages; its files tell of {told:,}"
 
 
 def _lost(reader: BagReader) -> Iterator[str]:
@@ -220,6 +253,7 @@ def _topics(reader: BagReader, dropped: Mapping[str, int]) -> tuple[list[TopicSu
         topic = TopicSurvey(
             name=name,
             type=reader.topics[name].type if name in reader.topics else "",
+            other_types=list(reader.topics[name].other_types) if name in reader.topics else [],
             messages=pace.n,
             dropped=dropped.get(name, 0),
         )
@@ -250,11 +284,6 @@ def _restarts(message: BagMessage) -> Iterator[tuple[str, int]]:
                 yield prefix + status.name, int(pair.value)
             elif pair.key.startswith("restarts of ") and pair.value.isdecimal():
                 yield prefix + pair.key.removeprefix("restarts of "), int(pair.value)
-
-
-def _size(part: Path) -> int:
-    files = part.glob("*") if part.is_dir() else [part]
-    return sum(file.stat().st_size for file in files)
 
 
 def start_text(start_ns: int) -> str:

@@ -173,9 +173,8 @@ def verify(
                 f"  {step.name.partition(',')[0]}: {n_other} of {other.compared - n_before} moves"
             )
     if not channel.compared and not world.compared:
-        raise BagError(
-            f"bag {reader.path}: none of its {n_steps} steps can be recomputed: {_reasons(channel)}"
-        )
+        why = "; ".join(recorded.rejected.lines()) or _reasons(channel)
+        raise BagError(f"bag {reader.path}: none of its {n_steps} steps can be recomputed: {why}")
     told = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
     missions = f"{n_missions} mission{'s' * (n_missions != 1)}"
     flown = f"{missions}, {n_steps} steps in scenario {scenario.name!r}{told}"
@@ -192,8 +191,7 @@ def verify(
         lines += flights.lines(flew)
     lines += _lines("decisions", decisions) if decisions else [f"decisions: not verified: {without}"]
     unread = recorded.rejected + recorded.orphans
-    for (topic, reason), n in sorted(recorded.rejected.items()):
-        lines.append(f"{n} messages on {topic} cannot be read: {reason}")
+    lines += recorded.rejected.lines()
     for topic, n in sorted(recorded.orphans.items()):
         lines.append(f"{n} messages on {topic} came too late to be brought together with their step")
     if other:

@@ -133,7 +133,8 @@ def _groups(
                 groups.append(Group(told, scenario, policy, label))
             groups[-1].add(one)
     if not groups:
-        raise BagError(f"bag {bag}: no step of a mission {'that is wanted ' if missions else ''}is in it")
+        wanted, why = "that is wanted " if missions else "", "; ".join(recorded.rejected.lines())
+        raise BagError(f"bag {bag}: no step of a mission {wanted}is in it{why and f': {why}'}")
     return groups
 
 

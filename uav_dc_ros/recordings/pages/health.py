@@ -129,7 +129,8 @@ class Health:
     def count(self, steps: Steps) -> None:
         """Note what could not be read, or came too late to belong to its step."""
         for (topic, reason), count in steps.rejected.items():
-            self._fault(self._reader.first_ns, topic, f"unreadable messages ({reason}): {count}")
+            why = steps.rejected.why(topic, reason)
+            self._fault(self._reader.first_ns, topic, f"unreadable messages ({reason}): {count}: {why}")
         for topic, count in steps.orphans.items():
             self._fault(self._reader.first_ns, topic, f"messages of steps that were over already: {count}")
 
