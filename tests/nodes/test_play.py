@@ -23,7 +23,7 @@ from tests.conftest import Ros, each_once, finish, read_bag
 from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.write import BagWriter
-from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.errors import ParameterError, UavDcError
 from uav_dc_ros.nodes import play as verb
 from uav_dc_ros.nodes import recorded_qos
 
@@ -261,7 +261,10 @@ def test_a_loop_goes_on_until_it_is_stopped(ros: Ros, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_played_is_told_and_left_out(ros: Ros, tmp_path: Path) -> None:
-    """A type that is not installed, one that is another by now, and a subscriber that cannot hear."""
+    """Types that are not installed, or others by now, two on one topic, and a subscriber that cannot hear.
+
+    And 57 years without a message, of a clock that was set forward: beyond what /clock can tell.
+    """
     bag = tmp_path / "bag.mcap"
     with bag.open("wb") as file:
         writer = McapWriter(file)
@@ -271,16 +274,25 @@ def test_what_cannot_be_played_is_told_and_left_out(ros: Ros, tmp_path: Path) ->
             ("/foreign", "their_msgs/msg/Thing", b"string data"),
             ("/changed", "std_msgs/msg/Float64", b"float32 data"),
             ("/odd", "os.path/msg/../x", b""),
+            ("/two", STRING, b"string data"),
+            ("/two", "std_msgs/msg/Float64", b"float64 data"),
         ):
             schema = writer.register_schema(name, "ros2msg", definition)
             channel = writer.register_channel(topic, "cdr", schema, {})
             for i in range(40):
                 writer.add_message(channel, START_NS + i * 10 * MS, text(f"{i}"), START_NS + i * 10 * MS)
+            if topic == "/fine":
+                later_ns = START_NS + 57 * 365 * 86400 * 1000 * MS
+                writer.add_message(channel, later_ns, text("40"), later_ns)
         writer.finish()
     listens = listener(ros, "/fine")
     deaf = listener(ros, "/fine", latched=True)
-    printed = play(ros, bag)
-    assert [int(told) for _, told, *_ in heard_by(listens)] == list(range(40))
+    printed = play(ros, bag, "--clock")
+    assert [int(told) for _, told, *_ in heard_by(listens)] == list(range(41))
+    assert (
+        "no message for 1,797,552,000 s after 0.4 s: skipped, as it is longer than --max-gap 600" in printed
+    )
+    assert "/two is not played: it has several types: std_msgs/msg/String, std_msgs/msg/Float64" in printed
     assert heard_by(deaf) == []
     assert printed.count("/foreign") == printed.count("/changed") == printed.count("/odd") == 1
     assert "their_msgs/msg/Thing is not installed" in printed
@@ -335,6 +347,24 @@ def test_what_the_bag_has_not_is_refused(small_bag: Path, arguments: list[str], 
 
 
 @pytest.mark.parametrize(
+    ("topics", "arguments", "told"),
+    [
+        ({}, [], "holds no message; expected at least one to play"),
+        ({"/a": VOLATILE}, [], "holds no message"),
+        ({"/clock": VOLATILE}, ["--clock"], "--clock leaves no topic"),
+    ],
+)
+def test_a_bag_that_holds_nothing_is_told(
+    tmp_path: Path, topics: dict[str, Qos], arguments: list[str], told: str
+) -> None:
+    bag = made(tmp_path / "bag", topics, [("/clock", 0.0, "now")] if "/clock" in topics else [])
+    parser = cli.Parser(prog="play")
+    verb.add_options(parser)
+    with BagReader(bag) as reader, pytest.raises(UavDcError, match=told):
+        verb._plan(reader, parser.parse_args([str(bag), *arguments]))
+
+
+@pytest.mark.parametrize(
     ("arguments", "told"),
     [
         (["--rate", "0"], "'0'; expected a number from 0.001 to 1e+06, or max"),
@@ -342,6 +372,7 @@ def test_what_the_bag_has_not_is_refused(small_bag: Path, arguments: list[str], 
         (["--rate", "inf"], "'inf'; expected"),
         (["--duration", "0"], "expected seconds, more than 0"),
         (["--start", "-1"], "expected seconds, of at least 0"),
+        (["--max-gap", "nan"], "expected seconds, more than 0"),
         (["--topics", "a"], "beginning with '/'"),
         (["--topics", "/a,/a"], "each once"),
         (["--remap", "/a=/b"], "expected FROM:=TO"),

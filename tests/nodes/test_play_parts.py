@@ -1,17 +1,20 @@
 """The parts of play: the time of the bag, and the QoS of recorded topics."""
 
 import math
+import sys
+from pathlib import Path
 
 import pytest
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2.metadata import dump_qos_v8, dump_qos_v9
+from std_msgs.msg import String
 
 from uav_dc_ros.bags.metadata import to_yaml
 from uav_dc_ros.bags.read import RecordedTopic
-from uav_dc_ros.errors import BagError
-from uav_dc_ros.nodes import recorded_qos
+from uav_dc_ros.errors import BagError, NodeError
+from uav_dc_ros.nodes import outlet, recorded_qos
 from uav_dc_ros.nodes.play_clock import PlayClock
 
 S = 10**9
@@ -140,3 +143,18 @@ def test_qos_that_is_none_is_refused(text: str) -> None:
     topic = RecordedTopic(name="/a", type="", offered_qos=text)
     with pytest.raises(BagError, match=r"QoS of topic /a is .*expected rosbag2's YAML"):
         recorded_qos.profile(topic, message_bytes=1, per_s=1.0)
+
+
+def test_nothing_is_imported_that_a_bag_names_but_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python would run it."""
+    (tmp_path / "evil").mkdir()
+    for name in ("__init__", "msg"):
+        (tmp_path / "evil" / f"{name}.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    for type in ("evil/msg/Thing", "antigravity/msg/Thing", "os/msg/Thing"):
+        with pytest.raises(NodeError, match="is not installed; expected a ROS package"):
+            outlet.message_class(RecordedTopic(name="/a", type=type))
+    assert not {"evil", "evil.msg", "antigravity"} & set(sys.modules)
+    assert outlet.message_class(RecordedTopic(name="/a", type="std_msgs/msg/String")) is String

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 import shutil
 
 import msgspec
@@ -24,6 +25,7 @@ from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings.missions import look_through
+from uav_dc_ros.recordings.pages import missions as pages
 from uav_dc_ros.recordings.pages.vehicle import WAY_MAX, Way
 from uav_dc_ros.recordings.step import TOLD_KEPT, RecordedPose
 from uav_dc_ros.recordings.steps import Steps
@@ -62,6 +64,58 @@ def steps_of(bag):
     with BagReader(bag) as reader:
         stream = Steps(reader, "", STEP_NS)
         return list(stream), stream
+
+
+@pytest.fixture(scope="module")
+def not_reached(tmp_path_factory):
+    """A bag of a flight of which two steps were not reached; one of them while it lasted."""
+    told = flown.Flight(TINY, seed=5).fly()
+    changed = []
+    for message in told:
+        if message.topic == "/mission":
+            payload = messages.decode(payloads.text_in_cdr(message.data), messages.Mission)
+            late = payload.step == 2 and payload.phase is not Phase.READY
+            n = (payload.step > 1) + (payload.step > 2 or late)
+            payload = msgspec.structs.replace(payload, steps_not_reached=n)
+            message = message._replace(data=said("mission", payload, 0).data)
+        changed.append(message)
+    return write(tmp_path_factory.mktemp("late") / "bag", changed, flown.flown_about(TINY, 5))
+
+
+def test_steps_that_were_not_reached_are_told(not_reached, capsys, tmp_path):
+    assert not any(step.others for step in steps_of(not_reached)[0])
+    status, printed = run(capsys, "verify", not_reached)
+    assert status == 0
+    assert "2 flown steps were not reached within the tolerance, as the vehicle says" in printed
+    _, printed = run(capsys, "info", not_reached)
+    assert re.search(r"steps +not reached +users collected", printed)
+    _, printed = run(capsys, "info", not_reached, "--json")
+    assert json.loads(printed)["missions"][0]["steps_not_reached"] == 2
+    run(capsys, "export", not_reached, "--out", tmp_path / "tables", "--format", "csv")
+    (row,) = csv.DictReader((tmp_path / "tables" / "missions.csv").open())
+    assert row["steps_not_reached"] == "2"
+    with BagReader(not_reached) as reader:
+        (one,) = pages.flown(iter(Steps(reader, "", STEP_NS)), TINY, True)
+    assert one.summary()["steps_not_reached"] == 2
+
+
+def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
+    """One that was told before it, for the same end, is not."""
+    told = flown.Flight(TINY, seed=5).fly()
+    last = max(i for i, message in enumerate(told) if message.topic == "/mission")
+    payload = messages.decode(payloads.text_in_cdr(told[last].data), messages.Mission)
+    for i, reason in enumerate(("step 4: there", "the motors were stopped: by hand")):
+        ended = msgspec.structs.replace(payload, phase=Phase.ABORTED, reason=reason)
+        told.insert(last + i, said("mission", ended, told[last + i - 1].publish_time_ns + 1000))
+    del told[last + 2 :]
+    bag = write(tmp_path / "bag", told, flown.flown_about(TINY, 5))
+    assert "the motors were stopped: by hand" in run(capsys, "info", bag)[1]
+    run(capsys, "export", bag, "--out", tmp_path / "tables", "--format", "csv")
+    (row,) = csv.DictReader((tmp_path / "tables" / "missions.csv").open())
+    assert (row["outcome"], row["reason"]) == ("aborted", "the motors were stopped: by hand")
+    with BagReader(bag) as reader:
+        (one,) = pages.flown(iter(Steps(reader, "", STEP_NS)), TINY, True)
+    assert one.summary()["reason"] == "the motors were stopped: by hand"
 
 
 # Steps.

@@ -3,14 +3,18 @@
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
+from rosbags.rosbag2.metadata import parse_qos
 
-from tests.bags.made import STRING, TYPES, content, text
+from tests.bags.made import QOS, STRING, TYPES, content, information, text
+from tests.recordings import made
 from uav_dc_ros import bag as command
 from uav_dc_ros import messages, payloads, scenarios, topics
+from uav_dc_ros.bags.recover import recover
 from uav_dc_ros.bags.write import BagWriter
 
 N_USERS = 4
@@ -243,3 +247,68 @@ def test_what_is_no_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert stopped.value.code == 2
         assert expected in error
         assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda data: b"\0\7" + data[2:], "encapsulation: XCDR2 (0x0007); expected CDR (0x0000 or 0x0001)"),
+        (lambda data: data[:-9], "malformed: "),
+        (
+            lambda data: b"\x28\xb5\x2f\xfd" + data,
+            "encapsulation: a zstd frame that is damaged; expected CDR",
+        ),
+    ],
+)
+def test_payloads_that_cannot_be_decoded_are_told_by_every_verb(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[bytes], bytes], why: str
+) -> None:
+    bag = made.copy(
+        flown(tmp_path / "bag"),
+        tmp_path / "spoilt",
+        lambda message: message._replace(data=spoil(message.data)),
+    )
+    told = json.loads(info(bag, capsys, "--json"))
+    problems = [problem for problem in told["problems"] if "cannot be read" in problem]
+    assert [problem.split(" cannot")[0] for problem in problems] == [
+        f"{n} messages of {topic}"
+        for topic, n in (("mission", 8), ("move", 6), ("pose", 8), ("rates", 8), ("users", 8))
+    ]
+    assert all(why in problem for problem in problems)
+    for verb, *options in (
+        ("verify",),
+        ("report", "--out", str(tmp_path / "page.html")),
+        ("report", "--compare", "--out", str(tmp_path / "page.html")),
+        ("export", "--format", "csv", "--out", str(tmp_path / "tables")),
+        ("export", "--transitions", "--out", str(tmp_path / "transitions.npz")),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            command.main([verb, str(bag), *options, "--scenario", "five_clusters"])
+        error = capsys.readouterr().err
+        assert stopped.value.code == 2
+        assert f"8 messages of users cannot be read: {why}" in error
+        assert error.count("\n") == 1
+
+
+def test_a_bag_of_several_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The latched messages that begin each part are of the part, and not of the bag; recovered, too."""
+    offers = parse_qos(QOS.replace("volatile", "transient_local"))
+    with BagWriter(tmp_path / "bag", {}, split_s=1.0) as bag:
+        bag.add_topic("/map", STRING, offers)
+        bag.add_topic("/a", STRING)
+        for i in range(5):
+            log_ns = 10**18 + i * 10**9
+            if i != 3:
+                bag.write("/map", text(f"{i}"), log_time_ns=log_ns, publish_time_ns=log_ns)
+            bag.write("/a", text(f"{i}"), log_time_ns=log_ns + 1, publish_time_ns=log_ns + 1)
+    recover(tmp_path / "bag", tmp_path / "again")
+    for folder in (tmp_path / "bag", tmp_path / "again"):
+        told = json.loads(info(folder, capsys, "--json"))
+        assert told["problems"] == []
+        assert told["messages"] == 9
+        parts = [(part["messages"], part["repeated"]) for part in told["parts"]]
+        assert len(parts) == 5
+        assert parts == [
+            (counts["message_count"], int(part > 0))
+            for part, counts in enumerate(information(folder)["files"])
+        ]

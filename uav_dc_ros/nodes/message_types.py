@@ -8,7 +8,7 @@ from typing import Any
 
 from uav_dc_ros.bags import definitions
 
-_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
+NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 _BASIC = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}  # IDL's: .msg's
 _SEPARATOR = "=" * 80
 
@@ -16,9 +16,9 @@ _SEPARATOR = "=" * 80
 def find(type: str) -> Any:
     """The Python class of a message type, such as `std_msgs/msg/String`; None if it is not installed.
 
-    Names come from the network: nothing is imported but packages that hold messages.
+    Names come from the network, or out of bags: nothing is imported but packages that hold messages.
     """
-    matched = _NAME.fullmatch(type)
+    matched = NAME.fullmatch(type)
     if matched is None:
         return None
     package, name = matched.groups()

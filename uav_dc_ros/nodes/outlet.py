@@ -1,9 +1,5 @@
 """A recorded topic that is published again: its publisher, what it still has to deliver, what it repeats."""
 
-import importlib
-import re
-from typing import Any
-
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
@@ -11,12 +7,11 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uav_dc_ros.bags.definitions import ENCODING
+from uav_dc_ros.bags.frames import CDR
 from uav_dc_ros.bags.read import BagMessage, RecordedTopic
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes import recorded_qos
+from uav_dc_ros.nodes import message_types, recorded_qos
 
-TYPE = re.compile(r"([A-Za-z]\w*)/msg/([A-Za-z]\w*)")
-CDR = "cdr"
 AT_ONCE = Duration()
 
 
@@ -24,19 +19,18 @@ def message_class(topic: RecordedTopic) -> type:
     """The class of a topic's messages, from the installed ROS packages.
 
     Raises:
-        NodeError: there is none, or the messages are not serialised as ROS 2 does.
+        NodeError: there is none, the messages have several types, or are not serialised as ROS 2 does.
     """
     if topic.serialization != CDR:
         raise NodeError(f"its messages are in {topic.serialization!r}; expected {CDR!r}")
-    named = TYPE.fullmatch(topic.type)
-    if named is None:
+    if topic.other_types:
+        raise NodeError(f"it has several types: {', '.join((topic.type, *topic.other_types))}; expected one")
+    if message_types.NAME.fullmatch(topic.type) is None:
         raise NodeError(f"type {topic.type!r} is no message; expected PACKAGE/msg/NAME")
-    package, name = named.groups()
-    try:
-        found: Any = getattr(importlib.import_module(f"{package}.msg"), name)
-        found.get_fields_and_field_types()
-    except (ImportError, AttributeError):
-        raise NodeError(f"type {topic.type} is not installed; expected a ROS package {package}") from None
+    found: type | None = message_types.find(topic.type)
+    if found is None:
+        package = topic.type.partition("/")[0]
+        raise NodeError(f"type {topic.type} is not installed; expected a ROS package {package}")
     return found
 
 

@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.nodes import environment
 from uav_dc_ros.nodes.play_clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN
 
 if TYPE_CHECKING:
     from uav_dc_ros.nodes.player import Plan
 
+MAX_GAP_S = 600.0
 CLOCK_HZ = 40.0  # rosbag2's default
 CLOCK_HZ_MAX = 1000.0
 SWITCH_S = 0.0005  # the thread that reads ahead must not hold up a message for longer
@@ -32,7 +33,7 @@ LEAVE_S = 1.0  # for the middleware to leave
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The command line."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help="folder of the bag, or one MCAP file")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="folder of the bag, or one of its files")
     parser.add_argument(
         "--rate",
         type=_rate,
@@ -51,6 +52,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--duration", type=_seconds(), metavar="S", help="seconds of the bag to play (default: all)"
+    )
+    parser.add_argument(
+        "--max-gap",
+        type=_seconds(most=math.inf),
+        default=MAX_GAP_S,
+        metavar="S|inf",
+        help="longest time without a message that is waited out, seconds of the bag; a longer one, as of a "
+        "clock that was set forward, is skipped, with a note (default: %(default)g)",
     )
     parser.add_argument("--topics", type=_topics, metavar="A,B,...", help="full names of topics to play")
     parser.add_argument(
@@ -110,9 +119,12 @@ def _plan(reader: BagReader, options: argparse.Namespace) -> "Plan":
 
     Raises:
         ParameterError: the bag does not hold it.
+        BagError: the bag holds nothing.
     """
     from uav_dc_ros.nodes.player import Plan
 
+    if not reader.message_count:
+        raise BagError(f"bag {options.bag} holds no message; expected at least one to play")
     length_s = (reader.last_ns - reader.first_ns) * 1e-9
     if options.start > length_s:
         raise ParameterError(f"--start {options.start:g}: bag {options.bag} lasts {length_s:.3f} s")
@@ -123,6 +135,7 @@ def _plan(reader: BagReader, options: argparse.Namespace) -> "Plan":
         names=_names(reader, options),
         start_s=options.start,
         duration_s=options.duration,
+        max_gap_s=options.max_gap,
         rate=options.rate,
         loop=options.loop,
         paused=options.paused,
@@ -169,7 +182,8 @@ def _names(reader: BagReader, options: argparse.Namespace) -> dict[str, str]:
             why = str(error).splitlines()[0].removesuffix(":")
             raise ParameterError(f"topic {topic} cannot be published as {name!r}: {why}") from None
     if not names:
-        raise ParameterError(f"--exclude leaves no topic of bag {options.bag}; expected at least one to play")
+        option = "--exclude" if options.exclude else "--clock"  # nothing else leaves one out
+        raise ParameterError(f"{option} leaves no topic of bag {options.bag}; expected at least one to play")
     return names
 
 
@@ -241,10 +255,10 @@ def _clock_hz(text: str) -> float:
     return _number(text, f"a number from 0.001 to {CLOCK_HZ_MAX:g}", 1e-3, CLOCK_HZ_MAX)
 
 
-def _seconds(least: float = 1e-9) -> Any:
+def _seconds(least: float = 1e-9, most: float = 2.0**31) -> Any:
     def seconds(text: str) -> float:
         expected = "seconds, of at least 0" if least == 0.0 else "seconds, more than 0"
-        return _number(text, expected, least, 2.0**31)
+        return _number(text, expected, least, most)
 
     return seconds
 

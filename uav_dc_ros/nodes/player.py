@@ -35,6 +35,7 @@ ROOM_S = 0.0002  # how soon it is seen that subscribers have caught up
 HELD_S = 0.1  # that the schedule makes up for when subscribers had to be waited for
 STUCK_S = 5.0  # until it is told that one does not
 LAST_WORDS_S = 0.5  # for what was published to arrive, when a key ends the play
+CLOCK_MAX_NS = 2**31 * 10**9 - 1
 FASTER = 1.25  # three times is about twice as fast
 
 
@@ -47,6 +48,7 @@ class Plan:
         names: full name of the topic to publish, by recorded topic.
         start_s: where to begin, seconds from the bag's first message.
         duration_s: how much of the bag to play, seconds; None: to its end.
+        max_gap_s: longest time without a message that is waited out, seconds of the bag.
         rate: seconds of the bag in a second; infinite: as fast as subscribers keep up.
         loop: begin again at the end.
         paused: begin with a pause.
@@ -58,6 +60,7 @@ class Plan:
     names: dict[str, str]
     start_s: float = 0.0
     duration_s: float | None = None
+    max_gap_s: float = math.inf
     rate: float = 1.0
     loop: bool = False
     paused: bool = False
@@ -154,15 +157,30 @@ class Player:
             self.plan.path, list(self.outlets), start_ns=self._start_ns, end_ns=self._end_ns
         ) as messages:
             self.clock.jump(self._start_ns)  # reading the beginning took no time of the bag
+            before_ns = self._start_ns
             for message in messages:
                 if self.outlets[message.topic].repeats(message):
                     continue
                 self.clock.limit_ns = message.log_time_ns
+                self._skip_gap(before_ns, message.log_time_ns)
+                before_ns = message.log_time_ns
                 if not self._wait_until_due(message.log_time_ns):
                     return
                 self._publish(message)
                 self.clock.played(message.log_time_ns)
         self._show(math.inf)
+
+    def _skip_gap(self, before_ns: int, next_ns: int) -> None:
+        """Go on at once after a long time without a message; nobody waits for that at `--rate max`."""
+        gap_s = (next_ns - before_ns) * 1e-9
+        if gap_s <= self.plan.max_gap_s or math.isinf(self.clock.rate):
+            return
+        at_s = (before_ns - self.reader.first_ns) * 1e-9
+        self.clock.jump(next_ns)
+        self.display.note(
+            f"no message for {gap_s:,.0f} s after {at_s:,.1f} s: skipped, as it is longer than --max-gap "
+            f"{self.plan.max_gap_s:g}; the clock may have been set forward while this was recorded"
+        )
 
     def _latched_before(self) -> Iterator[BagMessage]:
         """What somebody who joins at the start would have got of latched topics, in its order."""
@@ -229,7 +247,7 @@ class Player:
         period_s = TICK_S
         if self._clock_publisher is not None and self.plan.clock_hz is not None:
             if now_s >= self._clock_at_s:
-                self._clock_publisher.publish(Clock(clock=convert.stamp(self.clock.position_ns())))
+                self._publish_clock()
                 self._clock_at_s = max(self._clock_at_s + 1.0 / self.plan.clock_hz, now_s)
             period_s = min(period_s, max(0.0, self._clock_at_s - now_s))
         self._heed(self._keys.wait(0.0))
@@ -239,6 +257,11 @@ class Player:
             for told in self._audience.deaf():
                 self.display.note(told)
         self._tick_at_s = now_s + period_s
+
+    def _publish_clock(self) -> None:
+        """Publish the bag's time; ROS 2 counts seconds up to 2038 only, where it stands still then."""
+        stamp = convert.stamp(min(self.clock.position_ns(), CLOCK_MAX_NS))
+        self._clock_publisher.publish(Clock(clock=stamp))
 
     def _show(self, idle_s: float) -> None:
         at_s = (self.clock.position_ns() - self.reader.first_ns) * 1e-9

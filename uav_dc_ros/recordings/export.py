@@ -24,6 +24,7 @@ from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.recordings import rows, steps
 from uav_dc_ros.recordings.rows import Mission
+from uav_dc_ros.recordings.step import printable
 from uav_dc_ros.recordings.steps import Steps
 from uav_dc_ros.recordings.tables import Format, Table
 from uav_dc_ros.recordings.transitions import Transition, Transitions
@@ -37,7 +38,8 @@ Tables go into a new folder, a file each, one observation a row:
   users     a row per user and step: position, SINR (linear), rate, data, served, collected
   missions  a row per mission: seed, scenario, policy, outcome, totals
   phases    of a real vehicle only: a row per phase it told, with the reason and the time
-Of a real vehicle, steps also have the reason of their phase, and how long the move to them took.
+Of a real vehicle, steps also have the reason of their phase, and how long the move to them took; missions
+have what flew, the reason of their end, and how many steps were flown without reaching their cell.
 Units are in the names of columns. Rewards are computed anew from recorded cells and data.
 
 Transitions go into a new .npz file, which numpy.load reads: observation, next_observation (float32 [T, D]),
@@ -53,7 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
-    add("bag", type=Path, metavar="BAG", help="folder of a bag, or an MCAP file")
+    add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
     add(
         "--out",
         type=Path,
@@ -97,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
         recorded = Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
         if options.transitions:
             write_transitions(
-                options.out, recorded, scenario, options.observation or "mission", options.bag.name
+                options.out, recorded, scenario, options.observation or "mission", printable(options.bag.name)
             )
         else:
             format: Format = options.format or "parquet"

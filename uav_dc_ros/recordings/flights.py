@@ -91,12 +91,14 @@ class Flights(Book):
         unposed: steps whose users have a time of which no pose is recorded.
         holds: how often something kept one from going on.
         begun: steps whose move was begun, over all missions.
+        not_reached: flown steps whose cell was not reached, as the vehicle says; by flight and mission.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__()
         self.apart = Apart()
         self.unposed = self.holds = self.begun = 0
+        self.not_reached: dict[tuple[int, int], int] = {}
         self._scenario = scenario
         self._before: RecordedStep | None = None
         # Flight, mission, how often the clock had been set back, and the users' time.
@@ -110,6 +112,8 @@ class Flights(Book):
         )
         self.apart.add(step, self._scenario)
         self.holds += sum(told.holds for told in step.told)
+        if step.status is not None:
+            self.not_reached[step.flight, step.mission] = step.status.steps_not_reached
         found = self._time(step)
         if not step.untold:
             found += self._order(step, before.told[-1] if follows and before and before.told else None)
@@ -158,6 +162,8 @@ class Flights(Book):
         else:
             lines = [f"{told}, each follows as it may; {self.begun} moves were begun, none of them twice"]
         lines += self.apart.lines()
+        if n := sum(self.not_reached.values()):
+            lines.append(f"  {n} flown steps were not reached within the tolerance, as the vehicle says")
         if self.holds:
             times = "once" if self.holds == 1 else f"{self.holds} times"
             lines.append(f"  it held {times}: bag report tells why")

@@ -23,7 +23,7 @@ MISSIONS_MAX = 30  # that are told one by one
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What the verb takes."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag, or one MCAP file")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
     parser.add_argument(
         "--json", nargs="?", const="-", metavar="FILE", help="JSON instead, into a file or to the output"
     )
@@ -160,7 +160,9 @@ def _missions(missions: list[MissionSurvey]) -> Table:
     several = len({mission.namespace for mission in missions}) > 1
     flights = any(mission.flight for mission in missions)
     columns = [*(["namespace"] if several else []), *(["flight"] if flights else []), "mission", "outcome"]
-    for column in [*columns, "steps", "users collected", "seed", "lacks"]:
+    not_reached = any(mission.steps_not_reached for mission in missions)
+    columns += ["steps", *(["not reached"] if not_reached else []), "users collected", "seed", "lacks"]
+    for column in columns:
         table.add_column(column, justify="left" if column in ("namespace", "outcome", "lacks") else "right")
     for mission in missions[:MISSIONS_MAX]:
         collected = "-" if mission.users is None else f"{mission.collected:,} of {mission.users:,}"
@@ -168,7 +170,8 @@ def _missions(missions: list[MissionSurvey]) -> Table:
         table.add_row(
             *([Text(mission.namespace or "/")] if several else []),
             *([f"{mission.flight}"] if flights else []),
-            f"{mission.mission}", mission.outcome, f"{mission.steps}", collected,
+            f"{mission.mission}", mission.outcome, f"{mission.steps}",
+            *([f"{mission.steps_not_reached}"] if not_reached else []), collected,
             "-" if mission.seed is None else f"{mission.seed}", lacks,
         )  # fmt: skip
     if len(missions) > MISSIONS_MAX:

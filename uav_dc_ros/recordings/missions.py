@@ -23,6 +23,7 @@ class MissionSurvey:
         steps: steps flown.
         outcome: `landed`, `timeout`, `aborted`, or `not over`.
         reason: why, as a real vehicle tells; of one that is not over, why it is as it is. May be empty.
+        steps_not_reached: steps flown whose cell a real vehicle did not reach, as it says itself.
         collected, users: users collected as the last rates tell, and all; None without rates.
         seed, scenario, fingerprint: as the vehicle says.
         missing: messages of its steps that the bag lacks, by topic.
@@ -34,6 +35,7 @@ class MissionSurvey:
     steps: int = 0
     outcome: str = NOT_OVER
     reason: str = ""
+    steps_not_reached: int = 0
     collected: int | None = None
     users: int | None = None
     seed: int | None = None
@@ -81,6 +83,7 @@ def _enter(mission: MissionSurvey, step: RecordedStep) -> None:
         mission.collected, mission.users = sum(step.rates.collected), len(step.rates.collected)
     if step.status is not None:
         mission.seed = step.status.seed
+        mission.steps_not_reached = step.status.steps_not_reached
         mission.scenario, mission.fingerprint = step.status.scenario, step.status.fingerprint
         mission.reason = step.told[-1].reason if step.told else ""
         if step.status.phase.is_over:

@@ -16,7 +16,7 @@ from uav_dc_ros.recordings.pages.missions import Flown, flown
 from uav_dc_ros.recordings.pages.page import Page
 from uav_dc_ros.recordings.pages.vehicle import Way, way
 from uav_dc_ros.recordings.pages.world import world
-from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.step import RecordedStep, printable
 from uav_dc_ros.recordings.vehicles import vehicle
 from uav_dc_ros.topics import SIMULATED
 
@@ -28,7 +28,7 @@ BEGINNING = 1_000  # bytes of a page, within which it says whose it is
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help="a bag's folder, or one of its MCAP files")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="a bag's folder, or one of its files")
     parser.add_argument(
         "--out",
         type=Path,
@@ -74,7 +74,8 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
     with BagReader(options.bag) as reader:
         name = steps.namespace(reader, options.namespace)
         scenario = steps.scenario(reader, name, options.scenario)
-        title = f"{scenario.name}: {options.bag.absolute().name}"
+        bag = printable(options.bag.absolute().name)
+        title = f"{scenario.name}: {bag}"
         page, health = Page("mission", title), Health(reader, name)
         recorded = steps.Steps(reader, name, round(scenario.mission.step_s * 1e9))
         flew = vehicle(reader, name)
@@ -104,7 +105,7 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
         health.read()
         data = {
             "title": title,
-            "bag": options.bag.absolute().name,
+            "bag": bag,
             "recorded": _date(reader.first_ns),
             "policy": reader.about.get("policy", "unknown"),
             "about": {k: reader.about[k] for k in ("pace", "policy_sha256") if k in reader.about},

@@ -76,7 +76,7 @@ REAL: dict[str, Columns] = {
         "reason": "text",  # of the phase
         "flown_s": "float",  # from the begin of the move that led here until the vehicle was told to be here
     },
-    "missions": {"vehicle": "text", "reason": "text"},
+    "missions": {"vehicle": "text", "reason": "text", "steps_not_reached": "int"},
     "phases": {
         **_WHICH,
         "time_s": "float",  # when it was published, since the epoch
@@ -216,7 +216,11 @@ class Mission:
             "total_reward": self._total and self._total[1],
         }
         if self._vehicle != SIMULATED:
-            row |= {"vehicle": self._vehicle, "reason": status and status.reason}
+            row |= {
+                "vehicle": self._vehicle,
+                "reason": status and status.reason,
+                "steps_not_reached": status and status.steps_not_reached,
+            }
         return {name: [value] for name, value in row.items()}
 
 

@@ -133,7 +133,7 @@ class RecordedStep:
 
 
 def printable(text: str) -> str:
-    """A reason as a line that no terminal obeys: bags are told by anybody."""
+    """A reason, or a file's name, as a line of UTF-8 that no terminal obeys: bags are told by anybody."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 

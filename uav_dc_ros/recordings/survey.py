@@ -16,6 +16,7 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.storage import Storage
 from uav_dc_ros.errors import BagDamagedError, BagError
 from uav_dc_ros.recordings.missions import MissionSurvey, look_through, mission_problems
+from uav_dc_ros.recordings.step import printable
 from uav_dc_ros.recordings.steps import namespaces
 
 HARDWARE_ID = "uav_dc_ros"  # of our nodes' diagnostics
@@ -146,9 +147,9 @@ def _survey(reader: BagReader, error: BagDamagedError | None) -> Survey:
     problems += mission_problems(reader, missions)
     distro = told.get("ros_distro")
     return Survey(
-        path=str(reader.path),
+        path=printable(str(reader.path)),
         complete=not problems,
-        problems=problems,
+        problems=[printable(problem) for problem in problems],
         recoverable=recoverable,
         size_bytes=sum(part.stat().st_size for part in reader.parts),
         start_ns=reader.first_ns,
@@ -158,7 +159,7 @@ def _survey(reader: BagReader, error: BagDamagedError | None) -> Survey:
         messages=sum(topic.messages for topic in found),
         parts=[
             PartSurvey(
-                name=storage.path.name,
+                name=printable(storage.path.name),
                 messages=sum(topic.count for topic in storage.topics) + sum(storage.repeated.values()),
                 repeated=sum(storage.repeated.values()),
                 library=storage.library,

@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
-    add("bag", type=Path, metavar="BAG", help="folder of a bag, or an MCAP file")
+    add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
     add("--policy", metavar="NAME|DIR", help="also tell where this policy would have decided otherwise")
     add(
         "--policy-dir",

@@ -22,6 +22,7 @@ from uav_dc_ros.recordings import steps
 from uav_dc_ros.recordings.pages.missions import Flown, flown, significant
 from uav_dc_ros.recordings.pages.page import PAGE_MAX, Page
 from uav_dc_ros.recordings.pages.world import world
+from uav_dc_ros.recordings.step import printable
 
 GROUPS_MAX = 8  # more colours and dashes nobody tells apart
 TRACKS_MAX = 20  # of a group, in a picture
@@ -105,8 +106,8 @@ def page(
 
 def _labels(bags: list[Path]) -> list[str]:
     """Names of bags; with their folders, where names alone are equal."""
-    names = [bag.absolute().name for bag in bags]
-    return names if len(set(names)) == len(names) else [str(bag) for bag in bags]
+    names = [printable(bag.absolute().name) for bag in bags]
+    return names if len(set(names)) == len(names) else [printable(str(bag)) for bag in bags]
 
 
 def _groups(

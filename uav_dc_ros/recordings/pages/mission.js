@@ -245,6 +245,7 @@ open(async (page, data) => {
       ["mean sum-rate", ...si(one.sum_rate_bps, "bit/s").split(" ")],
       ["distance flown", ...si(one.distance_m, "m").split(" ")],
       ["steps", `${one.steps}`, `of ${world.max_steps}`],
+      ...(one.steps_not_reached ? [["steps not reached", `${one.steps_not_reached}`, `of ${one.steps}`, "bad"]] : []),
       ["reward", fixed(one.reward, 3)],
     ]));
     at("why").hidden = !one.reason || landed;

@@ -39,6 +39,7 @@ class Flown:
         outcome: how it ended.
         reason: why, as a real vehicle tells.
         steps: steps flown.
+        steps_not_reached: those of them whose cell a real vehicle did not reach, as it says itself.
         data_bits, collected: of each user at the end, `[U]`.
         distance_m: length of the path flown, metres.
         faults: what is missing or cannot be true, counted in words.
@@ -55,7 +56,7 @@ class Flown:
         self.outcome: str = NO_END
         self.reason = ""
         self.journey = Journey(scenario) if real else None
-        self.steps = 0
+        self.steps = self.steps_not_reached = 0
         self.data_bits: Array = np.zeros(n_users)
         self.collected: Array = np.zeros(n_users, dtype=bool)
         self.distance_m = 0.0
@@ -96,6 +97,7 @@ class Flown:
                 self.faults[f"steps without {name}"] += 1
         if status is not None:
             self.seed = status.seed
+            self.steps_not_reached = status.steps_not_reached
             self._cell = np.asarray(status.cell)
             if status.phase.is_over:
                 self.outcome, self.reason = status.phase.value, status.reason
@@ -108,6 +110,7 @@ class Flown:
         total, n = self._sum_rates_bps
         return {
             **({"reason": self.reason} if self.reason else {}),
+            **({"steps_not_reached": self.steps_not_reached} if self.steps_not_reached else {}),
             "flight": self.flight,
             "mission": self.index,
             "seed": self.seed,

@@ -50,7 +50,7 @@ class Way:
 def way(reader: BagReader, namespace: str, scenario: Scenario) -> Way:
     """The way of the vehicle in a namespace of a bag: one pass over its poses."""
     found = Way(scenario)
-    for message in reader.messages([f"{namespace}/pose"]) if f"{namespace}/pose" in reader.topics else ():
+    for _, message in reader.received([f"{namespace}/pose"]) if f"{namespace}/pose" in reader.topics else ():
         try:
             found.add(read_pose(message))
         except MessageError:
@@ -102,7 +102,9 @@ class Journey:
             "words": [
                 {
                     "s": seconds(told.publish_ns),
-                    "lasted_s": round((end_ns - told.publish_ns) * 1e-9, 2),
+                    "lasted_s": round(
+                        max(0, end_ns - told.publish_ns) * 1e-9, 2
+                    ),  # the clock may be set back
                     "step": step,
                     "phase": told.phase.value,
                     "reason": told.reason,
