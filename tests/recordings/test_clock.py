@@ -1,15 +1,19 @@
 """Recordings during which the machine's clock was set: missions and steps are told apart by what they say."""
 
 import random
+from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.bags.made import bare
 from tests.bags.test_foreign import run
 from tests.recordings import flown
 from tests.recordings.made import BEGUN_NS, about, flight, write
-from tests.recordings.test_steps import LATER_NS, plain, read
+from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, plain, read
 from tests.small_worlds import tiny
 from uav_dc_ros.bags import receipt
 from uav_dc_ros.bags.read import BagMessage, BagReader
@@ -83,16 +87,50 @@ def test_what_waited_when_the_recorder_was_stopped_lies_topic_by_topic(tmp_path:
     assert steps_of(write(tmp_path / "bag", told[:60] + tail)) == WHOLE
 
 
+MILLISECONDS = st.integers(-9000, -20) | st.integers(20, 9000)
+
+
+@given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(1, 130), MILLISECONDS), max_size=3))
+@settings(max_examples=60, deadline=None)
+def test_any_setting_of_the_clock_and_any_delay_in_writing_give_the_same_steps(
+    seed: int, settings_of_the_clock: list[tuple[int, int]]
+) -> None:
+    """Topics are written down late, each in its order; the clock is set by up to nine seconds."""
+    rng = random.Random(seed)
+    told = FLIGHT
+    for at, by_ms in settings_of_the_clock:
+        told = set_by(told, at, by_ms * 10**6)
+    late: dict[str, float] = {}
+    places = []
+    for i, message in enumerate(told):
+        late[message.topic] = max(late.get(message.topic, 0.0), i + rng.randrange(20))
+        places.append((late[message.topic], i, message))
+
+    class Recorded(InMemory):
+        def received(self, names: object) -> Iterator[tuple[int, BagMessage]]:
+            return receipt.in_order(message for *_, message in sorted(places, key=itemgetter(0, 1)))
+
+    stream = Steps(Recorded(told), "", STEP_NS)
+    assert [plain(step) for step in stream] == WHOLE
+    assert not stream.orphans + stream.repeated + stream.rejected
+
+
 def test_the_order_of_receipt() -> None:
     """A message that was lost and sent again is no clock; memory is bounded."""
     rng = random.Random(0)
     told = [
-        BagMessage(f"/{i % 3}", "", b"", BEGUN_NS + i * 10**6 + rng.randrange(10**6), i) for i in range(3000)
+        BagMessage(f"/{i % 3}", "", b"", BEGUN_NS + i * 10**6 + rng.randrange(10**6), BEGUN_NS + i * 10**6)
+        for i in range(3000)
     ]
     late = told[:100] + told[101:103] + [told[100]] + told[103:]
-    assert [(clock, m) for clock, m in receipt.in_order(iter(late))] == [(0, m) for m in told]
-    back = [m._replace(log_time_ns=m.log_time_ns - SECOND) if i >= 1500 else m for i, m in enumerate(told)]
-    assert list(receipt.in_order(iter(back))) == [(int(i >= 1500), m) for i, m in enumerate(back)]
+    assert list(receipt.in_order(late)) == [(0, m) for m in told]
+    resent = [*told]
+    resent[100] = told[100]._replace(log_time_ns=told[100].log_time_ns + SECOND)
+    assert receipt.set_back_ns(resent) == 0
+    alone = [m._replace(log_time_ns=m.log_time_ns - SECOND) if i >= 1500 else m for i, m in enumerate(told)]
+    for back in (alone, set_by(told, 1500, -SECOND)):
+        assert list(receipt.in_order(back)) == [(int(i >= 1500), m) for i, m in enumerate(back)]
+        assert receipt.set_back_ns(back) > SECOND * 0.99
 
 
 def test_memory_of_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,9 +142,9 @@ def test_memory_of_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
         for taken in range(1, 1001):
             yield BagMessage("/a", "", bytes(100), taken, taken)
 
-    for given, (_, message) in enumerate(receipt.in_order(stream()), 1):
-        assert message.log_time_ns == given
-        assert taken - given <= 10
+    for n, (_, message) in enumerate(receipt.in_order(stream()), 1):
+        assert message.log_time_ns == n
+        assert taken - n <= 10
 
 
 def test_it_is_told_and_nothing_is_amiss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,15 +161,17 @@ def test_it_is_told_and_nothing_is_amiss(tmp_path: Path, capsys: pytest.CaptureF
     assert "3 missions" in run(capsys, "export", bag, "--out", tmp_path / "tables", "--format", "csv")
 
 
-@pytest.mark.parametrize("at_s", [1.0, 20.0, 33.3])
-def test_beside_an_autopilot(tmp_path: Path, capsys: pytest.CaptureFixture[str], at_s: float) -> None:
+@pytest.mark.parametrize(("at_s", "by_s"), [(1.0, -5.0), (33.3, -5.0), (33.3, -40.0), (60.0, -3600.0)])
+def test_beside_an_autopilot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], at_s: float, by_s: float
+) -> None:
     """Times of the machine are in all that is published then: of users, of poses, of phases."""
     done = False
 
     def set_back(the: flown.Flight) -> None:
         nonlocal done
         if not done and the.vehicle.now_s >= at_s:
-            the.set_clock(-5.0)
+            the.set_clock(by_s)
             done = True
 
     told = flown.Flight(SCENARIO, beat=set_back).fly()

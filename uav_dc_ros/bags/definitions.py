@@ -34,7 +34,7 @@ def is_defined_so(type: str, encoding: str, definition: bytes) -> bool:
     if not definition or encoding not in ("ros2msg", "ros2idl"):
         return True
     try:
-        text = definition.decode()
+        text = definition.decode().replace("\r\n", "\n")  # as of a checkout on Windows
         told = get_types_from_msg(text, type) if encoding == "ros2msg" else get_types_from_idl(text)
     except Exception:  # of UTF-8, rosbags: no definition
         return False

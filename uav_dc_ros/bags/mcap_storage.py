@@ -22,8 +22,8 @@ from uav_dc_ros.bags.storage import (
     Storage,
     damage,
     foreign,
+    goes_back_ns,
     reading,
-    set_back_ns,
 )
 from uav_dc_ros.errors import BagDamagedError, BagError
 
@@ -130,11 +130,11 @@ def _open_indexed(
     def recorded(topics: Collection[str] | None) -> Iterator[BagMessage]:
         return read(topics, None, None, sort=False)
 
-    def clock_set_back_ns() -> int:
+    def log_goes_back_ns() -> int:
         if all(chunk.message_index_offsets for chunk in summary.chunk_indexes):
             with suppress(ValueError), reading(path):
-                return set_back_ns(_indexed_times(file, summary))
-        return set_back_ns((message.topic, message.log_time_ns) for message in recorded(None))
+                return goes_back_ns(_indexed_times(file, summary))
+        return goes_back_ns((message.topic, message.log_time_ns) for message in recorded(None))
 
     return Storage(
         path=path,
@@ -143,7 +143,7 @@ def _open_indexed(
         last_ns=min(statistics.message_end_time, TIME_MAX_NS),
         messages=lambda topics, start_ns, end_ns: read(topics, start_ns, end_ns, sort=True),
         recorded=recorded,
-        set_back_ns=clock_set_back_ns,
+        goes_back_ns=log_goes_back_ns,
         about=told.about,
         dropped=told.dropped,
         repeated=left_out,
@@ -205,7 +205,7 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
         last_ns=scan.part.last_ns,
         messages=messages,
         recorded=lambda topics: _scanned(Scan(path, file), left_out, topics),
-        set_back_ns=lambda: scan.set_back_ns,
+        goes_back_ns=lambda: scan.goes_back_ns,
         about=scan.part.about,
         dropped=scan.part.dropped,
         repeated=left_out,

@@ -19,8 +19,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from uav_dc_ros.bags import receipt
 from uav_dc_ros.bags.mcap_storage import open_mcap
-from uav_dc_ros.bags.receipt import SET_BACK_NS, in_order
 from uav_dc_ros.bags.sqlite_storage import open_sqlite
 from uav_dc_ros.bags.storage import (
     SQLITE_MAGIC,
@@ -131,11 +131,11 @@ class BagReader:
         Raises:
             BagError: the bag is damaged there.
         """
-        most_ns = max((part.set_back_ns() for part in self.storages), default=0)
+        goes_back_ns = max((part.goes_back_ns() for part in self.storages), default=0)
         if not self._is_side_by_side:
             for before, after in pairwise(part for part in self.storages if _names(part)):
-                most_ns = max(most_ns, before.last_ns - after.first_ns)
-        return most_ns if most_ns > SET_BACK_NS else 0
+                goes_back_ns = max(goes_back_ns, before.last_ns - after.first_ns)
+        return receipt.set_back_ns(self._recorded(None)) if goes_back_ns > receipt.LEAST_NS else 0
 
     def received(self, topics: Collection[str]) -> Iterator[tuple[int, BagMessage]]:
         """Messages in the order of their receipt, each with how often the clock had been set back by then.
@@ -148,10 +148,14 @@ class BagReader:
         """
         if not self.set_back_ns:
             return ((0, message) for message in self.messages(topics))
+        return receipt.in_order(self._recorded(topics))
+
+    def _recorded(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
+        """Messages in the order in which they were recorded."""
         streams = [part.recorded(topics) for part in self.storages]
         if self._is_side_by_side:
-            return in_order(heapq.merge(*streams, key=attrgetter("log_time_ns")))
-        return in_order(chain(*streams))
+            return heapq.merge(*streams, key=attrgetter("log_time_ns"))
+        return chain(*streams)
 
     @property
     def _is_side_by_side(self) -> bool:

@@ -132,7 +132,7 @@ class Scan:
         part: what was read until now.
         library: what wrote the file, in its own words.
         lag_ns: how much earlier than one before it a message was until now, nanoseconds.
-        set_back_ns: how much earlier than the one before it on its topic.
+        goes_back_ns: how much earlier than the one before it on its topic.
         damages: what could not be used until now, as it lies in the file.
         unreadable: messages that are whole, and whose payload is no CDR.
         compressed: topics of whose messages rosbag2 compressed each by itself; they come decompressed.
@@ -151,7 +151,7 @@ class Scan:
         self.compressed: set[str] = set()
         self.path = path
         self.library = ""
-        self.lag_ns = self.set_back_ns = 0
+        self.lag_ns = self.goes_back_ns = 0
         self._file = file
         self._frames = Frames(file)
         self.size = self._frames.size
@@ -302,7 +302,7 @@ class Scan:
             log_time_ns, publish_time_ns = min(log_time_ns, TIME_MAX_NS), min(publish_time_ns, TIME_MAX_NS)
             self.part.count(topic, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
             self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
-            self.set_back_ns = max(self.set_back_ns, self._times_ns.get(topic, 0) - log_time_ns)
+            self.goes_back_ns = max(self.goes_back_ns, self._times_ns.get(topic, 0) - log_time_ns)
             self._last_ns = self._times_ns[topic] = log_time_ns
             for damage in reversed(self.damages):
                 if damage.before_ns is not None:

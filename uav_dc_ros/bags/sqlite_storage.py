@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from uav_dc_ros.bags.frames import CDR, plain
-from uav_dc_ros.bags.storage import BagMessage, RecordedTopic, Storage, damage, set_back_ns
+from uav_dc_ros.bags.storage import BagMessage, RecordedTopic, Storage, damage, goes_back_ns
 
 ROWS = 1000  # read at a time
 
@@ -73,7 +73,7 @@ def open_sqlite(path: Path, closing: ExitStack) -> Storage:
         last_ns=last_ns,
         messages=lambda wanted, start_ns, end_ns: read(wanted, start_ns, end_ns, "timestamp, id"),
         recorded=lambda wanted: read(wanted, None, None, "id"),
-        set_back_ns=lambda: set_back_ns(times()),
+        goes_back_ns=lambda: goes_back_ns(times()),
         compressed=compressed,
     )
 

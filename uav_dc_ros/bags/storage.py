@@ -101,7 +101,7 @@ class Storage:
     Attributes:
         messages: those between two log times (the second one excluded), in the order of their log times.
         recorded: those of some topics, or all, in the order in which they were recorded.
-        set_back_ns: by how much the log time went back, at most, from one message of a topic to the next,
+        goes_back_ns: by how much the log time went back, at most, from one message of a topic to the next,
             nanoseconds; looks through the file.
         about, dropped, repeated: as those of `metadata.Part`; repeated messages are those left out.
         library: what wrote it, in its own words.
@@ -117,7 +117,7 @@ class Storage:
     last_ns: int
     messages: Messages
     recorded: Callable[[Collection[str] | None], Iterator[BagMessage]]
-    set_back_ns: Callable[[], int]
+    goes_back_ns: Callable[[], int]
     about: dict[str, str] = field(default_factory=dict)
     dropped: dict[str, int] | None = None
     repeated: dict[str, int] = field(default_factory=dict)
@@ -166,7 +166,7 @@ def foreign(beginning: bytes) -> str:
     return f"starts with {beginning!r}; expected an MCAP file, or SQLite storage"
 
 
-def set_back_ns(times: Iterable[tuple[object, int]]) -> int:
+def goes_back_ns(times: Iterable[tuple[object, int]]) -> int:
     """The most by which a message's log time is earlier than that of the one before it on its topic, ns.
 
     Args:

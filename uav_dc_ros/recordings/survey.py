@@ -11,6 +11,7 @@ from typing import Any
 
 from uav_dc_ros import topics
 from uav_dc_ros.bags.definitions import TYPESTORE
+from uav_dc_ros.bags.frames import TIME_MAX_NS
 from uav_dc_ros.bags.metadata import FILE_NAME, LOST, Part, is_told, read_metadata
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.storage import Storage
@@ -141,6 +142,10 @@ def _survey(reader: BagReader, error: BagDamagedError | None) -> Survey:
     problems += [f"{n:,} messages of {topic} were dropped" for topic, n in sorted(dropped.items()) if n]
     found, restarts = _topics(reader, dropped)
     problems += _miscounted(reader, found)
+    if reader.last_ns == TIME_MAX_NS:
+        problems.append(
+            "the times of some messages are beyond what ROS 2 can tell (2^63 ns): shown as the last"
+        )
     missions: list[MissionSurvey] = []
     for namespace in namespaces(reader):
         missions += look_through(reader, namespace, problems)
