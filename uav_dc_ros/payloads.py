@@ -25,19 +25,6 @@ def cdr_of_text(text: bytes) -> bytes:
     return CDR_LITTLE_ENDIAN + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
 
 
-def text_in_cdr(data: bytes) -> bytes:
-    """The text in a serialised std_msgs/String.
-
-    Raises:
-        MessageError: it is serialised in another way, or holds less than it says.
-    """
-    order = byte_order(data)
-    length = int.from_bytes(data[4:8], order)  # with the zero at its end
-    if len(data) < 8 + length:
-        raise MessageError("malformed", f"{len(data) - 8} bytes of text; expected {length}, as it says")
-    return data[8 : 7 + length]
-
-
 def byte_order(data: bytes) -> Literal["little", "big"]:
     """The byte order of a serialised message, by its encapsulation: plain CDR, as ROS 2 has it.
 
@@ -54,6 +41,19 @@ def byte_order(data: bytes) -> Literal["little", "big"]:
     raise MessageError(
         "encapsulation", f"{_NAMES.get(kind, f'0x{kind.hex()}')}; expected CDR (0x0000 or 0x0001)"
     )
+
+
+def text_in_cdr(data: bytes) -> bytes:
+    """The text in a serialised std_msgs/String.
+
+    Raises:
+        MessageError: it is serialised in another way, or holds less than it says.
+    """
+    order = byte_order(data)
+    length = int.from_bytes(data[4:8], order)  # with the zero at its end
+    if len(data) < 8 + length:
+        raise MessageError("malformed", f"{len(data) - 8} bytes of text; expected {length}, as it says")
+    return data[8 : 7 + length]
 
 
 def users(scenario: Scenario, users_m: Array, *, mission: int, step: int, time_ns: int) -> messages.Users:
