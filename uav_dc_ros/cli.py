@@ -13,6 +13,7 @@ from uav_dc_ros.errors import UavDcError
 
 # What a shell says of a command that Ctrl-C ended.
 INTERRUPTED = 130
+NEGATIVE = re.compile(r"-\.?\d")  # how a value begins that is no option: no option begins so
 NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")  # between the slashes of a ROS name
 
 
@@ -21,6 +22,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
+        self._negative_number_matcher = NEGATIVE  # argparse's own takes -35.3,149.1 for an option
 
     def error(self, message: str) -> NoReturn:
         """Exits with status 2."""

@@ -1,6 +1,7 @@
 """The life cycle and the parameters of each node, by the services that every ROS tool uses."""
 
 import json
+import math
 import subprocess
 from collections.abc import Iterator
 from typing import Any
@@ -112,12 +113,33 @@ def test_parameters_are_refused_with_their_reason(ros: Ros, asker: Asker) -> Non
     assert "seed" in reason(seed=-1)
     assert "missions" in reason(missions=0)
     assert "pace: 'fast'; expected 'lockstep' or a number above 0" in reason(pace="fast")
-    assert "INTEGER" in reason(seed="three")
+    assert "seed: 'three'; expected a whole number from 0 to" in reason(seed="three")
     assert "read-only" in reason(autostart=True)
     assert reason(sead=3)
     assert asker.ask(node="/world", set={"seed": 3})["seed"]["success"]
     assert asker.ask(node="/world", do="configure")["success"]
     assert "seed: the node is inactive; expected it to be unconfigured" in reason(seed=4)
+    ended(node)
+
+
+def test_a_whole_number_is_a_real_one_wherever_it_is_given(ros: Ros, asker: Asker) -> None:
+    """On the command line, in a file of parameters, and set while the node runs."""
+    file = ros.folder / "whole.yaml"
+    file.write_text("bridge: {ros__parameters: {hold_s: 10, datum: '-35,149,584'}}")
+    given = ("-p", "least_battery:=0", "-p", "silent_steps:=3", "--params-file", str(file))
+    node = waiting(ros, "bridge", "-p", f"connect:={NOBODY}", *given)
+    real = [row for row in NODES["bridge"].parameters if isinstance(row.default, float)]
+    whole = {row.name: math.ceil(row.least or 0) for row in real}
+    told = asker.ask(node="/bridge", set=whole)
+    assert all(answer["success"] for answer in told.values()), told
+    refused = asker.ask(node="/bridge", set={"hold_s": "long", "arm": 1, "retry_s": True, "then": "stay"})
+    assert {name: answer["reason"] for name, answer in refused.items()} == {
+        "hold_s": "hold_s: 'long'; expected a number from 0.1 to 600.0 s",
+        "arm": "arm: 1; expected true or false",
+        "retry_s": "retry_s: True; expected a number from 0.5 to 60.0 s",
+        "then": "then: 'stay'; expected one of return, land",
+    }
+    assert asker.ask(node="/bridge", do="configure") == {"success": True, "state": "inactive"}
     ended(node)
 
 
@@ -143,6 +165,8 @@ def test_every_parameter_is_described_with_unit_and_range(ros: Ros, asker: Asker
     ("arguments", "told"),
     [
         (("-p", "sead:=3"), "error: sead: no such parameter of node world; did you mean 'seed'?"),
+        (("-p", "seed:=1.5"), "error: seed: 1.5; expected a whole number from 0 to"),
+        (("-p", "use_sim_time:=1"), "error: Trying to set parameter 'use_sim_time' to '1'"),
         (("-p", "wind_mps:=3"), "error: wind_mps: no such parameter of node world; expected some of autosta"),
         (
             ("-p", "qos_overrides./moves.subscription.depth:=5"),

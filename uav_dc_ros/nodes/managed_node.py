@@ -31,6 +31,9 @@ class ManagedNode(LifecycleNode):
         name: of its row.
         overrides: values of parameters, over those of the command line.
 
+    Raises:
+        ParameterError: a value that cannot be, or a parameter that the node does not have.
+
     Attributes:
         row: its row of the node table.
         values: values of its parameters; they are checked when it is configured.
@@ -38,7 +41,10 @@ class ManagedNode(LifecycleNode):
     """
 
     def __init__(self, name: str, overrides: Sequence[rclpy.Parameter] = ()) -> None:
-        super().__init__(name, parameter_overrides=list(overrides))
+        try:
+            super().__init__(name, parameter_overrides=list(overrides))
+        except InvalidParameterTypeException as error:  # of a parameter that rclpy declares itself
+            raise ParameterError(str(error)) from None
         self.row = NODES[name]
         self.values: dict[str, Any] = {}
         self.failure: UavDcError | None = None
@@ -57,15 +63,20 @@ class ManagedNode(LifecycleNode):
         """
         rows = {row.name: row for row in (*EVERY, *self.row.parameters)}
         for row in rows.values():
+            if (given := self._parameter_overrides.get(row.name)) is not None:
+                self._parameter_overrides[row.name] = _typed(given, row)
             try:
-                given = self.declare_parameter(row.name, row.default, _descriptor(row)).value
-            except (InvalidParameterTypeException, InvalidParameterValueException):
-                given = self._parameter_overrides[row.name].value
-            self.values[row.name] = row.value(given)
+                value = self.declare_parameter(row.name, row.default, _descriptor(row)).value
+            except InvalidParameterValueException:
+                value = self._parameter_overrides[row.name].value
+            self.values[row.name] = row.value(value)
         self._refuse_unknown("", list(rows))
         for peer in self.values["peers"]:
             if peer not in NODES:
                 raise ParameterError(f"peers: {peer!r}; expected some of {', '.join(NODES)}")
+        self.add_pre_set_parameters_callback(
+            lambda given: [_typed(one, rows[one.name]) if one.name in rows else one for one in given]
+        )
         self.add_on_set_parameters_callback(self._on_set)
 
     def _refuse_unknown(self, kind: str, known: Sequence[str]) -> None:
@@ -199,6 +210,12 @@ class ManagedNode(LifecycleNode):
             return response
 
 
+def _typed(given: rclpy.Parameter, row: Parameter) -> rclpy.Parameter:
+    """A parameter with a value of its row's type, where the given value denotes one."""
+    value = row.typed(given.value)
+    return given if value is given.value else rclpy.Parameter(row.name, value=value)
+
+
 def _descriptor(row: Parameter) -> ParameterDescriptor:
     """What ROS tells about a parameter, and checks itself."""
     unit = f" [{row.unit}]" if row.unit else ""
@@ -206,7 +223,7 @@ def _descriptor(row: Parameter) -> ParameterDescriptor:
         description=f"{row.description}{unit}",
         additional_constraints=row.expected,
         read_only=row.read_only,
-        dynamic_typing=isinstance(row.default, str),  # `-p pace:=90` arrives as a number
+        dynamic_typing=True,  # a wrong type is refused here, by the parameter's name
     )
     if isinstance(row.default, float):
         descriptor.floating_point_range = [FloatingPointRange(from_value=row.least, to_value=row.most)]

@@ -85,7 +85,7 @@ def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[st
             row.value(value)
         except ParameterError as error:
             raise ParameterError(f"--set {node}.{error}") from None
-        given.setdefault(node, {})[name] = value
+        given.setdefault(node, {})[name] = row.typed(value)
     return given
 
 

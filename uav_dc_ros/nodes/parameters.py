@@ -1,5 +1,6 @@
 """The nodes' ROS parameters: each declared once, with description, unit and range. Knows no ROS."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -50,18 +51,24 @@ class Parameter:
         kind = "a whole number" if isinstance(self.default, int) else "a number"
         return f"{kind} from {self.least} to {self.most}{f' {self.unit}' if self.unit else ''}"
 
+    def typed(self, given: Any) -> Any:
+        """A value as one of the parameter's type, where it denotes one: `hold_s:=10` and `pace:=90` do."""
+        if isinstance(self.default, list):
+            return list(given) if isinstance(given, list | tuple) else given
+        if isinstance(self.default, str) and isinstance(given, bool | int | float):
+            return str(given)
+        if type(self.default) is float and type(given) is int:
+            with contextlib.suppress(OverflowError):
+                return float(given)
+        return given
+
     def value(self, given: Any) -> Any:
         """The value that a node uses, checked.
 
         Raises:
             ParameterError: a value of another type, out of range, or that makes no sense.
         """
-        if isinstance(self.default, list):
-            given = list(given) if isinstance(given, list | tuple) else given
-        elif isinstance(self.default, str) and isinstance(given, bool | int | float):
-            given = str(given)  # `-p pace:=90` arrives as a number
-        elif type(self.default) is float and type(given) is int:
-            given = float(given)
+        given = self.typed(given)
         if type(given) is not type(self.default):
             raise ParameterError(f"{self.name}: {given!r}; expected {self.expected}")
         number: Any = given
