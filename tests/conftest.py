@@ -33,6 +33,7 @@ class Ros:
             MARK: self.mark,
             "ROS_DOMAIN_ID": str(domain),
             "ROS_LOG_DIR": str(folder / "log"),
+            "XDG_STATE_HOME": str(folder / "state"),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "PYTHONPATH": str(ROOT),
         }

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -58,6 +59,16 @@ def namespace(text: str) -> str:
             "with '/' between parts"
         )
     return "/" + "/".join(names)
+
+
+def on_stop(handler: Callable[..., object]) -> None:
+    """Call a handler for each signal that asks to end: Ctrl-C, SIGTERM, and the end of the terminal.
+
+    The last one only where it is not ignored, as under nohup.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def run(command: Callable[[], int], prog: str) -> NoReturn:

@@ -1,7 +1,7 @@
 """Fly recorded missions: start the nodes, watch the flight, close the bag, print a summary.
 
 python -m uav_dc_ros.run_all --scenario five_clusters --seed 3
-python -m uav_dc_ros.run_all --vehicle mavlink --connect tcp:127.0.0.1:5760
+python -m uav_dc_ros.run_all --vehicle mavlink --connect tcp:127.0.0.1:5760 --arm --datum here
 """
 
 import argparse
@@ -79,8 +79,9 @@ def parser() -> cli.Parser:
     )
     vehicle.add_argument(
         "--datum",
-        metavar="LAT,LON,ALT",
-        help="of the grid's corner (default: the vehicle stands where the scenario starts)",
+        metavar="here|last|LAT,LON,ALT",
+        help="where the grid's corner lies: so that the vehicle stands at the scenario's start, as in the "
+        "last flight, or there; needed with --arm (default: here)",
     )
     vehicle.add_argument(
         "--set",

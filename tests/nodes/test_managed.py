@@ -7,10 +7,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from rclpy.parameter import Parameter
 
 from tests.conftest import Ros, finish
+from tests.nodes.mavros_flight import node_in
 from uav_dc_ros.nodes.parameters import EVERY
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.world import World
 
 PROCESSES = [name for name, row in NODES.items() if row.process and name != "live_view"]
 NOBODY = "tcp:127.0.0.1:9"  # where no autopilot is
@@ -120,6 +123,17 @@ def test_parameters_are_refused_with_their_reason(ros: Ros, asker: Asker) -> Non
     assert asker.ask(node="/world", do="configure")["success"]
     assert "seed: the node is inactive; expected it to be unconfigured" in reason(seed=4)
     ended(node)
+
+
+def test_a_world_that_is_configured_anew_has_the_topics_of_its_vehicle(ros: Ros) -> None:
+    with node_in(ros):
+        world = World()
+        for vehicle, row in (("external", WORLD_AROUND), ("simulated", NODES["world"])):
+            world.set_parameters([Parameter("vehicle", value=vehicle)])
+            world.trigger_configure()
+            assert set(world.publishers_of) == set(row.publishes), vehicle
+            world.trigger_cleanup()
+        world.destroy_node()
 
 
 def test_a_whole_number_is_a_real_one_wherever_it_is_given(ros: Ros, asker: Asker) -> None:

@@ -193,14 +193,16 @@ def test_names_can_be_remapped_and_others_who_fly_the_same_are_told(ros: Ros) ->
         pattern = "nodes publish /drone/pose; expected one vehicle only"
         until(executor, vehicle, lambda known: pattern in str(known.missing))
         node.destroy_publisher(twin)
-        pattern = "nodes publish /uav2/goal; expected one bridge only"
-        until(executor, vehicle, lambda known: pattern in str(known.missing))
-        node.destroy_publisher(other)
         until(executor, vehicle, lambda known: known.missing is None)
+        rivals = "2 nodes publish /uav2/goal; expected one bridge only"
+        until(executor, vehicle, lambda known: known.other_controller == rivals)
+        node.destroy_publisher(other)
+        until(executor, vehicle, lambda known: known.other_controller is None)
         vehicle.steer(START)
         mavros.wait_for("setpoint")
         restarted = stack.enter_context(mavros_of(node, anchor=vehicle.anchor))
-        until(executor, restarted, lambda known: known.missing is None)  # its predecessor is still there
+        known = until(executor, restarted, lambda known: known.missing is None)
+        assert known.other_controller is None, "its predecessor is still in the graph"
         assert node.count_publishers("/uav2/goal") == 2
 
 

@@ -18,7 +18,7 @@ import pytest
 from rclpy.task import Future
 
 from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.nodes.vehicles import mavros_messages
@@ -123,6 +123,18 @@ def test_with_a_datum_the_fix_says_where_it_stands_across_and_the_ground_how_hig
     hearing.on_fix(True, stands.latitude_deg, stands.longitude_deg, 9.2)
     hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 100.3, 9.3)
     assert hearing.position == pytest.approx((250.0, 120.0, 0.0), abs=0.01)
+
+
+def test_without_a_datum_the_fix_says_where_the_grid_came_to_lie() -> None:
+    corner = Geodetic(latitude_deg=47.4, longitude_deg=8.5, altitude_m=0.0)
+    stands = corner.at(PLACE)
+    hearing = met()
+    assert hearing.corner is None
+    hearing.on_fix(True, stands.latitude_deg, stands.longitude_deg, 1.2)
+    hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 100.2, 1.3)
+    assert hearing.corner is not None
+    assert hearing.corner.seen_from(corner) == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
+    assert hearing.position == PLACE
 
 
 # What the diagnostics tell.
@@ -271,6 +283,19 @@ def test_the_same_pose_again_is_no_news_and_one_without_a_stamp_is() -> None:
     assert (known.position_s, known.vehicle_s) == (11.0, pytest.approx(10.0))
 
 
+def test_a_pose_that_is_late_repeated_or_unstamped_is_counted_and_ignored() -> None:
+    hearing = met()
+    for stamp_s, now_s in ((98.5, 1.1), (100.0, 1.2), (0.0, 1.3), (9e6, 1.4)):
+        hearing.on_pose(Enu(400.0, 6.0, 7.0), 0.5, stamp_s, now_s)
+        known = hearing.telemetry(now_s)
+        assert (known.position, known.position_s) == (PLACE, 1.0)
+    hearing.on_pose(Enu(6.0, 6.0, 7.0), 0.5, 100.5, 1.5)
+    assert hearing.telemetry(1.5).position == pytest.approx((21.0, 0.0, 0.0))
+    assert known.discarded == {"late": 1, "repeated": 1, "without a stamp": 1, "from the future": 1}
+    hearing.on_pose(Enu(7.0, 6.0, 7.0), 0.5, 5.0, 2.6)
+    assert hearing.telemetry(2.6).position_s == 2.6, "MAVROS has found another offset, or it has booted anew"
+
+
 # With mavros_msgs: stand-ins.
 
 
@@ -286,6 +311,7 @@ class Service:
 
 PACKAGE = mavros_messages.MavrosMsgs(
     **dict.fromkeys(("state", "extended_state", "sys_status", "estimator_status", "statustext"), Message),
+    **dict.fromkeys(("home", "target"), Message),
     **dict.fromkeys(("set_mode", "command_bool", "command_tol", "message_interval"), Service),
 )
 FLAGS = [
@@ -322,6 +348,22 @@ def test_with_mavros_msgs_all_is_waited_for_and_named() -> None:
     arducopter = full("ArduPilot")
     arducopter.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.1)
     assert arducopter.telemetry(1.1).missing is None, "ArduPilot has no ESTIMATOR_STATUS"
+
+
+def test_with_mavros_msgs_home_and_target_are_told_in_the_grid_s_frame() -> None:
+    hearing = full("ArduPilot")
+    assert (hearing.telemetry(1.0).home, hearing.telemetry(1.0).target) == (None, None)
+    point = Message(x=5.0, y=16.0, z=7.0)
+    hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.1, tilt_rad(0.5, 0.5, 0.5, 0.5))
+    hearing.on_home(Message(position=point))
+    hearing.on_target(Message(position=point, type_mask=0xDF8))
+    known = hearing.telemetry(1.1)
+    there = (PLACE.east_m, PLACE.north_m + 10.0, PLACE.up_m)
+    assert (known.home, known.target) == (pytest.approx(there), pytest.approx(there))
+    assert known.tilt_rad == pytest.approx(math.pi / 2)
+    assert known.system == "mavros (uas:///uas1)"
+    hearing.on_target(Message(position=point, type_mask=0xDFF))
+    assert hearing.telemetry(1.1).target is None, "it follows a velocity"
 
 
 def test_with_mavros_msgs_state_and_ground_are_what_it_says() -> None:
@@ -482,7 +524,8 @@ def test_the_package_is_found_and_one_of_another_kind_is_refused(monkeypatch: py
     ):
         mavros_messages.load(needed_for="arming")
     package, messages, services = ModuleType("mavros_msgs"), ModuleType("msg"), ModuleType("srv")
-    for name in ("State", "ExtendedState", "SysStatus", "EstimatorStatus", "StatusText"):
+    names = ("State", "ExtendedState", "SysStatus", "EstimatorStatus", "StatusText", "HomePosition")
+    for name in (*names, "PositionTarget"):
         setattr(messages, name, Message)
     for name in ("SetMode", "CommandBool", "CommandTOL", "MessageInterval"):
         setattr(services, name, Service)

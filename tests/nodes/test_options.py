@@ -1,12 +1,13 @@
 """run_all's options: what a newcomer gets wrong is one clear line, status 2, and nothing written."""
 
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import Ros
-from uav_dc_ros import resources
+from uav_dc_ros import cli, resources
 
 
 def refused(ros: Ros, *arguments: object) -> str:
@@ -89,6 +90,16 @@ def test_an_existing_bag_folder(ros: Ros) -> None:
     bag = ros.folder / "bag"
     bag.mkdir()
     assert f"--bag {bag}: it exists already" in refused(ros, "--bag", bag)
+
+
+def test_the_end_of_a_terminal_is_a_stop_unless_it_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+    handled: list[int] = []
+    monkeypatch.setattr(signal, "signal", lambda number, handler: handled.append(number))
+    for before, expected in ((signal.SIG_DFL, [2, 15, 1]), (signal.SIG_IGN, [2, 15])):  # a background job's
+        monkeypatch.setattr(signal, "getsignal", lambda number, before=before: before)
+        cli.on_stop(print)
+        assert handled == expected, before
+        handled.clear()
 
 
 def test_a_machine_without_ros(ros: Ros) -> None:

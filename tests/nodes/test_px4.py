@@ -22,6 +22,7 @@ from tests.conftest import Ros, each_once
 from tests.nodes import px4_messages
 from tests.nodes.conftest import SMALL
 from uav_dc_ros import scenarios
+from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S
 from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned, to_enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
@@ -238,6 +239,7 @@ def test_topics_and_their_qos(vehicle: px4.Px4, spun: Spun) -> None:
         *("in/offboard_control_mode", "in/trajectory_setpoint", "in/vehicle_command"),
         *("out/vehicle_status_v1", "out/vehicle_local_position", "out/vehicle_land_detected"),
         *("out/battery_status", "out/failsafe_flags", "out/vehicle_command_ack"),
+        *("out/vehicle_attitude", "out/home_position"),
     }
     for name in names:
         publishes = name.startswith("in/")
@@ -368,10 +370,10 @@ def test_the_stream_keeps_its_pace(vehicle: px4.Px4, spun: Spun, hand: Hand) -> 
         if i % 25 == 24:
             time.sleep(0.3)  # a callback that takes its time
     gaps = gaps_s(hand.heartbeats)
-    print(f"late by, ms: p50 {1e3 * np.quantile(abs(gaps - px4.STREAM_S), 0.5):.2f}", end=", ")
-    print(f"p99 {1e3 * np.quantile(abs(gaps - px4.STREAM_S), 0.99):.2f}, of {len(gaps)}")
-    assert np.mean(gaps) == pytest.approx(px4.STREAM_S, rel=0.15)
-    assert np.median(abs(gaps - px4.STREAM_S)) < 0.01
+    print(f"late by, ms: p50 {1e3 * np.quantile(abs(gaps - STREAM_S), 0.5):.2f}", end=", ")
+    print(f"p99 {1e3 * np.quantile(abs(gaps - STREAM_S), 0.99):.2f}, of {len(gaps)}")
+    assert np.mean(gaps) == pytest.approx(STREAM_S, rel=0.15)
+    assert np.median(abs(gaps - STREAM_S)) < 0.01
     assert max(gaps) < 0.5, "PX4 wants more than 2 Hz"
 
 
@@ -382,7 +384,7 @@ def test_the_stream_ends_a_second_after_those_who_decide(vehicle: px4.Px4, spun:
     last_ns = time.time_ns()
     spun.pass_time(1.5, hand.say)
     for heard in (hand.heartbeats, hand.setpoints):  # best effort: the last ones may be lost on their way
-        assert 0.5 * px4.LIFE_S <= (heard[-1][0] - last_ns) / 1e9 <= px4.LIFE_S + 0.2
+        assert 0.5 * LIFE_S <= (heard[-1][0] - last_ns) / 1e9 <= LIFE_S + 0.2
     before = len(hand.heartbeats)
     spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.steer(goal)))
 
@@ -437,6 +439,27 @@ def test_no_setpoint_no_stream(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None
     assert (len(hand.heartbeats), len(hand.setpoints)) == before
     vehicle.close()
     vehicle.close()
+
+
+def test_another_bridge_is_seen(vehicle: px4.Px4, spun: Spun, hand: Hand, msg: Any) -> None:
+    spun.until(lambda: vehicle.kind == "PX4", hand.say)
+    assert vehicle.telemetry().other_controller is None
+    topic = f"{spun.namespace}/fmu/in/trajectory_setpoint"
+    other = spun.node("other").create_publisher(msg.TrajectorySetpoint, topic, 1)
+    expected = f"2 nodes publish {topic}; expected one bridge only"
+    spun.until(lambda: vehicle.telemetry().other_controller == expected, hand.say)
+    assert other is not None
+
+
+def test_a_stream_that_broke_is_not_believed_to_live(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+    def broken(message: Any) -> None:
+        raise RuntimeError("no such publisher")
+
+    spun.until(lambda: vehicle.telemetry().missing is None, hand.say)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vehicle._publishers["trajectory_setpoint"], "publish", broken)
+        with pytest.raises(RuntimeError, match="no such publisher"):
+            spun.pass_time(20.0, lambda: (hand.say(), vehicle.steer(Enu(0.0, 0.0, 50.0))))
 
 
 def test_a_vehicle_whose_time_is_faster_gets_more_of_it(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
@@ -536,6 +559,58 @@ def test_the_emptiest_battery_counts(msg: Any) -> None:
         message = msg.BatteryStatus(id=number, connected=connected, remaining=remaining)
         hearing.on_battery_status(message, 0.0)
         assert hearing.telemetry().battery == told
+
+
+def test_a_battery_tells_its_voltage_and_what_px4_thinks_of_it(msg: Any) -> None:
+    hearing = Px4Hearing(place=PLACE)
+    assert (hearing.telemetry().battery_v, hearing.telemetry().battery_fails) == (None, False)
+    for warning, fails in ((0, False), (1, True), (3, True)):
+        message = msg.BatteryStatus(id=1, connected=True, remaining=0.75, voltage_v=9.0, warning=warning)
+        hearing.hear("battery_status", message, 0.0)
+        known = hearing.telemetry()
+        assert (known.battery, known.battery_v, known.battery_fails) == (0.75, 9.0, fails)
+
+
+def test_home_and_tilt_are_told(msg: Any) -> None:
+    hearing = standing(msg)
+    assert (hearing.telemetry().home, hearing.telemetry().tilt_rad) == (None, None)
+    hearing.hear("home_position", msg.HomePosition(x=3.0, y=8.0, z=0.5, valid_lpos=True), 1.0)
+    hearing.hear("vehicle_attitude", msg.VehicleAttitude(q=[0.0, 1.0, 0.0, 0.0]), 1.0)
+    known = hearing.telemetry()
+    assert known.home == pytest.approx((PLACE.east_m + 10.0, PLACE.north_m, PLACE.up_m))
+    assert known.tilt_rad == pytest.approx(math.pi), "on its back"
+    assert known.system == "system 7"
+
+
+def test_what_is_late_repeated_unstamped_or_of_another_vehicle_is_counted_and_ignored(msg: Any) -> None:
+    hearing = standing(msg)
+
+    def hear(name: str, message: Any, stamp_s: float, now_s: float) -> Telemetry:
+        message.timestamp = round(stamp_s * 1e6)
+        hearing.hear(name, message, now_s)
+        return hearing.telemetry()
+
+    offboard = status(msg, arming_state=2, nav_state=14)
+    at = [position(msg, Ned(START.north_m + m, START.east_m, START.down_m)) for m in (0.0, 1.0, 2.0, 400.0)]
+    hear("vehicle_status", offboard, 100.0, 1.0)
+    hear("vehicle_local_position", at[1], 100.0, 1.0)
+    for stamp_s, now_s, message in (
+        *((98.5, 1.1, at[0]), (0.0, 1.2, at[0]), (100.0, 1.3, at[3]), (9e6, 1.4, at[3])),
+    ):
+        known = hear("vehicle_local_position", message, stamp_s, now_s)
+        assert (known.position, known.position_s) == (pytest.approx((0.0, 1.0, 0.0)), 1.0)
+    assert hear("vehicle_local_position", at[2], 100.5, 1.5).position_s == 1.5
+    for stamp_s, message in ((98.5, status(msg)), (101.0, status(msg, system_id=8))):
+        known = hear("vehicle_status", message, stamp_s, 1.5)
+        assert (known.mode, known.armed) == (Mode.COMMANDED, True)
+    assert known.discarded == {
+        "late": 2,
+        "without a stamp": 1,
+        "repeated": 1,
+        "from the future": 1,
+        "of another system": 1,
+    }
+    assert hear("vehicle_local_position", at[1], 3.0, 2.6).position_s == 2.6, "it has booted anew"
 
 
 def test_time_goes_on_whatever_clock_the_stamps_are_of(msg: Any) -> None:
@@ -717,7 +792,7 @@ def test_when_nobody_decides_any_more_px4_takes_it_home(flight: Flight) -> None:
     flight.until(lambda: flight.bridge.step == 2)
     before_s = time.monotonic()
     flight.spun.until(lambda: flight.fake.all("mode")[-1]["mode"] == 5)
-    assert px4.LIFE_S <= time.monotonic() - before_s + 0.2 < px4.LIFE_S + 3.0
+    assert LIFE_S <= time.monotonic() - before_s + 0.2 < LIFE_S + 3.0
     assert flight.fake.all("mode")[-1]["why"] == "failsafe"
     flight.finish()
     phase, _, why = flight.log[-1]

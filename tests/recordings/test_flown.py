@@ -354,7 +354,17 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
     """Through real DDS and real MAVLink, beside a fake autopilot: both policy and bridge die on the way."""
     bag = ros.folder / "bag"
     with fake("ardupilot", speed=4.0) as autopilot:
-        options = ("--vehicle", "mavlink", "--connect", autopilot.address, "--arm", "--bag", bag)
+        options = (
+            "--vehicle",
+            "mavlink",
+            "--connect",
+            autopilot.address,
+            "--arm",
+            "--datum",
+            "here",
+            "--bag",
+            bag,
+        )
         process = ros.start("uav_dc_ros.run_all", *low, *options)
         for step, node in ((2, "policy"), (5, "bridge")):
             until(lambda step=step: flies_east(autopilot, step), process)

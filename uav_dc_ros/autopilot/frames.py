@@ -55,6 +55,17 @@ def wrapped(angle_rad: float) -> float:
     return math.pi - (math.pi - angle_rad) % (2 * math.pi)
 
 
+def tilt_rad(w: float, x: float, y: float, z: float) -> float | None:
+    """Angle between a body's vertical axis and the vertical, 0 to pi, of a unit quaternion; None: it is none.
+
+    The same in ENU (with the body's axes forward, left, up) and in NED (forward, right, down).
+    """
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not 0.9 < length < 1.1:
+        return None
+    return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y) / (length * length))))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Geodetic:
     """A point on WGS84.

@@ -128,8 +128,13 @@ class Mavlink:
     @property
     def anchor(self) -> str:
         """The grid's datum, as `Geodetic.parse` reads it; empty until it is known."""
+        return str(self.datum or "")
+
+    @property
+    def datum(self) -> Geodetic | None:
+        """Where on the Earth the grid's corner lies; None: not known."""
         with self._lock:
-            return str(self._hearing.datum or "")
+            return self._hearing.datum
 
     @property
     def kind(self) -> str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
-from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.frames import Enu, Geodetic
 
 
 class Mode(StrEnum):
@@ -130,6 +130,10 @@ class Vehicle(Protocol):
     @property
     def anchor(self) -> str:
         """Where the grid lies, for a transport that is opened again in the air; empty until it is known."""
+
+    @property
+    def datum(self) -> Geodetic | None:
+        """Where on the Earth the grid's corner lies; None: not known."""
 
     def telemetry(self) -> Telemetry:
         """What is known of the vehicle now, times as of `time.monotonic`.

@@ -7,6 +7,7 @@ journal where the mission stood, and takes it up in the air; it never arms a sec
 
 import dataclasses
 import time
+from contextlib import ExitStack
 
 import msgspec
 import numpy as np
@@ -14,14 +15,14 @@ import numpy as np
 from uav_dc_ros import messages, scenarios
 from uav_dc_ros.autopilot.bridge import Bridge, Standing
 from uav_dc_ros.autopilot.fence import Fence
-from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.errors import MessageError, NodeError
+from uav_dc_ros.errors import MessageError, NodeError, UavDcError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import cdr, runtime, vehicles
+from uav_dc_ros.nodes import cdr, datums, runtime, vehicles
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.lease import Lease
 from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
@@ -47,6 +48,8 @@ class AutopilotBridge(MissionNode):
 
     def __init__(self) -> None:
         super().__init__("bridge")
+        self._open = ExitStack()  # what is to be closed
+        self._begun = False
 
     def configure(self) -> None:
         """Load the world, and what is left of a mission whose bridge was killed."""
@@ -57,15 +60,17 @@ class AutopilotBridge(MissionNode):
         self.settings = Settings(**settings | {"then": Mode(values["then"])})
         self.journal = Journal(values["journal"])
         self.fence = Fence.around(self.scenario, values["fence_margin_m"])
-        vehicles.check(values["vehicle"], values["connect"], values["datum"], values["arm"])
+        vehicles.check(values["vehicle"], values["connect"], values["arm"])
         self._restore()
+        self._datum()
 
     def activate(self) -> None:
         """Reach for the vehicle; the mission begins when the peers are ready, or goes on at once."""
         kept = self._restore()
         standing, anchor = (None, "") if kept is None else (kept.standing, kept.anchor)
+        datum = self._datum()
         self.bridge = Bridge(self.scenario, self.settings, self._on_change, standing, self.fence)
-        self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, anchor)
+        self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, datum, anchor)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
         self._begun = standing is not None and standing.flies
@@ -77,8 +82,12 @@ class AutopilotBridge(MissionNode):
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
+        self._grid = ""  # where it lies, as logged last
+        self._grid_is_kept, self._is_restarted = False, standing is not None
         self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
         self._policy = Lease(self, TOPICS["move"])
+        for close in (self._policy.close, self.journal.close, self.vehicle.close):
+            self._open.callback(close)
         run_when_due()  # this thread; those of the middleware stay as they are
         self.vehicle.open()
         self._timer = self.timer(TICK_S, self._tick)
@@ -89,17 +98,25 @@ class AutopilotBridge(MissionNode):
 
     def deactivate(self) -> None:
         """Bring a vehicle that flies down, and let go of it once it obeys."""
-        bridge = self.bridge
-        if self._begun and not bridge.is_over:
-            bridge.stop("the bridge was stopped")
-            deadline_s = time.monotonic() + OBEYS_S
-            while not bridge.is_done_with(self._known) and time.monotonic() < deadline_s:
-                self._tick()
-                time.sleep(TICK_LEAST_S)
+        if self._begun and not self.bridge.is_over:
+            self.bridge.stop("the bridge was stopped")
+            self._wait_until_it_obeys()
         self._tell_diagnostics()  # the last changes, too
-        self.vehicle.close()
-        self.journal.close()
-        self._policy.close()
+
+    def _wait_until_it_obeys(self) -> None:
+        """Go on as before: to see whether it obeys takes messages, and the timer of `_tick`."""
+        deadline_s, failed = time.monotonic() + OBEYS_S, False
+        while not self.bridge.is_done_with(self._known) and time.monotonic() < deadline_s:
+            try:
+                self.serve(TICK_LEAST_S)
+            except Exception as error:  # whatever it was: the vehicle is asked again
+                if not failed:
+                    self.get_logger().error(f"while the vehicle is brought down: {error}")
+                failed = True
+
+    def _fall_silent(self) -> None:
+        super()._fall_silent()
+        self._open.close()
 
     # Before the start.
 
@@ -118,6 +135,17 @@ class AutopilotBridge(MissionNode):
         if self.count_publishers("mission") > 1:
             raise NodeError(ANOTHER_MISSION)
         self._begun = True
+
+    def _datum(self) -> Geodetic | None:
+        """Where the grid is to lie; None: under the vehicle, or where it lay before this start.
+
+        Raises:
+            UavDcError: there is no such place.
+        """
+        if self._restore() is not None:
+            return None
+        values = self.values
+        return datums.parse(values["datum"], self.scenario, values["vehicle"], arm=values["arm"])
 
     def _restore(self) -> Kept | None:
         """What the journal tells of a mission.
@@ -155,9 +183,11 @@ class AutopilotBridge(MissionNode):
         self._known = known = self.vehicle.telemetry()
         self._keep_pace(known)
         self._publish_pose(known)
+        self._tell_grid()
         if not self._begun:
             self._begin_if_all_ready()
         if self._begun:
+            self._refuse_without_grid(known)
             self.bridge.policy_is_gone = self._policy.is_gone()
             for wish in self.bridge.tick(time.monotonic(), known):
                 self.vehicle.ask(wish)
@@ -195,6 +225,40 @@ class AutopilotBridge(MissionNode):
             self.publish("target", cdr.pose(np.asarray(setpoint), now_ns))
         self._setpoint = setpoint
 
+    # Where the grid lies.
+
+    def _tell_grid(self) -> None:
+        """Log where the grid lies, as soon as that is known, and how far from the last flight's."""
+        datum, anchor = self.vehicle.datum, self.vehicle.anchor
+        where = anchor if datum is None else str(datum)
+        if where == self._grid:
+            return
+        self._grid, moved = where, True
+        told = f"the grid lies at {anchor} of the vehicle's own frame; not compared with the last flight"
+        if datum is not None:
+            source = "" if self._is_restarted else self.values["datum"] or datums.HERE
+            told, moved = datums.described(datum, source, self.scenario)
+        (self.get_logger().warning if moved else self.get_logger().info)(told)
+
+    def _keep_grid(self) -> None:
+        """Keep where the grid of a vehicle that takes off lies, for the next flight."""
+        datum = self.vehicle.datum
+        if self._grid_is_kept or self.bridge.phase is not Phase.TAKEOFF or datum is None:
+            return
+        self._grid_is_kept = True
+        try:
+            datums.keep(self.scenario, datum, self.values["vehicle"])
+        except UavDcError as error:  # no reason not to fly
+            self.get_logger().warning(f"the next flight will not know where the grid lay ({datum}): {error}")
+
+    def _refuse_without_grid(self, known: Telemetry) -> None:
+        """End a mission beside a vehicle that flies already, while nothing says where the grid lies."""
+        waits = self.bridge.phase is Phase.CONNECTING and not self.vehicle.anchor
+        if waits and known.armed and known.on_ground is False:
+            self.bridge.stop(
+                "it flies, and where the grid lies is not known: expected datum last or LAT,LON,ALT"
+            )
+
     def _on_change(self) -> None:
         """Keep where the mission stands, and say it: what others know is never forgotten."""
         kept = Kept(
@@ -209,6 +273,7 @@ class AutopilotBridge(MissionNode):
             if not self._forgets:
                 self.get_logger().error(f"a bridge that is killed now will not know where it was: {error}")
             self._forgets = True
+        self._keep_grid()
         self._tell()
 
     def _tell(self) -> None:
@@ -221,6 +286,7 @@ class AutopilotBridge(MissionNode):
             reason=messages.told(waits or bridge.reason),
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
+            steps_not_reached=getattr(bridge, "steps_not_reached", 0),
             seed=self.values["seed"],
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
@@ -240,6 +306,7 @@ class AutopilotBridge(MissionNode):
         aborted = bridge.phase is Phase.ABORTED
         warnings = [bridge.reason] if aborted or bridge.fault else []
         warnings += ["the journal cannot be written"] if self._forgets else []
+        warnings += [] if known.other_controller is None else [known.other_controller]
         values = {
             "phase": bridge.phase.value,
             "reason": bridge.reason,
@@ -249,7 +316,10 @@ class AutopilotBridge(MissionNode):
             "armed": str(known.armed).lower(),
             "estimate": "good" if known.estimate_ok else "not good",
             "battery": "" if known.battery is None else f"{known.battery:.0%}",
-            "grid anchor": self.vehicle.anchor,
+            "grid": self._grid,
+            "system": known.system,
+            "other controller": known.other_controller or "",
+            **{f"discarded: {why}": str(count) for why, count in known.discarded.items()},
         }
         for name, at_s in (("position", known.position_s), ("heartbeat", known.heartbeat_s)):
             values[f"{name} age [s]"] = "" if at_s is None else f"{now_s - at_s:.2f}"

@@ -20,8 +20,9 @@ CONNECT = Parameter(
 DATUM = Parameter(
     name="datum",
     default="",
-    description="latitude, longitude (degrees) and altitude (metres) of the grid's corner, with a comma "
-    "between; empty: the vehicle stands where the scenario starts when its first good position comes",
+    description="where the grid's corner lies: here (the vehicle stands where the scenario starts when its "
+    "first good position comes), last (as in the last flight), or latitude, longitude (degrees) and altitude "
+    "(metres) with a comma between; needed with arm; empty: here",
 )
 FENCE_MARGIN_M = Parameter(
     name="fence_margin_m",

@@ -103,10 +103,11 @@ class Display:
             justify: JustifyMethod = "left" if name == "outcome" else "right"
             table.add_column(name, justify=justify, no_wrap=True, overflow="fold")
         for mission in summaries:
+            missed = f" ({mission.steps_not_reached} not reached)" if mission.steps_not_reached else ""
             table.add_row(
                 str(mission.seed),
                 mission.outcome.value,
-                str(mission.steps),
+                f"{mission.steps}{missed}",
                 f"{mission.users_collected}/{mission.users_total}",
                 f"{mission.data_bits / 1e6:.1f} Mbit",
                 f"{mission.sum_rate_bps / 1e6:.3f} Mbit/s",

@@ -28,6 +28,7 @@ from uav_dc_ros.topics import SIMULATED
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
+REST_S, REST_QUIET_S = 2.0, 0.2  # longest time for what the nodes said last, and after which all of it came
 TICK_S = 0.02
 
 
@@ -50,7 +51,7 @@ class Flight:
         self.nodes = run_options.nodes(options)
         self.together = run_options.together(options, self.nodes)
         self._settings = run_options.settings(options, self.nodes)
-        run_options.check_vehicle(options, self.nodes)
+        run_options.check_vehicle(options, self.nodes, self.scenario)
         if options.live is not None:
             foxglove_server.check(address=str(ADDRESS.default), port=options.live)
         self.bag = run_options.new_bag(options.bag) if "recorder" in self.nodes else None
@@ -66,12 +67,11 @@ class Flight:
         self.summaries: list[Summary] = []
         self._interrupted = self._aborted = False
         self._step_s = 0.0  # when the last step came, monotonic clock
-        self._phase: Phase | None = None  # of the vehicle; none before it was heard
+        self._status: Mission | None = None  # of the vehicle, its last word
 
     def run(self) -> int:
         """Fly; returns the exit status of the command."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._interrupt)
+        cli.on_stop(self._interrupt)
         status = 0
         remapped = ["--ros-args", "-r", f"__ns:={self.options.namespace}", "-r", "/clock:=clock"]
         with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, self.display:
@@ -92,6 +92,7 @@ class Flight:
                     self.display.error(str(error))
                     status = 1
                 status = max(status, self._stopped(supervisor.stop()))
+                self._hear_the_rest(executor)
             self._account_for_all(node)
             node.trigger_shutdown()
             rclpy.try_shutdown()
@@ -122,7 +123,7 @@ class Flight:
 
     def _check_patience(self, node: Observer, now_s: float) -> None:
         """Wait for steps that are due, and for nodes that are started here; others may take their time."""
-        if not self.is_simulated and self._phase is not None:
+        if not self.is_simulated and self._status is not None:
             return  # the bridge itself sees to it that the mission ends; a pilot may take his time
         patience_s = SILENCE_S + pace.period_s(self.scenario, self.options.pace)
         if now_s - self._step_s <= patience_s:
@@ -142,6 +143,15 @@ class Flight:
             self.display.error(f"node {name} ended with {code} when it was asked to stop")
         return int("recorder" in odd)
 
+    def _hear_the_rest(self, executor: DirectExecutor) -> None:
+        """Handle what the nodes said while they were stopped: how a mission ends that was broken off."""
+        if len(self.summaries) < self.options.missions:
+            deadline_s = time.monotonic() + REST_S
+            try:
+                executor.spin(lambda: time.monotonic() > deadline_s, REST_QUIET_S)
+            except NodeError as error:
+                self.display.error(str(error))
+
     def _account_for_all(self, node: Observer) -> None:
         """Every mission that was to be flown has its end: those without one were aborted."""
         node.close()
@@ -149,7 +159,10 @@ class Flight:
         if flown < self.options.missions:
             not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.options.seed + flown)
             now = node.mission or not_begun
-            self._on_end(now if now.mission == flown else not_begun, Phase.ABORTED)
+            now = now if now.mission == flown else not_begun
+            if self._status is not None and self._status.mission == flown:
+                now.hear(self._status)
+            self._on_end(now, Phase.ABORTED)
 
     def _mend_bag(self) -> int:
         """Make a whole bag of one whose recorder did not close it; 1 if that cannot be."""
@@ -210,7 +223,7 @@ class Flight:
         self._interrupted = True
 
     def _on_status(self, status: Mission) -> None:
-        self._phase = status.phase
+        self._status = status
         self.display.vehicle(status)
 
     def _on_step(self, mission: MissionSoFar) -> None:

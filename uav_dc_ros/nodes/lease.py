@@ -1,10 +1,14 @@
-"""Notices within a fraction of a second that the only publisher of a topic has been killed.
+"""Notices within two seconds that the only publisher of a topic has been killed.
 
-A publisher that offers a lease (see `topics.Topic.lease_s`) gives a sign of life within it, from a thread of
-the middleware: busy or loading, it lives; killed, it does not. A second subscription asks for that sign
-alone: one that asked for the messages, too, would be deaf to publishers that offer none.
+A publisher that offers a lease (see `topics.Topic.lease_s`) asserts its liveliness several times a second,
+from a thread of the middleware: busy or loading, it lives; killed, it does not. On a busy computer that
+thread waits, too, so many assertions in a row have to be missed; and since the one that waited may be this
+process, liveliness that comes back within a moment was not lost. A second subscription asks for liveliness
+alone: one that asked for the messages, too, would not match publishers that offer none.
 """
 
+import time
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.duration import Duration
@@ -19,7 +23,38 @@ from rclpy.node import Node
 from uav_dc_ros.nodes import qos
 from uav_dc_ros.topics import Topic
 
-LATE = 1.4  # of the lease, after which a sign of life is missed
+MISSED_S = 1.25  # without an assertion, after which the middleware reports liveliness as lost
+CONFIRMED_S = 0.25  # that it then has to stay lost
+
+
+class Confirmed:
+    """Liveliness as the middleware reports it, confirmed. To be asked several times in `CONFIRMED_S`.
+
+    Args:
+        clock: steady, seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._was_there = False
+        self._lost_s: float | None = None  # since when it is lost, without a gap between the looks
+        self._looked_s = 0.0
+
+    def is_gone(self, alive: bool) -> bool:
+        """Is somebody gone who was there."""
+        now_s, before_s = self._clock(), self._looked_s
+        self._looked_s = now_s
+        self._was_there |= alive
+        if alive or not self._was_there:
+            self._lost_s = None
+            return False
+        if self._lost_s is None or now_s - before_s > CONFIRMED_S:  # this process itself had to wait
+            self._lost_s = now_s
+        return now_s - self._lost_s >= CONFIRMED_S
+
+    def forget(self) -> None:
+        """Wait for somebody anew."""
+        self._was_there = False
 
 
 class Lease:
@@ -31,11 +66,12 @@ class Lease:
     """
 
     def __init__(self, node: Node, topic: Topic) -> None:
-        assert topic.lease_s is not None, "otherwise nobody gives a sign"
+        assert topic.lease_s is not None, "otherwise nobody asserts liveliness"
+        assert topic.lease_s < MISSED_S, "otherwise they do not match"
         profile = qos.requested(topic, all=False)
-        profile.liveliness_lease_duration = Duration(seconds=LATE * topic.lease_s)
+        profile.liveliness_lease_duration = Duration(seconds=MISSED_S)
         self._node = node
-        self._was_there = False
+        self._confirmed = Confirmed()
         self._subscription = node.create_subscription(
             qos.MESSAGE_TYPES[topic.type],
             topic.name,
@@ -56,12 +92,11 @@ class Lease:
             return False
         with self._event:
             alive = bool(self._event.take_event().alive_count)
-        self._was_there |= alive
-        return self._was_there and not alive
+        return self._confirmed.is_gone(alive)
 
     def hear(self) -> None:
         """Note that somebody has published: one that offers no lease, maybe, in place of one that did."""
-        self._was_there = False
+        self._confirmed.forget()
 
     def close(self) -> None:
         """Look no more."""

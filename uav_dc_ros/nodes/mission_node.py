@@ -53,6 +53,8 @@ class MissionNode(ManagedNode):
         message_bytes: about how large a message is that it publishes, by topic, where that may be much;
             to be told when it is configured.
         published_ns: when the message that is being handled was published, nanoseconds since the epoch.
+        serve: handles what comes within so many seconds: for who has to wait inside a callback, and depends
+            on what comes. Set by `runtime`.
     """
 
     drains = False
@@ -66,6 +68,7 @@ class MissionNode(ManagedNode):
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.message_bytes: dict[str, int] = {}
         self.published_ns = 0
+        self.serve: Callable[[float], None] = time.sleep
         self.publishers_of: dict[str, Publisher] = {}
         self.subscriptions_of: dict[str, Any] = {}
         self.peers = [peer for peer in self.values["peers"] if peer != name]

@@ -25,6 +25,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         seed: seed of the mission's users.
         outcome: `landed`, `timeout` or `aborted`.
         steps: steps flown.
+        steps_not_reached: of them, those whose cell a real vehicle did not reach.
         users_collected, users_total: users.
         data_bits: data collected from all users, bit.
         sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
@@ -39,6 +40,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     outcome: messages.Phase
     steps: int
+    steps_not_reached: int
     users_collected: int
     users_total: int
     data_bits: float
@@ -60,7 +62,7 @@ class MissionSoFar:
         rates: what was measured last.
         distance_m: length of the path flown, metres.
         over: has it come to its end?
-        reason: what the vehicle said of that.
+        reason, steps_not_reached: what the vehicle said of that.
         sum_of_sum_rates_bps: sum-rates of all measured steps, added up, bit/s.
         unheard_steps: that were flown while nobody measured them.
     """
@@ -74,8 +76,13 @@ class MissionSoFar:
     distance_m: float = 0.0
     over: bool = False
     reason: str = ""
+    steps_not_reached: int = 0
     sum_of_sum_rates_bps: float = 0.0
     unheard_steps: int = 0
+
+    def hear(self, status: messages.Mission) -> None:
+        """Take in the vehicle's last word on it."""
+        self.reason, self.steps_not_reached = status.reason, status.steps_not_reached
 
     @property
     def users_collected(self) -> int:
@@ -194,7 +201,6 @@ class Observer(MissionNode):
         self.mission, self._position_m = now, position_m
         now.step, now.cell, now.rates = mission.step, mission.cell, rates
         now.over = mission.phase.is_over
-        now.reason = mission.reason
         self._on_step(now)
         if now.over:
             self._tell_end(now, mission)
@@ -214,10 +220,11 @@ class Observer(MissionNode):
             end = self._ended[mission]
             if self.mission is None or self.mission.mission < mission:  # it was over before its first rates
                 self.mission = MissionSoFar(scenario=self.scenario, mission=mission, seed=end.seed)
-            self.mission.over, self.mission.reason = True, end.reason
+            self.mission.over = True
             self._tell_end(self.mission, end)
 
     def _tell_end(self, now: MissionSoFar, end: messages.Mission) -> None:
+        now.hear(end)
         self._told = now.mission
         self._ended.pop(now.mission, None)
         self._on_end(now, end.phase)
@@ -237,6 +244,7 @@ def summary(
         seed=now.seed,
         outcome=outcome,
         steps=now.step,
+        steps_not_reached=now.steps_not_reached,
         users_collected=now.users_collected,
         users_total=scenario.n_users,
         data_bits=now.data_bits,

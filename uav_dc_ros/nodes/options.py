@@ -8,8 +8,9 @@ from pathlib import Path
 import msgspec
 
 from uav_dc_ros.core import pace
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
-from uav_dc_ros.nodes import vehicles
+from uav_dc_ros.nodes import datums, vehicles
 from uav_dc_ros.nodes.table import COMPOSABLE, NODES
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
@@ -89,7 +90,7 @@ def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[st
     return given
 
 
-def check_vehicle(options: argparse.Namespace, nodes: list[str]) -> None:
+def check_vehicle(options: argparse.Namespace, nodes: list[str], scenario: Scenario) -> None:
     """Refuse options that do not go together, and a way to the vehicle that this machine does not have.
 
     Raises:
@@ -108,7 +109,8 @@ def check_vehicle(options: argparse.Namespace, nodes: list[str]) -> None:
     if options.missions != 1:
         raise ParameterError(f"--missions {options.missions}: expected 1 with --vehicle {options.vehicle}")
     if "bridge" in nodes:
-        vehicles.check(options.vehicle, options.connect or "", options.datum or "", options.arm)
+        datums.parse(options.datum or "", scenario, options.vehicle, arm=options.arm)
+        vehicles.check(options.vehicle, options.connect or "", options.arm)
 
 
 def check_writable(summary: Path, bag: Path | None) -> None:

@@ -16,6 +16,7 @@ import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.signals import SignalHandlerOptions
 
+from uav_dc_ros import cli
 from uav_dc_ros.errors import ParameterError, UavDcError
 from uav_dc_ros.nodes import fastdds, usage
 from uav_dc_ros.nodes.executor import DirectExecutor
@@ -31,7 +32,7 @@ GAVE_UP = 3
 
 
 class Stopper:
-    """Turns SIGINT, SIGTERM and, under run_all, the end of standard input into a wish to stop.
+    """Turns SIGINT, SIGTERM, SIGHUP and, under run_all, the end of standard input into a wish to stop.
 
     A waiting executor sleeps in C, where Python's handlers do not run: signals arrive through a file
     descriptor in a thread that wakes it.
@@ -43,8 +44,7 @@ class Stopper:
         self._ours, theirs = socket.socketpair()
         theirs.setblocking(False)
         self._theirs = theirs
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: None)
+        cli.on_stop(lambda *_: None)
         signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         threading.Thread(target=self._watch, daemon=True).start()
 
@@ -97,6 +97,7 @@ def main(
         executor = DirectExecutor(rest_s)
         for node in nodes:
             executor.add_node(node)
+            node.serve = executor.spin_once
         stopper = Stopper(executor.wake)
         if _begin([node for node in nodes if node.values["autostart"]]):
             gc.freeze()  # what is there by now stays: no need to look at it again and again

@@ -33,7 +33,7 @@ from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
 from uav_dc_ros.nodes.parameters import EXTERNAL
 from uav_dc_ros.nodes.surroundings import Surroundings
-from uav_dc_ros.nodes.table import WORLD_AROUND
+from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
 
 STALL_S = 1.0  # a lockstep that stands still for so long repeats its last messages
 CONFIRM_S = 1.0  # a lockstep waits for who hears of it no longer than so
@@ -62,8 +62,9 @@ class World(MissionNode):
         self.scenario = scenarios.load(self.values["scenario"])
         self.pace: float | None = self.values["pace"]
         self.surroundings: Surroundings | None = None
-        if self.values["vehicle"] == EXTERNAL:
-            self.row = WORLD_AROUND
+        is_around = self.values["vehicle"] == EXTERNAL
+        self.row = WORLD_AROUND if is_around else NODES["world"]
+        if is_around:
             self.surroundings = Surroundings(self.scenario, self.values["seed"])
         else:
             pace.check(self.scenario, self.pace, self.values["missions"])

@@ -16,13 +16,16 @@ from uav_dc_ros.nodes.vehicles.mavros import Mavros
 from uav_dc_ros.nodes.vehicles.px4 import Px4, load_messages
 
 
-def make(node: Node, values: Mapping[str, Any], scenario: Scenario, anchor: str) -> Vehicle:
+def make(
+    node: Node, values: Mapping[str, Any], scenario: Scenario, datum: Geodetic | None, anchor: str
+) -> Vehicle:
     """The vehicle that a bridge's parameters name; not opened yet.
 
     Args:
         node: of the bridge, for ways that are made of topics.
         values: its parameters.
         scenario: whose start the vehicle stands under, unless there is a datum.
+        datum: of the grid; None: see `scenario`.
         anchor: of the same vehicle before the bridge was started again; empty: there was none.
 
     Raises:
@@ -31,9 +34,8 @@ def make(node: Node, values: Mapping[str, Any], scenario: Scenario, anchor: str)
     """
     east_m, north_m, _ = scenario.mission.start_m
     place = Enu(east_m, north_m, 0.0)
-    datum = Geodetic.parse(values["datum"]) if values["datum"] else None
     kind, connect = values["vehicle"], values["connect"]
-    check(kind, connect, values["datum"], values["arm"])
+    check(kind, connect, values["arm"])
     if kind == "mavlink":
         return Mavlink(connect, datum=datum, place=place, anchor=anchor)
     if kind == "mavros":
@@ -41,15 +43,13 @@ def make(node: Node, values: Mapping[str, Any], scenario: Scenario, anchor: str)
     return Px4(node, place=place, anchor=anchor, datum=datum)
 
 
-def check(kind: str, connect: str, datum: str, arm: bool) -> None:
-    """Refuse a way that this machine does not have, or cannot arm by; an address or datum that is none.
+def check(kind: str, connect: str, arm: bool) -> None:
+    """Refuse a way that this machine does not have, or cannot arm by; an address that is none.
 
     Raises:
         VehicleError: what was wrong.
         ParameterError: an address where none belongs, or none where one is needed.
     """
-    if datum:
-        Geodetic.parse(datum)
     if kind != "mavlink" and connect:
         raise ParameterError(f"connect: {connect!r}; expected none with a vehicle on {kind}")
     if kind == "mavlink":

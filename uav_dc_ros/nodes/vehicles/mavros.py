@@ -26,7 +26,7 @@ from sensor_msgs.msg import (  # type: ignore[import-untyped, unused-ignore]
     NavSatStatus,
 )
 
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.convert import FRAME, position_m, stamp_ns
@@ -36,12 +36,15 @@ from uav_dc_ros.nodes.vehicles.mavros_hearing import (
     ESTIMATOR_STATUS,
     EXTENDED_STATE,
     FIX,
+    HOME,
     POSE,
     STALE_S,
     STATE,
     SYS_STATUS,
+    TARGET,
     Hearing,
 )
+from uav_dc_ros.nodes.vehicles.rivals import Rivals
 from uav_dc_ros.nodes.vehicles.stream import Stream
 
 SETPOINT = "mavros/setpoint_position/local"
@@ -89,14 +92,14 @@ class Mavros:
         self._node = node
         self._package = mavros_messages.load(needed_for="arming" if arms else "")
         self._hearing = Hearing(place, datum, anchor, full=self._package is not None)
-        self._restarted = bool(anchor)
+        self._rivals = Rivals(node, restarted=bool(anchor))
         self._yaw_rad: float | None = None
         self._stream: Stream[Target] = Stream(self._publish, "mavros")
         self._publisher: Any = None
         self._subscriptions: dict[str, Any] = {}
         self._commands: Commands | None = None
         self._closed = False
-        self._looked_s = -math.inf  # when others were looked for last, and what is wrong with them
+        self._looked_s = -math.inf  # when the graph was looked at last, and what is wrong with it
         self._wrong: str | None = None
 
     def open(self) -> None:
@@ -120,6 +123,8 @@ class Mavros:
             self._hear(
                 package.estimator_status, ESTIMATOR_STATUS, _timed(hearing.on_estimator_status), SEVERAL
             )
+            self._hear(package.home, HOME, lambda home, _: hearing.on_home(home), SEVERAL)
+            self._hear(package.target, TARGET, lambda target, _: hearing.on_target(target), NEWEST)
             commands = self._commands
             self._hear(package.statustext, STATUSTEXT, lambda text, _: commands.on_statustext(text), SEVERAL)
         self._stream.start()
@@ -141,6 +146,11 @@ class Mavros:
         return self._hearing.dialect.name if self._hearing.dialect else ""
 
     @property
+    def datum(self) -> Geodetic | None:
+        """Where on the Earth the grid's corner lies, of altitude 0 unless it was given; None: not known."""
+        return self._hearing.corner
+
+    @property
     def anchor(self) -> str:
         """Where MAVROS counts from, in the grid's frame: EAST,NORTH,UP, metres; empty until it is known."""
         origin = self._hearing.origin
@@ -155,11 +165,14 @@ class Mavros:
         )
         if hearing.armed:
             self._commands.granted("arming")
-        known = hearing.telemetry(now_s, self._commands.refusal, self._commands.said)
-        if known.missing is not None or self._restarted:
+        known = dataclasses.replace(
+            hearing.telemetry(now_s, self._commands.refusal, self._commands.said),
+            other_controller=self._rivals.on(self._publisher.topic_name),
+        )
+        if known.missing is not None:
             return known
         if now_s - self._looked_s >= LOOK_S:
-            self._looked_s, self._wrong = now_s, self._others()
+            self._looked_s, self._wrong = now_s, self._graph_problem()
         return dataclasses.replace(known, missing=self._wrong)
 
     def steer(self, setpoint: Enu | None) -> None:
@@ -199,9 +212,9 @@ class Mavros:
         except MessageError as error:
             self._hearing.on_bad_pose(str(error))
             return
-        self._hearing.on_pose(
-            local, _yaw_rad(message), stamp_ns(message.header.stamp) * 1e-9, _arrived_s(info)
-        )
+        q = message.pose.orientation
+        stamp_s, tilt = stamp_ns(message.header.stamp) * 1e-9, tilt_rad(q.w, q.x, q.y, q.z)
+        self._hearing.on_pose(local, _yaw_rad(message), stamp_s, _arrived_s(info), tilt)
 
     def _on_diagnostics(self, message: DiagnosticArray, info: Any) -> None:
         now_s = _arrived_s(info)
@@ -216,17 +229,13 @@ class Mavros:
         has_fix = message.status.status >= NavSatStatus.STATUS_FIX
         self._hearing.on_fix(has_fix, message.latitude, message.longitude, _arrived_s(info))
 
-    def _others(self) -> str | None:
-        """Who else publishes the same, or that nobody hears setpoints; None: all is well.
-
-        The graph remembers a bridge that was killed in the air for a while: its successor does not ask.
-        """
+    def _graph_problem(self) -> str | None:
+        """That nobody hears setpoints, or that there are two vehicles; None: all is well."""
         if self._publisher.get_subscription_count() == 0:
             return f"nobody hears {self._publisher.topic_name}; expected MAVROS to"
-        names = {"vehicle": self._subscriptions[POSE].topic_name, "bridge": self._publisher.topic_name}
-        for what, topic in names.items():
-            if (count := self._node.count_publishers(topic)) > 1:
-                return f"{count} nodes publish {topic}; expected one {what} only"
+        poses = self._subscriptions[POSE].topic_name
+        if (count := self._node.count_publishers(poses)) > 1:
+            return f"{count} nodes publish {poses}; expected one vehicle only"
         return None
 
     # The stream: in a thread of its own.

@@ -52,6 +52,11 @@ class Diagnostics:
         self._beats, self._listened = 0, 0
         self._stranger: str | None = None
 
+    @property
+    def source(self) -> str:
+        """Whom it listens to: MAVROS's node and link; empty: nobody yet."""
+        return "{} ({})".format(*self._source) if self._source else ""
+
     def on_status(self, name: str, link: str, values: Mapping[str, str], now_s: float) -> None:
         """A status of anybody's diagnostics: its name, its hardware, and its values."""
         node, _, task = name.rpartition(": ")

@@ -5,8 +5,10 @@ With mavros_msgs, its mode, and whether it is armed and stands, come from `mavro
 known, with mavros_msgs or without.
 """
 
+import contextlib
 import math
 import re
+from collections import Counter
 from typing import Any
 
 from uav_dc_ros.autopilot.dialects import (
@@ -25,9 +27,11 @@ from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.nodes.vehicles.mavros_diagnostics import Diagnostics
 from uav_dc_ros.nodes.vehicles.mavros_time import VehicleTime
+from uav_dc_ros.nodes.vehicles.order import Order
 
 POSE, FIX = "mavros/local_position/pose", "mavros/global_position/global"
 STATE, EXTENDED_STATE = "mavros/state", "mavros/extended_state"
+HOME, TARGET = "mavros/home_position/home", "mavros/setpoint_raw/target_local"
 SYS_STATUS, ESTIMATOR_STATUS = "mavros/sys_status", "mavros/estimator_status"
 ESTIMATOR_FLAGS = (  # fields of EstimatorStatus: the bits of ESTIMATOR_STATUS_FLAGS, from the least on
     *("attitude", "velocity_horiz", "velocity_vert", "pos_horiz_rel", "pos_horiz_abs", "pos_vert_abs"),
@@ -36,6 +40,7 @@ ESTIMATOR_FLAGS = (  # fields of EstimatorStatus: the bits of ESTIMATOR_STATUS_F
 )
 CUSTOM_MODE = re.compile(r"CMODE\((\d+)\)")  # how MAVROS writes a mode that it has no name for
 AHRS = 1 << 21  # MAV_SYS_STATUS_AHRS
+NO_POSITION = 7  # PositionTarget.IGNORE_PX, IGNORE_PY, IGNORE_PZ
 NO_VOLTAGE = 65.535  # MAVLink's UINT16_MAX millivolts
 
 STALE_S = 3.0  # age after which the last report on an estimate says nothing
@@ -57,6 +62,8 @@ class Hearing:
         yaw_rad: of the vehicle, counter-clockwise from the east.
         heard: when something last came on each topic.
         diagnostics: what MAVROS tells there.
+        corner: of the grid on the Earth; of unknown altitude, unless there is a datum; None: not known yet.
+        discarded: messages that were ignored, by reason.
 
     Raises:
         VehicleError: the anchor is none.
@@ -79,6 +86,12 @@ class Hearing:
         self._fix: Geodetic | None = None
         self._batteries: dict[str, tuple[float | None, float | None]] = {}  # charge, volts
         self._time = VehicleTime()
+        self._order = Order()
+        self._tilt_rad: float | None = None
+        self._home: Enu | None = None  # in MAVROS's frame, as the next
+        self._target: Enu | None = None
+        self.corner = datum
+        self.discarded: Counter[str] = Counter()
 
     @property
     def dialect(self) -> Dialect | None:
@@ -125,9 +138,13 @@ class Hearing:
     @property
     def position(self) -> Enu | None:
         """In the grid's frame."""
-        if self.origin is None or self._local is None:
+        return self._in_grid(self._local)
+
+    def _in_grid(self, local: Enu | None) -> Enu | None:
+        """A position in MAVROS's frame, in the grid's."""
+        if self.origin is None or local is None:
             return None
-        return Enu(*(o + p for o, p in zip(self.origin, self._local, strict=True)))
+        return Enu(*(o + p for o, p in zip(self.origin, local, strict=True)))
 
     def to_mavros(self, position: Enu) -> Enu:
         """A position of the grid, as MAVROS's local ENU; the origin must be known."""
@@ -163,6 +180,11 @@ class Hearing:
             missing=self._missing(now_s),
             refusal=refusal,
             said=said,
+            home=self._in_grid(self._home),
+            target=self._in_grid(self._target),
+            tilt_rad=self._tilt_rad,
+            system=self.diagnostics.source,
+            discarded=dict(self.discarded),
         )
 
     def wanted(self) -> list[str]:
@@ -231,16 +253,29 @@ class Hearing:
             here = Enu(east_m, north_m, self.place.up_m)
         self.origin = Enu(*(h - p for h, p in zip(here, self._local, strict=True)))
 
+    def _find_corner(self, now_s: float) -> None:
+        """Find out where the grid lies on the Earth, from a fix of a vehicle that stands."""
+        fix, position = self._fix, self.position
+        if self.corner is not None or fix is None or position is None or self.landed_state != ON_GROUND:
+            return
+        if now_s - self.heard[FIX] <= FIX_S:
+            with contextlib.suppress(VehicleError):  # who has no datum needs no Earth
+                self.corner = fix.at(Enu(-position.east_m, -position.north_m, 0.0))
+
     # What it says: standard messages.
 
-    def on_pose(self, local: Enu, yaw_rad: float, stamp_s: float, now_s: float) -> None:
+    def on_pose(
+        self, local: Enu, yaw_rad: float, stamp_s: float, now_s: float, tilt_rad: float | None = None
+    ) -> None:
         """A pose in MAVROS's local frame; `now_s`: when it arrived."""
-        if not self._time.is_news(stamp_s):
-            return  # the same again
+        if (why := self._order.refusal(stamp_s, now_s)) is not None:
+            self.discarded[why] += 1
+            return
         self._time.hear(stamp_s, now_s)
         self.heard[POSE] = now_s
-        self._local, self.yaw_rad, self._refused = local, yaw_rad, ""
+        self._local, self.yaw_rad, self._tilt_rad, self._refused = local, yaw_rad, tilt_rad, ""
         self._anchor(now_s)
+        self._find_corner(now_s)
 
     def on_bad_pose(self, why: str) -> None:
         """A pose that nobody flies by, and why."""
@@ -248,10 +283,11 @@ class Hearing:
 
     def on_fix(self, has_fix: bool, latitude_deg: float, longitude_deg: float, now_s: float) -> None:
         """Where the autopilot's estimate is on the Earth. Its altitude (above the ellipsoid) is not used."""
-        if self.datum is not None and has_fix and math.isfinite(latitude_deg + longitude_deg):
+        if has_fix and math.isfinite(latitude_deg + longitude_deg):
             self.heard[FIX] = now_s
+            altitude_m = self.datum.altitude_m if self.datum is not None else 0.0
             self._fix = Geodetic(
-                latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=self.datum.altitude_m
+                latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=altitude_m
             )
 
     def on_battery(self, where: str, charge: float, volts: float) -> None:
@@ -281,6 +317,20 @@ class Hearing:
         self.heard[ESTIMATOR_STATUS] = now_s
         flags = (getattr(status, f"{name}_status_flag") for name in ESTIMATOR_FLAGS)
         self._flags = sum(1 << bit for bit, flag in enumerate(flags) if flag)
+
+    def on_home(self, home: Any) -> None:
+        """HomePosition: its `position` is in MAVROS's frame."""
+        self._home = _finite(home.position)
+
+    def on_target(self, target: Any) -> None:
+        """PositionTarget that the autopilot follows."""
+        self._target = None if target.type_mask & NO_POSITION else _finite(target.position)
+
+
+def _finite(point: Any) -> Enu | None:
+    """A geometry_msgs/Point; None: it is none."""
+    position = Enu(point.x, point.y, point.z)
+    return position if all(map(math.isfinite, position)) else None
 
 
 def parse_anchor(text: str) -> Enu:

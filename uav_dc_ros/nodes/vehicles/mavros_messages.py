@@ -16,7 +16,7 @@ class MavrosMsgs:
     """Its messages and services, as far as they are used.
 
     Attributes:
-        state, extended_state, sys_status, estimator_status, statustext: classes of messages.
+        state, extended_state, sys_status, estimator_status, statustext, home, target: classes of messages.
         set_mode, command_bool, command_tol, message_interval: classes of services.
     """
 
@@ -25,6 +25,8 @@ class MavrosMsgs:
     sys_status: Any
     estimator_status: Any
     statustext: Any
+    home: Any
+    target: Any
     set_mode: Any
     command_bool: Any
     command_tol: Any
@@ -54,6 +56,8 @@ def load(*, needed_for: str = "") -> MavrosMsgs | None:
             sys_status=messages.SysStatus,
             estimator_status=messages.EstimatorStatus,
             statustext=messages.StatusText,
+            home=messages.HomePosition,
+            target=messages.PositionTarget,
             set_mode=services.SetMode,
             command_bool=services.CommandBool,
             command_tol=services.CommandTOL,

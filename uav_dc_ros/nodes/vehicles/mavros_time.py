@@ -2,8 +2,8 @@
 
 import math
 
-LEAP_S = 1.0  # further than its pace explains: MAVROS has found another offset between the clocks
-FASTEST = 100.0  # times as fast as the clock
+from uav_dc_ros.nodes.vehicles.order import FASTEST, LEAP_S
+
 PATIENCE_S = 0.5  # without a stamp, after which time goes on at the clock's pace
 
 
@@ -17,10 +17,6 @@ class VehicleTime:
     def __init__(self) -> None:
         self._time_s, self._told_s = 0.0, 0.0
         self._stamp_s, self._heard_s = math.nan, math.nan
-
-    def is_news(self, stamp_s: float) -> bool:
-        """Is this another moment than that of the last stamp."""
-        return stamp_s != self._stamp_s or stamp_s == 0.0
 
     def hear(self, stamp_s: float, now_s: float) -> None:
         """Take in a stamp that came at a steady time, seconds."""

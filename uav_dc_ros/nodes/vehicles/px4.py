@@ -1,8 +1,7 @@
 """PX4 over uXRCE-DDS: hears its topics, passes wishes on, streams setpoints. It decides nothing.
 
-A thread of its own streams, so that the stream keeps its pace whatever the node's callbacks do. It ends
-`LIFE_S` after the last call of `steer`, and while no position has come for `POSE_S` that PX4 trusts; then its
-own failsafe takes over (COM_OF_LOSS_T, COM_OBL_RC_ACT), as it does when the process is gone.
+The stream (see there) also ends while no position has come for `POSE_S` that PX4 trusts; then PX4's own
+failsafe takes over (COM_OF_LOSS_T, COM_OBL_RC_ACT), as it does when the process is gone.
 
 What is sent has the time 0: PX4 puts that of its arrival there, so nobody has to agree about clocks.
 """
@@ -16,18 +15,17 @@ import time
 from functools import partial
 from typing import Any
 
-from rclpy.exceptions import InvalidHandle
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uav_dc_ros.autopilot import dialects
-from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S, STREAM_VEHICLE_S, following
+from uav_dc_ros.autopilot.beat import STREAM_VEHICLE_S
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned
-from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.nodes.vehicles.px4_hearing import COMPANION, Px4Hearing
+from uav_dc_ros.nodes.vehicles.rivals import Rivals
+from uav_dc_ros.nodes.vehicles.stream import Stream
 
 POSE_S = 0.5
 LOOK_S = 1.0  # between two looks at which topics there are
@@ -42,6 +40,8 @@ HEARD = {  # in fmu/out
     "battery_status": "BatteryStatus",
     "failsafe_flags": "FailsafeFlags",
     "vehicle_command_ack": "VehicleCommandAck",
+    "vehicle_attitude": "VehicleAttitude",
+    "home_position": "HomePosition",
 }
 NEEDED = ("vehicle_status", "vehicle_local_position")  # PX4 1.15 does not send all of the others
 SENT = {  # in fmu/in
@@ -94,21 +94,18 @@ class Px4:
         self._messages = load_messages()
         self._node = node
         self._hearing = Px4Hearing(place=place, anchor=anchor, datum=datum)
-        self._changed = threading.Condition()  # its lock is that of all below, and of `_hearing`
-        self._setpoint: Enu | None = None
-        self._alive_s = -math.inf  # last sign of life of those who decide
+        self._lock = threading.Lock()  # of all below, and of `_hearing`
         self._streamed_vehicle_s = 0.0
-        self._urgent = False
         self._sent: Ned | None = None
         heartbeat = self._class("offboard_control_mode")()
         heartbeat.position = True
-        self._stream = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
+        self._messages_sent = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
         self._silent = set(NEEDED)
         self._looked_s, self._seen = -math.inf, ""
-        self._ended = False
+        self._rivals = Rivals(node, restarted=bool(anchor))
         self._subscriptions: list[Any] = []
         self._publishers: dict[str, Any] = {}
-        self._thread = threading.Thread(target=self._run, name="px4", daemon=True)
+        self._stream: Stream[Enu] = Stream(self._send, "px4")
 
     def open(self) -> None:
         """Begin to listen."""
@@ -120,15 +117,11 @@ class Px4:
             )
         for name in SENT:
             self._publishers[name] = self._node.create_publisher(self._class(name), self._topic(name), QOS)
-        self._thread.start()
+        self._stream.start()
 
     def close(self) -> None:
         """End the stream, and hear no more; more than once is as good as once."""
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._stream.stop()
         while self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop())
         while self._publishers:
@@ -137,19 +130,27 @@ class Px4:
     @property
     def kind(self) -> str:
         """Name of the autopilot; empty until it has spoken."""
-        with self._changed:
+        with self._lock:
             return dialects.PX4.name if self._hearing.status is not None else ""
+
+    @property
+    def datum(self) -> Geodetic | None:
+        """Where on the Earth the grid's corner lies; None: not known."""
+        with self._lock:
+            return self._hearing.datum
 
     @property
     def anchor(self) -> str:
         """Where the grid lies: its datum, or else PX4's origin in it; empty until it is known."""
-        with self._changed:
+        with self._lock:
             return self._hearing.anchor
 
     def telemetry(self) -> Telemetry:
         """What is known of the vehicle now, times as of `time.monotonic`."""
-        with self._changed:
+        with self._lock:
             known, silent = self._hearing.telemetry(), [name for name in NEEDED if name in self._silent]
+        setpoints = self._publishers["trajectory_setpoint"].topic_name
+        known = dataclasses.replace(known, other_controller=self._rivals.on(setpoints))
         if not silent:
             return known
         topics = ", ".join(self._topic(name) for name in silent)
@@ -157,10 +158,7 @@ class Px4:
 
     def steer(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
-        with self._changed:
-            if setpoint != self._setpoint:
-                self._hurry()
-            self._setpoint, self._alive_s = setpoint, time.monotonic()
+        self._stream.steer(setpoint)
 
     def ask(self, wish: Wish) -> None:
         """Pass a wish on, once; whether it was fulfilled, `telemetry` tells. PX4 takes off by setpoints."""
@@ -184,11 +182,12 @@ class Px4:
         return versioned(f"fmu/{'out' if name in HEARD else 'in'}/{name}", self._class(name))
 
     def _hear(self, name: str, message: Any) -> None:
-        with self._changed:
+        with self._lock:
             self._silent.discard(name)
-            getattr(self._hearing, f"on_{name}")(message, time.monotonic())
-            if self._hearing.vehicle_s - self._streamed_vehicle_s >= STREAM_VEHICLE_S:
-                self._hurry()
+            self._hearing.hear(name, message, time.monotonic())
+            hurry = self._hearing.vehicle_s - self._streamed_vehicle_s >= STREAM_VEHICLE_S
+        if hurry:
+            self._stream.hurry()
 
     def _others(self, silent: list[str]) -> str:
         """What a PX4 of another release publishes instead, in words."""
@@ -219,49 +218,21 @@ class Px4:
         message.from_external = True
         self._publishers["vehicle_command"].publish(message)
 
-    def _hurry(self) -> None:
-        """Have the stream go on before its next beat."""
-        self._urgent = True
-        self._changed.notify()
-
-    def _run(self) -> None:
-        run_when_due()
-        due_s = time.monotonic()
-        while True:
-            with self._changed:
-                while not (self._ended or self._urgent or (left_s := due_s - time.monotonic()) <= 0):
-                    self._changed.wait(left_s)
-                if self._ended:
-                    return
-                now_s = time.monotonic()
-                self._urgent, self._streamed_vehicle_s = False, self._hearing.vehicle_s
-                ned = self._wanted(now_s)
-            if now_s >= due_s:
-                due_s = following(due_s, STREAM_S, now_s)
-            try:
-                if ned is not None:
-                    self._send(ned)
-            except (InvalidHandle, _rclpy.RCLError):
-                if self._node.context.ok():
-                    raise
-                return  # ROS has been shut down under it
-
-    def _wanted(self, now_s: float) -> Ned | None:
-        """The setpoint to be sent now, in PX4's frame; None: there is none, or nobody may fly by it."""
-        hearing = self._hearing
-        if self._setpoint is None or hearing.frame is None or hearing.position_s is None:
-            return None
-        if now_s - self._alive_s > LIFE_S or now_s - hearing.position_s > POSE_S:
-            return None
-        return hearing.frame.to_autopilot(self._setpoint)
-
-    def _send(self, ned: Ned) -> None:
-        """Send a setpoint, then the heartbeat that has PX4 follow it."""
+    def _send(self, setpoint: Enu) -> None:
+        """Send a setpoint, then the heartbeat that has PX4 follow it: the stream's thread."""
+        with self._lock:
+            hearing = self._hearing
+            self._streamed_vehicle_s = hearing.vehicle_s
+            if hearing.frame is None or hearing.position_s is None:
+                return
+            if time.monotonic() - hearing.position_s > POSE_S:
+                return
+            ned = hearing.frame.to_autopilot(setpoint)
         if ned != self._sent:  # made anew only then: the less there is to do, the better the pace
-            setpoint, self._sent = self._class("trajectory_setpoint")(), ned
-            setpoint.position = list(ned)
-            setpoint.velocity = setpoint.acceleration = setpoint.jerk = NOT_CONTROLLED
-            setpoint.yaw = setpoint.yawspeed = math.nan
-            self._stream["trajectory_setpoint"] = setpoint
-        for name, message in self._stream.items():
+            message, self._sent = self._class("trajectory_setpoint")(), ned
+            message.position = list(ned)
+            message.velocity = message.acceleration = message.jerk = NOT_CONTROLLED
+            message.yaw = message.yawspeed = math.nan
+            self._messages_sent["trajectory_setpoint"] = message
+        for name, message in self._messages_sent.items():
             self._publishers[name].publish(message)

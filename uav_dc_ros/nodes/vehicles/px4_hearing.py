@@ -4,18 +4,21 @@ Positions are in PX4's local NED here, and nowhere beyond.
 """
 
 import math
+from collections import Counter
 from typing import Any
 
 from uav_dc_ros.autopilot.dialects import COPTERS
-from uav_dc_ros.autopilot.frames import Enu, Geodetic, LocalFrame, Ned, to_enu
+from uav_dc_ros.autopilot.frames import Enu, Geodetic, LocalFrame, Ned, tilt_rad, to_enu
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
 from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.nodes.vehicles.order import Order
 
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: as whom commands are sent, so that answers are told apart
 CLOCK_S = 10.0  # between two messages; a longer time, or one back, is of another clock
 LOCAL = "local:"  # before an anchor of a vehicle that does not know where on the Earth it is
 
 ARMED = 2  # ARMING_STATE
+BATTERY_LOW = 1  # BATTERY_WARNING; what is above is worse
 ACCEPTED, IN_PROGRESS = 0, 5  # VEHICLE_CMD_RESULT
 RESULTS = {1: "temporarily rejected", 2: "denied", 3: "unsupported", 4: "failed", 6: "cancelled"}
 COMMANDS = {20: "returning", 21: "landing", 176: "the change of mode", 400: "arming"}  # VEHICLE_CMD
@@ -46,6 +49,7 @@ MODE_NAMES = {
     20: "AUTO_PRECLAND",
     21: "ORBIT",
 }
+ORDERED = {"vehicle_status", "vehicle_local_position", "vehicle_land_detected", "vehicle_attitude"}
 WHY = (  # of failsafe_flags: what keeps PX4 from OFFBOARD, or from arming
     "angular_velocity_invalid",
     "attitude_invalid",
@@ -74,6 +78,7 @@ class Px4Hearing:
         status: the last VehicleStatus; None: none came yet.
         position_s: when the last position came that PX4 trusted, steady time, seconds.
         vehicle_s: the vehicle's own time, seconds.
+        discarded: messages that were ignored, by reason.
     """
 
     def __init__(self, *, place: Enu, anchor: str = "", datum: Geodetic | None = None) -> None:
@@ -91,7 +96,11 @@ class Px4Hearing:
         self._sure = False
         self._status_s: float | None = None
         self._landed: bool | None = None
-        self._charge: dict[int, float] = {}  # by number of the battery
+        self._batteries: dict[int, tuple[float, float, bool]] = {}  # by number: charge, volts, does it fail
+        self._tilt_rad: float | None = None
+        self._home: Ned | None = None
+        self._orders = {name: Order() for name in ORDERED}
+        self.discarded: Counter[str] = Counter()
         self._flags: Any = None
         self._refusals: dict[str, str] = {}  # by what was refused, the latest at the end
         self._stamp_us = 0
@@ -115,6 +124,7 @@ class Px4Hearing:
             mode = MODES.get(status.nav_state, Mode.OTHER)
             name = MODE_NAMES.get(status.nav_state, f"nav_state {status.nav_state}")
             name += " (failsafe)" if status.failsafe else ""
+        charge, volts, fails = min(self._batteries.values(), default=(None, None, False))
         return Telemetry(
             heartbeat_s=self._status_s,
             mode=mode,
@@ -124,13 +134,35 @@ class Px4Hearing:
             position=self._position,
             position_s=self.position_s,
             estimate_ok=self._sure,
-            battery=min(self._charge.values(), default=None),
+            battery=charge,
+            battery_v=volts or None,
+            battery_fails=fails,
             vehicle_s=self.vehicle_s,
             missing=self._missing(),
             refusal=self._refusal(),
+            home=self.frame.from_autopilot(self._home) if self.frame and self._home else None,
+            tilt_rad=self._tilt_rad,
+            system="" if status is None else f"system {status.system_id}",
+            discarded=dict(self.discarded),
         )
 
     # What it says.
+
+    def hear(self, name: str, message: Any, now_s: float) -> None:
+        """Take in a message of a topic, at a steady time, unless it is not this vehicle's or out of order."""
+        why = None
+        if (
+            name == "vehicle_status"
+            and self.status is not None
+            and message.system_id != self.status.system_id
+        ):
+            why = "of another system"
+        elif (order := self._orders.get(name)) is not None:
+            why = order.refusal(message.timestamp / 1e6, now_s)
+        if why is not None:
+            self.discarded[why] += 1
+            return
+        getattr(self, f"on_{name}")(message, now_s)
 
     def on_vehicle_status(self, message: Any, now_s: float) -> None:
         """Take in its state, at a steady time; likewise the others."""
@@ -155,11 +187,21 @@ class Px4Hearing:
         self._landed = bool(message.landed)
 
     def on_battery_status(self, message: Any, now_s: float) -> None:
-        """Take in the charge of one of its batteries."""
+        """Take in the state of one of its batteries."""
         if message.connected and message.remaining >= 0:
-            self._charge[message.id] = float(message.remaining)
+            fails = message.warning >= BATTERY_LOW
+            self._batteries[message.id] = float(message.remaining), float(message.voltage_v), fails
         else:
-            self._charge.pop(message.id, None)
+            self._batteries.pop(message.id, None)
+
+    def on_vehicle_attitude(self, message: Any, now_s: float) -> None:
+        """Take in how it is tilted."""
+        self._tilt_rad = tilt_rad(*map(float, message.q))
+
+    def on_home_position(self, message: Any, now_s: float) -> None:
+        """Take in where it returns to."""
+        ned = Ned(message.x, message.y, message.z)
+        self._home = ned if message.valid_lpos and all(map(math.isfinite, ned)) else None
 
     def on_failsafe_flags(self, message: Any, now_s: float) -> None:
         """Take in what it finds wrong with itself."""

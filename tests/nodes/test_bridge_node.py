@@ -1,0 +1,212 @@
+"""The bridge's node in this process, beside a vehicle whose telemetry a test says."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from std_msgs.msg import String
+
+from tests.conftest import Ros
+from tests.nodes.mavros_flight import node_in
+from uav_dc_ros import messages
+from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
+from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.messages import Phase
+from uav_dc_ros.nodes import bridge, datums, vehicles
+from uav_dc_ros.nodes.bridge import AutopilotBridge
+
+DATUM = Geodetic(latitude_deg=47.4, longitude_deg=8.5, altitude_m=400.0)
+FLIES = Telemetry(
+    position=Enu(0.0, 0.0, 100.0),
+    estimate_ok=True,
+    armed=True,
+    on_ground=False,
+    mode=Mode.COMMANDED,
+    mode_name="GUIDED",
+)
+
+
+class Stub:
+    """A vehicle without a link."""
+
+    kind = "ArduCopter"
+
+    def __init__(self) -> None:
+        self.known, self.datum = FLIES, None
+        self.asked: list[Wish] = []
+        self.setpoints: list[Enu | None] = []
+        self.opened = self.closed = 0
+        self.broken = ""
+
+    @property
+    def anchor(self) -> str:
+        return str(self.datum or "")
+
+    def open(self) -> None:
+        self.opened += 1
+        if self.broken == "open":
+            raise VehicleError("no such link")
+
+    def telemetry(self) -> Telemetry:
+        if self.broken == "telemetry":
+            raise VehicleError("the link is gone for good")
+        now_s = time.monotonic()
+        return replace(self.known, heartbeat_s=now_s, position_s=now_s)
+
+    def steer(self, setpoint: Enu | None) -> None:
+        self.setpoints.append(setpoint)
+
+    def ask(self, wish: Wish) -> None:
+        self.asked.append(wish)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class Made:
+    """The node, its vehicle, and what it publishes as `mission`."""
+
+    def __init__(self, node: AutopilotBridge, vehicle: Stub) -> None:
+        self.node, self.vehicle = node, vehicle
+        self.logged: list[str] = []
+
+    def until(self, done: Callable[[], object]) -> None:
+        for _ in range(2000):
+            if done():
+                return
+            self.node.serve(0.005)
+        raise AssertionError("this never came to be")
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Its diagnostics."""
+        return self.node.diagnose()[1]
+
+
+@pytest.fixture
+def made(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> Iterator[Made]:
+    """A bridge that waits for a lifecycle manager, with nobody else to wait for."""
+    vehicle = Stub()
+    monkeypatch.setattr(vehicles, "make", lambda *_: vehicle)
+    monkeypatch.setattr(bridge, "run_when_due", lambda: None)
+    monkeypatch.setenv("XDG_STATE_HOME", str(ros.folder / "state"))
+    with node_in(ros, "-p", "connect:=tcp:127.0.0.1:1", "-p", "peers:=[bridge]") as (_, executor):
+        node = AutopilotBridge()
+        node.serve = executor.spin_once
+        executor.add_node(node)
+        yield Made(node, vehicle)
+        if node.state != "finalized":
+            node.trigger_shutdown()
+        node.destroy_node()
+
+
+def activate(made: Made) -> None:
+    """Bring it up."""
+    made.node.trigger_configure()
+    made.node.trigger_activate()
+    assert made.node.state == "active"
+
+
+def test_the_vehicle_is_seen_obeying_while_the_bridge_stops(made: Made) -> None:
+    """The mode comes as a message, which somebody has to take meanwhile: as with MAVROS and PX4."""
+    node, vehicle = made.node, made.vehicle
+    vehicle.datum = DATUM
+    activate(made)
+    made.until(lambda: node._begun)
+    node.bridge.phase = Phase.READY
+    publisher = node.create_publisher(String, "mode", 1)
+
+    def obey(message: String) -> None:
+        vehicle.known = replace(FLIES, mode=Mode(message.data))
+
+    node.create_subscription(String, "mode", obey, 1)
+    made.until(lambda: publisher.get_subscription_count() == 1)
+    made.vehicle.ask = lambda wish: publisher.publish(String(data=wish.mode))  # type: ignore[method-assign]
+    node.trigger_deactivate()
+    assert node._known.mode is Mode.RETURN
+    assert node.bridge.is_done_with(node._known)
+    assert vehicle.closed == 1
+
+
+@pytest.mark.parametrize("broken", ["", "telemetry"])
+def test_what_was_opened_is_closed_once(made: Made, broken: str) -> None:
+    activate(made)
+    made.until(lambda: made.node._begun)
+    made.vehicle.broken = broken
+    made.node.trigger_deactivate()
+    assert (made.node.state, made.vehicle.opened, made.vehicle.closed) == ("inactive", 1, 1)
+    made.node.trigger_shutdown()
+    assert made.vehicle.closed == 1
+
+
+def test_what_fails_to_start_is_closed(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    made.vehicle.broken = "open"
+    made.node.trigger_configure()
+    made.node.trigger_activate()
+    assert (made.node.state, made.vehicle.closed) == ("inactive", 1)
+    made.vehicle.broken = ""
+
+    def refuse(*_: Any) -> None:
+        raise VehicleError("after it was opened")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(made.node, "_refuse_unknown", refuse)
+        made.node.trigger_activate()
+    assert (made.node.state, made.vehicle.opened, made.vehicle.closed) == ("inactive", 2, 2)
+    made.node.trigger_activate()
+    assert (made.node.state, made.vehicle.opened, made.vehicle.closed) == ("active", 3, 2)
+
+
+def test_a_vehicle_that_flies_where_no_grid_is_known_is_refused_at_once(made: Made) -> None:
+    made.vehicle.known = replace(FLIES, position=None, missing="the grid has no datum")
+    activate(made)
+    made.until(lambda: made.node.bridge.is_over)
+    told = made.node._told
+    assert told is not None
+    assert (told.phase, told.step) == (Phase.ABORTED, 0)
+    assert told.reason == "it flies, and where the grid lies is not known: expected datum last or LAT,LON,ALT"
+    assert made.vehicle.asked == [], "whoever flies it keeps it"
+    assert set(made.vehicle.setpoints) == {None}
+
+
+def test_who_else_is_there_and_what_was_ignored_is_in_the_diagnostics(made: Made) -> None:
+    made.vehicle.known = Telemetry(
+        system="system 7", other_controller="system 255 sends setpoints", discarded={"late": 2, "repeated": 1}
+    )
+    activate(made)
+    made.until(lambda: made.node._known.system)
+    warnings, values = made.node.diagnose()
+    assert "system 255 sends setpoints" in warnings
+    expected = {
+        "system": "system 7",
+        "other controller": "system 255 sends setpoints",
+        "discarded: late": "2",
+        "discarded: repeated": "1",
+    }
+    assert expected.items() <= values.items()
+
+
+def test_where_the_grid_lies_is_logged_and_kept_when_the_vehicle_takes_off(made: Made) -> None:
+    activate(made)
+    made.vehicle.known = Telemetry()
+    made.until(lambda: made.node._begun)
+    assert made.values["grid"] == ""
+    made.vehicle.datum = DATUM
+    made.until(lambda: made.values["grid"] == str(DATUM))
+    assert datums.last(made.node.scenario) is None, "nothing has flown yet"
+    made.node.bridge.phase = Phase.TAKEOFF
+    made.node._on_change()
+    kept = datums.last(made.node.scenario)
+    assert kept is not None
+    assert (kept.datum, kept.vehicle) == (str(DATUM), "mavlink")
+
+
+def test_steps_that_were_not_reached_are_told(made: Made) -> None:
+    activate(made)
+    made.node.bridge.__dict__["steps_not_reached"] = 3
+    made.node._tell()
+    assert isinstance(made.node._told, messages.Mission)
+    assert made.node._told.steps_not_reached == 3

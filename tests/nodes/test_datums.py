@@ -1,0 +1,110 @@
+"""Where the grid lay in the last flight: kept, offered, and compared with."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from uav_dc_ros import run_all, scenarios
+from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.errors import NodeError, ParameterError, VehicleError
+from uav_dc_ros.nodes import datums, options
+
+FIVE, THREE = scenarios.load("five_clusters"), scenarios.load("three_clusters")
+DATUM = Geodetic(latitude_deg=-35.363261, longitude_deg=149.16523, altitude_m=584.0)
+FLIGHT = r"-35\.363261,149\.16523,584\.0 \(flight of five_clusters, 20\d\d-.*\+00:00\)"
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A state folder of this test's own."""
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def check(*given: str) -> None:
+    """What run_all checks of the options of a vehicle."""
+    wanted = run_all.parser().parse_args(["--vehicle", "mavlink", "--connect", "tcp:127.0.0.1:1", *given])
+    options.check_vehicle(wanted, ["bridge"], FIVE)
+
+
+def test_a_datum_with_a_minus_is_a_value() -> None:
+    for words in (["--datum", "-35.36,149.16,584"], ["--datum=-35.36,149.16,584"]):
+        assert run_all.parser().parse_args(words).datum == "-35.36,149.16,584"
+    check("--datum", "-35.36,149.16,584", "--arm")
+
+
+def test_who_arms_says_where_the_grid_lies() -> None:
+    expected = r"arm: without a datum; expected one with it: here \(.*\), last \(.*\) or LAT,LON,ALT"
+    with pytest.raises(ParameterError, match=f"{expected}$"):
+        check("--arm")
+    datums.keep(FIVE, DATUM, "mavlink")
+    with pytest.raises(ParameterError, match=f"{expected}; the last flight's: {FLIGHT}$"):
+        check("--arm")
+    for given in ((), ("--arm", "--datum", "here"), ("--arm", "--datum", "last")):
+        check(*given)
+    with pytest.raises(VehicleError, match="datum: '47,8'; expected LATITUDE,LONGITUDE,ALTITUDE"):
+        check("--datum", "47,8")
+
+
+def test_the_last_flight_s_is_that_of_the_same_world() -> None:
+    assert datums.last(FIVE) is None
+    with pytest.raises(ParameterError, match=r"'last'; no flight in this world .* is kept in .*datums"):
+        check("--datum", "last")
+    datums.keep(FIVE, DATUM, "mavlink")
+    datums.keep(THREE, DATUM.at(Enu(10.0, 0.0, 0.0)), "px4")
+    assert datums.parse("last", FIVE, "px4") == DATUM
+    assert datums.parse("last", THREE, "mavlink") != DATUM
+    for here in ("here", ""):
+        assert datums.parse(here, FIVE, "mavlink") is None
+
+
+def test_a_flight_through_mavros_has_no_altitude_for_the_others() -> None:
+    datums.keep(FIVE, DATUM, "mavros")
+    assert datums.parse("last", FIVE, "mavros") == DATUM
+    with pytest.raises(ParameterError, match=f"reports no altitude above mean sea level: {FLIGHT}; expected"):
+        datums.parse("last", FIVE, "mavlink")
+
+
+def test_a_grid_that_moves_is_seen() -> None:
+    told, moved = datums.described(DATUM, "here", FIVE)
+    assert (moved, told) == (
+        False,
+        f"the grid's corner lies at {DATUM}, from where the vehicle stands; no earlier flight in this world "
+        "is kept",
+    )
+    datums.keep(FIVE, DATUM, "mavlink")
+    told, moved = datums.described(DATUM.at(Enu(200.0, -200.0, 0.0)), "here", FIVE)
+    assert moved
+    assert re.search(r"; 200\.0 m east and 200\.0 m south of that of the last flight \(20", told)
+    told, moved = datums.described(DATUM, "last", FIVE)
+    assert not moved
+    assert ", as in the last flight; 0.0 m east and 0.0 m north of that" in told
+
+
+def test_a_broken_file_is_told_and_stops_nobody_who_names_the_place(state: Path) -> None:
+    datums.keep(FIVE, DATUM, "mavlink")
+    (file,) = state.rglob("*.json")
+    for broken in (b"", b"{}", b'{"scenario": "x", "datum": "x", "vehicle": "x", "time": "x"}', b"\xff"):
+        file.write_bytes(broken)
+        with pytest.raises(ParameterError, match=f"datum of the last flight, {file}: .*; expected it whole"):
+            check("--datum", "last")
+        assert datums.described(DATUM, "here", FIVE)[1], "it may have moved"
+        check("--arm", "--datum", "here")
+        with pytest.raises(ParameterError, match="arm: without a datum"):
+            check("--arm")
+
+
+def test_where_it_is_kept(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert datums.folder() == state / "uav_dc_ros" / "datums"
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/uav-dc:/var/lib/other")
+    assert datums.folder() == Path("/var/lib/uav-dc/uav_dc_ros/datums"), "as systemd has it"
+    monkeypatch.delenv("STATE_DIRECTORY")
+    monkeypatch.setenv("XDG_STATE_HOME", "relative")
+    monkeypatch.setenv("HOME", "/home/uav")
+    assert datums.folder() == Path("/home/uav/.local/state/uav_dc_ros/datums")
+    (state / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(state / "file"))
+    with pytest.raises(NodeError, match="cannot be made: Not a directory"):
+        datums.keep(FIVE, DATUM, "mavlink")
