@@ -21,7 +21,7 @@ from uav_dc_ros.autopilot import fence, mavlink
 from uav_dc_ros.autopilot.links import Address
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.nodes import options, supervisor
+from uav_dc_ros.nodes import datums, lease, options, supervisor
 from uav_dc_ros.nodes.parameters import EVERY
 from uav_dc_ros.nodes.table import NODES
 
@@ -140,6 +140,7 @@ def test_run_all_would_start_what_the_guide_says(words: list[str], monkeypatch: 
     started = options.nodes(wanted)
     real = wanted.vehicle != "simulated"
     assert ("bridge" in started) == (real and wanted.nodes is None)
+    assert wanted.datum is not None or not wanted.arm, "who arms says where the grid lies"
     if wanted.vehicle == "mavlink" and "bridge" in started:
         Address.parse(wanted.connect)
     else:
@@ -200,6 +201,10 @@ def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert NODES["policy"].restarts == 3
     assert supervisor.RESTART_WINDOW_S == 60
     assert "three times within a minute" in GUIDE
+    assert lease.MISSED_S + lease.CONFIRMED_S < 2.0
+    assert "stops where it is, within two seconds" in GUIDE
+    assert datums.MOVED_M == 5.0
+    assert "as a warning from 5 m on" in GUIDE
 
 
 def test_the_field_is_five_clusters_at_a_fifth() -> None:

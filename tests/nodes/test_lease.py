@@ -14,7 +14,6 @@ from tests.nodes.mavros_flight import node_in, spin
 from uav_dc_ros.nodes.lease import CONFIRMED_S, Confirmed, Lease
 from uav_dc_ros.topics import TOPICS
 
-PROMISED_S = 2.0  # in the guide
 TICK_S = 0.02
 
 
