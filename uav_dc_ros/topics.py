@@ -31,8 +31,9 @@ class Topic:
         asks_reliable: reliability asked for by subscriptions.
         latched: durability transient local instead of volatile, offered and asked for.
         depth: messages that a publisher keeps.
-        lease_s: within how many seconds a publisher that was killed is missed, by who asks for it; None: by
-            the middleware's own measure, tens of seconds.
+        lease_s: liveliness lease that publishers offer, seconds: they assert their liveliness within it, for
+            who asks for that (see `nodes.lease`); None: none is offered, and one that was killed is missed
+            after tens of seconds.
         recorded: does the recorder write it?
     """
 

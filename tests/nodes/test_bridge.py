@@ -6,6 +6,7 @@ The aircraft is what cannot exist here: see tests/autopilot/autopilot.py for wha
 import itertools
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -152,6 +153,33 @@ def test_a_pilot_arms_where_the_bridge_may_not(ros: Ros, low: tuple[object, ...]
         status, output = finish(process)
     assert status == 0, shown + output
     check_steps(ros.folder / "bag")
+
+
+@pytest.mark.long
+def test_the_second_flight_has_the_grid_of_the_first(ros: Ros, low: tuple[object, ...]) -> None:
+    """It begins at the dock, where the first one landed."""
+
+    def fly(autopilot: Fake, datum: str) -> str:
+        given = ("--connect", autopilot.address, "--arm", "--datum", datum, "--no-record")
+        given = ("--vehicle", "mavlink", *given, "--set", "bridge.least_battery=0")
+        status, output = ros.run_all(*low, *given)
+        assert status == 0, output
+        return output
+
+    with fake("ardupilot", speed=8.0) as autopilot:
+        fly(autopilot, "here")
+        first = len(autopilot.all("setpoint"))
+        assert "; 0.0 m east and 0.0 m north of that of the last flight (" in fly(autopilot, "last")
+        second = [told["ned"] for told in autopilot.all("setpoint")[first:]]
+        for step in range(STEPS + 1):
+            assert any(ned[:2] == pytest.approx([0.0, 20.0 * step], abs=0.2) for ned in second), step
+        assert autopilot.report()["ned"][:2] == pytest.approx([0.0, 20.0 * STEPS], abs=2.0)
+        warned = "WARN: the grid's corner lies at "
+        output = fly(autopilot, "here")
+        assert warned in output
+        assert re.search(
+            r"; 1[34]\d\.\d m east and \d\.\d m (north|south) of that of the last flight", output
+        )
 
 
 # What dies.

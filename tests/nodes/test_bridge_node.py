@@ -1,5 +1,6 @@
 """The bridge's node in this process, beside a vehicle whose telemetry a test says."""
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -12,6 +13,8 @@ from tests.conftest import Ros
 from tests.nodes.mavros_flight import node_in
 from uav_dc_ros import messages
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.links import Address
+from uav_dc_ros.autopilot.mavlink import Mavlink
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
@@ -71,7 +74,6 @@ class Made:
 
     def __init__(self, node: AutopilotBridge, vehicle: Stub) -> None:
         self.node, self.vehicle = node, vehicle
-        self.logged: list[str] = []
 
     def until(self, done: Callable[[], object]) -> None:
         for _ in range(2000):
@@ -160,18 +162,6 @@ def test_what_fails_to_start_is_closed(made: Made, monkeypatch: pytest.MonkeyPat
     assert (made.node.state, made.vehicle.opened, made.vehicle.closed) == ("active", 3, 2)
 
 
-def test_a_vehicle_that_flies_where_no_grid_is_known_is_refused_at_once(made: Made) -> None:
-    made.vehicle.known = replace(FLIES, position=None, missing="the grid has no datum")
-    activate(made)
-    made.until(lambda: made.node.bridge.is_over)
-    told = made.node._told
-    assert told is not None
-    assert (told.phase, told.step) == (Phase.ABORTED, 0)
-    assert told.reason == "it flies, and where the grid lies is not known: expected datum last or LAT,LON,ALT"
-    assert made.vehicle.asked == [], "whoever flies it keeps it"
-    assert set(made.vehicle.setpoints) == {None}
-
-
 def test_who_else_is_there_and_what_was_ignored_is_in_the_diagnostics(made: Made) -> None:
     made.vehicle.known = Telemetry(
         system="system 7", other_controller="system 255 sends setpoints", discarded={"late": 2, "repeated": 1}
@@ -210,3 +200,34 @@ def test_steps_that_were_not_reached_are_told(made: Made) -> None:
     made.node._tell()
     assert isinstance(made.node._told, messages.Mission)
     assert made.node._told.steps_not_reached == 3
+
+
+def open_files() -> set[str]:
+    """What this process has open, but for what the middleware opens and closes by itself."""
+    links = (os.readlink(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd") if _is_open(name))
+    return {link for link in links if link.startswith("pipe:")}
+
+
+def _is_open(name: str) -> bool:
+    return os.path.islink(f"/proc/self/fd/{name}")
+
+
+def test_a_transport_is_closed_whatever_became_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before it was opened, after the link could not be opened at all, and a second time."""
+    before = open_files()
+    for opened in (False, True):
+        vehicle = Mavlink("tcp:127.0.0.1:1")
+        with monkeypatch.context() as patch:
+            if opened:
+                patch.setattr(Address, "open", refuse_link)
+                vehicle.open()
+                vehicle._thread.join()
+                with pytest.raises(VehicleError, match="no such device"):
+                    vehicle.telemetry()
+            vehicle.close()
+            vehicle.close()
+    assert open_files() == before
+
+
+def refuse_link(address: Address) -> None:
+    raise VehicleError("no such device")

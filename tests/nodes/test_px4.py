@@ -605,9 +605,9 @@ def test_what_is_late_repeated_unstamped_or_of_another_vehicle_is_counted_and_ig
         assert (known.mode, known.armed) == (Mode.COMMANDED, True)
     assert known.discarded == {
         "late": 2,
-        "without a stamp": 1,
+        "zeroed": 1,
         "repeated": 1,
-        "from the future": 1,
+        "impossible": 1,
         "of another system": 1,
     }
     assert hear("vehicle_local_position", at[1], 3.0, 2.6).position_s == 2.6, "it has booted anew"

@@ -99,7 +99,7 @@ class Mavlink:
         self._wake_out, self._wake_in = os.pipe()
         os.set_blocking(self._wake_in, False)
         os.set_blocking(self._wake_out, False)
-        self._ended = False
+        self._ended = self._closed = False
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
 
     def __enter__(self) -> Self:
@@ -117,11 +117,12 @@ class Mavlink:
 
     def close(self) -> None:
         """End the stream, and the link; more than once is as good as once."""
-        if self._ended:
+        if self._closed:
             return
-        self._ended = True
+        self._closed = self._ended = True
         self._wake()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
         os.close(self._wake_in)
         os.close(self._wake_out)
 

@@ -82,7 +82,8 @@ class AutopilotBridge(MissionNode):
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
-        self._grid = ""  # where it lies, as logged last
+        self._system = ""  # as logged last, and where the grid lies
+        self._grid = ""
         self._grid_is_kept, self._is_restarted = False, standing is not None
         self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
         self._policy = Lease(self, TOPICS["move"])
@@ -183,11 +184,11 @@ class AutopilotBridge(MissionNode):
         self._known = known = self.vehicle.telemetry()
         self._keep_pace(known)
         self._publish_pose(known)
+        self._tell_vehicle(known)
         self._tell_grid()
         if not self._begun:
             self._begin_if_all_ready()
         if self._begun:
-            self._refuse_without_grid(known)
             self.bridge.policy_is_gone = self._policy.is_gone()
             for wish in self.bridge.tick(time.monotonic(), known):
                 self.vehicle.ask(wish)
@@ -225,7 +226,13 @@ class AutopilotBridge(MissionNode):
             self.publish("target", cdr.pose(np.asarray(setpoint), now_ns))
         self._setpoint = setpoint
 
-    # Where the grid lies.
+    # Which vehicle, and where the grid lies.
+
+    def _tell_vehicle(self, known: Telemetry) -> None:
+        """Log which vehicle it is."""
+        if known.system != self._system:
+            self._system = known.system
+            self.get_logger().info(f"the vehicle is {known.system}, {self.vehicle.kind or 'not known yet'}")
 
     def _tell_grid(self) -> None:
         """Log where the grid lies, as soon as that is known, and how far from the last flight's."""
@@ -250,14 +257,6 @@ class AutopilotBridge(MissionNode):
             datums.keep(self.scenario, datum, self.values["vehicle"])
         except UavDcError as error:  # no reason not to fly
             self.get_logger().warning(f"the next flight will not know where the grid lay ({datum}): {error}")
-
-    def _refuse_without_grid(self, known: Telemetry) -> None:
-        """End a mission beside a vehicle that flies already, while nothing says where the grid lies."""
-        waits = self.bridge.phase is Phase.CONNECTING and not self.vehicle.anchor
-        if waits and known.armed and known.on_ground is False:
-            self.bridge.stop(
-                "it flies, and where the grid lies is not known: expected datum last or LAT,LON,ALT"
-            )
 
     def _on_change(self) -> None:
         """Keep where the mission stands, and say it: what others know is never forgotten."""

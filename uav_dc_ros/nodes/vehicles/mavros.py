@@ -44,7 +44,7 @@ from uav_dc_ros.nodes.vehicles.mavros_hearing import (
     TARGET,
     Hearing,
 )
-from uav_dc_ros.nodes.vehicles.rivals import Rivals
+from uav_dc_ros.nodes.vehicles.other_publishers import OtherPublishers
 from uav_dc_ros.nodes.vehicles.stream import Stream
 
 SETPOINT = "mavros/setpoint_position/local"
@@ -92,7 +92,7 @@ class Mavros:
         self._node = node
         self._package = mavros_messages.load(needed_for="arming" if arms else "")
         self._hearing = Hearing(place, datum, anchor, full=self._package is not None)
-        self._rivals = Rivals(node, restarted=bool(anchor))
+        self._other_publishers = OtherPublishers(node, restarted=bool(anchor))
         self._yaw_rad: float | None = None
         self._stream: Stream[Target] = Stream(self._publish, "mavros")
         self._publisher: Any = None
@@ -167,7 +167,7 @@ class Mavros:
             self._commands.granted("arming")
         known = dataclasses.replace(
             hearing.telemetry(now_s, self._commands.refusal, self._commands.said),
-            other_controller=self._rivals.on(self._publisher.topic_name),
+            other_controller=self._other_publishers.on(self._publisher.topic_name),
         )
         if known.missing is not None:
             return known

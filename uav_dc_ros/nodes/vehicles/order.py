@@ -24,11 +24,11 @@ class Order:
             if not advance_s:
                 return "repeated"
             if not stamp_s:
-                why = "without a stamp"
+                why = "zeroed"
             elif advance_s < 0:
                 why = "late"
             elif advance_s > LEAP_S + FASTEST * passed_s:
-                why = "from the future"
+                why = "impossible"
             if passed_s > RESYNC_S:
                 why = None
         if why is None:

@@ -23,8 +23,8 @@ from uav_dc_ros.autopilot.beat import STREAM_VEHICLE_S
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.nodes.vehicles.other_publishers import OtherPublishers
 from uav_dc_ros.nodes.vehicles.px4_hearing import COMPANION, Px4Hearing
-from uav_dc_ros.nodes.vehicles.rivals import Rivals
 from uav_dc_ros.nodes.vehicles.stream import Stream
 
 POSE_S = 0.5
@@ -102,7 +102,7 @@ class Px4:
         self._messages_sent = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
         self._silent = set(NEEDED)
         self._looked_s, self._seen = -math.inf, ""
-        self._rivals = Rivals(node, restarted=bool(anchor))
+        self._other_publishers = OtherPublishers(node, restarted=bool(anchor))
         self._subscriptions: list[Any] = []
         self._publishers: dict[str, Any] = {}
         self._stream: Stream[Enu] = Stream(self._send, "px4")
@@ -150,7 +150,7 @@ class Px4:
         with self._lock:
             known, silent = self._hearing.telemetry(), [name for name in NEEDED if name in self._silent]
         setpoints = self._publishers["trajectory_setpoint"].topic_name
-        known = dataclasses.replace(known, other_controller=self._rivals.on(setpoints))
+        known = dataclasses.replace(known, other_controller=self._other_publishers.on(setpoints))
         if not silent:
             return known
         topics = ", ".join(self._topic(name) for name in silent)
