@@ -82,8 +82,7 @@ class AutopilotBridge(MissionNode):
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
-        self._system = ""  # as logged last, and where the grid lies
-        self._grid = ""
+        self._grid = ""  # where it lies, as logged last
         self._grid_is_kept, self._is_restarted = False, standing is not None
         self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
         self._policy = Lease(self, TOPICS["move"])
@@ -184,7 +183,6 @@ class AutopilotBridge(MissionNode):
         self._known = known = self.vehicle.telemetry()
         self._keep_pace(known)
         self._publish_pose(known)
-        self._tell_vehicle(known)
         self._tell_grid()
         if not self._begun:
             self._begin_if_all_ready()
@@ -226,13 +224,7 @@ class AutopilotBridge(MissionNode):
             self.publish("target", cdr.pose(np.asarray(setpoint), now_ns))
         self._setpoint = setpoint
 
-    # Which vehicle, and where the grid lies.
-
-    def _tell_vehicle(self, known: Telemetry) -> None:
-        """Log which vehicle it is."""
-        if known.system != self._system:
-            self._system = known.system
-            self.get_logger().info(f"the vehicle is {known.system}, {self.vehicle.kind or 'not known yet'}")
+    # Where the grid lies.
 
     def _tell_grid(self) -> None:
         """Log where the grid lies, as soon as that is known, and how far from the last flight's."""
