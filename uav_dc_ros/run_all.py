@@ -134,12 +134,15 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     options = parser().parse_args(arguments)
 
     def command() -> int:
-        from uav_dc_ros.nodes import environment
+        from uav_dc_ros.nodes import environment, fastdds
 
         environment.prepare(alone=options.nodes is None)  # before ROS is imported
         from uav_dc_ros.nodes.flight import Flight
 
-        return Flight(options).run()
+        try:
+            return Flight(options).run()
+        finally:
+            fastdds.remove_leftovers()  # of nodes that were killed
 
     cli.run(command, PROG)
 

@@ -47,6 +47,9 @@ Between them: convert (ROS messages and plain values), cdr (serialised messages,
 import importlib.util
 import sys
 
+from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.nodes import environment
+
 # Looked for, not imported: wheels from PyPI start Python anew on their first import, and whoever reads the
 # node table only should not be started anew.
 if importlib.util.find_spec("rclpy") is None:
@@ -56,3 +59,8 @@ if importlib.util.find_spec("rclpy") is None:
         file=sys.stderr,
     )
     raise SystemExit(2)
+try:
+    environment.check_import()
+except ParameterError as error:
+    print(f"error: {error}", file=sys.stderr)
+    raise SystemExit(2) from None

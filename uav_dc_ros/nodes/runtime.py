@@ -18,13 +18,13 @@ from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros import cli
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes import fastdds, usage
+from uav_dc_ros.nodes import environment, fastdds, usage
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.mission_node import SUPERVISED, MissionNode
 
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.2  # a message that was lost on the way is sent again within a tenth
-LEAVE_S = 1.0
+LEAVE_S = 3.0  # for the middleware to close
 BACKGROUND = 5  # niceness of a node that nobody waits for
 # Exit statuses. Python's own 1 is left to what nobody thought of: only that is worth another try.
 NOT_BEGUN = 2
@@ -47,6 +47,10 @@ class Stopper:
         cli.on_stop(lambda *_: None)
         signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         threading.Thread(target=self._watch, daemon=True).start()
+
+    def close(self) -> None:
+        """Wake no more: nothing waits, and what would be woken is to end."""
+        self._wake = lambda: None
 
     def _watch(self) -> None:
         sources: list[Any] = [self._ours]
@@ -87,11 +91,27 @@ def main(
     """
     if arguments is None:
         arguments = usage.ros_arguments(makes[0].__doc__ or "")
-    fastdds.use_profiles()
     if gives_way:
         give_way()
+    status = _flown(makes, arguments)
+    # All is logged and written. The middleware was seen to hang while several of its participants leave at
+    # once: that must not turn a good ending into a killed process, and costs its shared memory at most.
+    threading.Timer(LEAVE_S, os._exit, (status,)).start()
+    gc.unfreeze()
+    gc.collect()  # the middleware's part of a node ends with the last reference to it, and not before
+    rclpy.try_shutdown()
+    rclpy.get_default_context().destroy()
+    os._exit(status)
+
+
+def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> int:
+    """Run nodes from the first to the last; returns the exit status. Leaves no reference to any of them."""
     status = NOT_BEGUN
+    nodes: list[MissionNode] = []
     try:
+        if SUPERVISED not in os.environ:
+            environment.check()
+        fastdds.use_profiles()
         nodes = _made(makes, arguments)
         rest_s = min(node.rest_s for node in nodes)
         executor = DirectExecutor(rest_s)
@@ -105,14 +125,13 @@ def main(
                 os.nice(BACKGROUND)
             status = GAVE_UP
             status = _run(nodes, executor, stopper)
+        stopper.close()
     except UavDcError as error:
         print(f"error: {error}", file=sys.stderr)
-    # All is said and written. The middleware has been seen to hang while several of its participants leave
-    # at once; that must not turn a good ending into a killed process.
     sys.stderr.flush()
-    threading.Timer(LEAVE_S, os._exit, (status,)).start()
-    rclpy.try_shutdown()
-    os._exit(status)
+    for node in nodes:
+        node.destroy_node()
+    return status
 
 
 def _made(makes: Iterable[Callable[[], MissionNode]], arguments: list[str]) -> list[MissionNode]:
