@@ -2,8 +2,9 @@
 
     python -m tests.autopilot.autopilot --kind ardupilot --tcp 0 --speed 20
 
-It tells in lines of JSON on standard output what happened to it, first where it listens, and takes commands
-on standard input (see `Control`). Simulated time runs `--speed` times faster than the clock.
+The vehicle itself is in `copter`. It tells in lines of JSON on standard output what happened to it, first
+where it listens, and takes commands on standard input: all of them are listed in `Control`. Simulated time
+runs `--speed` times faster than the clock.
 
 Imitated, as it was seen with a real ArduCopter (4.6) in simulation, or as PX4's documentation tells:
 a TCP server starts when its first client comes; messages at the rates that were asked for; an estimate that
@@ -13,17 +14,18 @@ setpoint interrupts; OFFBOARD only after a second of setpoints at more than 2 Hz
 they end; the frames each of them takes; speeds; disarming on the ground; MAVLink 1 until MAVLink 2 is
 heard; motors that need two seconds to lift it; the last ten metres down at half a metre per second; the
 charge that ArduCopter's simulator counts to nothing within seven minutes while the voltage stays; PX4's
-origin, sent when it changes or when asked for it, and its readiness, told for the mode that it is in.
-A foreign gimbal speaks too.
+origin, sent when it changes or when asked for it, and its readiness, told for the mode that it is in;
+parameters, answered by name; ArduCopter's position target, reported in GUIDED only, and ignored without a
+word where it lies outside its fence; failsafes for its fence, a ground station that fell silent (in its own
+time), and low voltage (a text and the battery's health; neither acts on it). A foreign gimbal speaks too.
 
-Not imitated: attitude, wind, noise, GPS, parameters, missions, failsafes other than PX4's for setpoints,
-links that lose single messages, yaw. Unlike any real one, its time waits (a quarter of a second at most)
-for a client that was heard lately and is late now: the machine that tests run on has other work to do.
+Not imitated: noise, GPS, missions, other failsafes, links that lose single messages, yaw. Unlike any real
+one, its time waits (a quarter of a second at most) for a client that was heard lately and is late now: the
+machine that tests run on has other work to do.
 """
 
 import argparse
 import contextlib
-import json
 import math
 import os
 import select
@@ -35,165 +37,17 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-TICK_S = 0.02
-ACROSS_MPS, UP_MPS, DOWN_MPS, ACROSS_MPS2 = 10.2, 2.5, 1.5, 1.9
-SLOW_M, SLOW_MPS = 10.0, 0.5  # LAND_ALT_LOW, LAND_SPEED
-SPOOL_S = 2.0  # from the command to take off until it leaves the ground
-RETURN_M = 15.0
-FULL_V, SAG_V, EMPTY_V = 12.6, 0.3, 10.2  # at rest, less in the air, at rest without charge
-COUNTED_PER_S = 29.3 / 3600 / 3.3  # amperes of ArduCopter's simulator, ampere-hours of BATT_CAPACITY
+from tests.autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, tell
+
 ADVICE_S = 30.0
-VELOCITY_S = 3.0  # GUID_TIMEOUT
-OFFBOARD_GAP_S, OFFBOARD_PROOF_S, OFFBOARD_LOSS_S = 0.5, 1.0, 1.0
-IDLE_DISARM_S, LANDED_DISARM_S = 10.0, 1.0
+OFFBOARD_GAP_S, OFFBOARD_PROOF_S = 0.5, 1.0
 SO_TIMESTAMPNS = 35  # of Linux: when a datagram came, however late this process reads it
 PATIENCE_S, AHEAD_S, LEAP_S = 0.25, 0.4, 0.4  # wall, simulated, simulated
 FLAGS, MADE_UP = 0x33F, 0x80
 HOME = (47.397742, 8.545594, 488.0)
-
-ARDUPILOT_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9, "BRAKE": 17}
-PX4_MODES = {
-    name: main << 16 | sub << 24
-    for name, main, sub in [
-        *[("MANUAL", 1, 0), ("POSCTL", 3, 0), ("AUTO.LOITER", 4, 3), ("AUTO.RTL", 4, 5)],
-        *[("AUTO.LAND", 4, 6), ("OFFBOARD", 6, 0)],
-    ]
-}
-FOLLOWS, RETURNS, LANDS = ("GUIDED", "OFFBOARD"), ("RTL", "AUTO.RTL"), ("LAND", "AUTO.LAND")
-
-
-def tell(event: str, t_s: float, **more: Any) -> None:
-    print(json.dumps({"event": event, "t_s": round(t_s, 3), **more}), flush=True)
-
-
-class Copter:
-    """Where it is, and what it does. NED metres from where it was switched on."""
-
-    def __init__(self, kind: str, ready_s: float) -> None:
-        self.px4 = kind == "px4"
-        self.modes = PX4_MODES if self.px4 else ARDUPILOT_MODES
-        self.mode = "POSCTL" if self.px4 else "STABILIZE"
-        self.ready_s, self.t_s = ready_s, 0.0
-        self.ned, self.velocity = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-        self.armed, self.landed, self.taking_off_to_m = False, True, None
-        self.target: list[float] | None = None  # NED
-        self.target_velocity: list[float] | None = None
-        self.target_s = -math.inf
-        self.streamed_since_s, self.streamed_s = math.inf, -math.inf
-        self.ground_since_s = 0.0
-        self.take_off_s, self.counted = 0.0, 0.0
-        self.battery, self.lost, self.refuses, self.balks = 1.0, False, False, False
-
-    @property
-    def ready(self) -> bool:
-        return self.t_s >= self.ready_s and not self.lost
-
-    @property
-    def landed_state(self) -> int:
-        if self.landed:
-            return 1
-        if self.taking_off_to_m is not None:
-            return 3
-        return 4 if self.mode in LANDS else 2
-
-    @property
-    def charge(self) -> float:
-        return self.battery if self.px4 else max(0.0, self.battery - self.counted)
-
-    @property
-    def volts(self) -> float:
-        return EMPTY_V + (FULL_V - EMPTY_V) * self.battery - (0.0 if self.landed else SAG_V)
-
-    def set_mode(self, mode: str, why: str) -> None:
-        if mode != self.mode:
-            self.mode, self.taking_off_to_m = mode, None
-            self.target, self.target_velocity, self.target_s = None, None, self.t_s
-            tell("mode", self.t_s, mode=mode, why=why)
-
-    def arm(self, armed: bool, why: str) -> None:
-        if armed != self.armed:
-            self.armed, self.ground_since_s = armed, self.t_s
-            tell("armed" if armed else "disarmed", self.t_s, why=why, ned=self.ned)
-
-    def tick(self) -> None:
-        self.t_s += TICK_S
-        self.counted += 0.0 if self.landed else COUNTED_PER_S * TICK_S
-        if self.px4 and self.mode == "OFFBOARD" and self.t_s - self.streamed_s > OFFBOARD_LOSS_S:
-            self.set_mode("AUTO.RTL", "failsafe: no offboard setpoints")
-        goal = self.ned if self.landed else self._goal()
-        if self.armed and self.landed:
-            goal = self._lift_off()
-        self._fly(goal)
-        if self.armed and self.landed:
-            down = self.mode in LANDS or self.mode in RETURNS
-            if self.t_s - self.ground_since_s > (LANDED_DISARM_S if down else IDLE_DISARM_S):
-                self.arm(False, "on the ground")
-
-    def _lift_off(self) -> list[float]:
-        """What lifts it from the ground: a command to take off; a setpoint above, of PX4."""
-        if self.px4:
-            rises = self.target is not None and self.target[2] < self.ned[2] - 0.5
-            self.landed = not (self.mode == "OFFBOARD" and rises)
-        else:
-            turning = self.taking_off_to_m is not None and self.t_s - self.take_off_s >= SPOOL_S
-            self.landed = not (self.mode == "GUIDED" and turning)
-        return self._goal() if not self.landed else self.ned
-
-    def _goal(self) -> list[float]:
-        north, east, down = self.ned
-        if self.mode in LANDS:
-            return [north, east, 1.0]
-        if self.mode in RETURNS:
-            if math.hypot(north, east) > 0.5:
-                high = down <= -RETURN_M + 0.5
-                return [0.0, 0.0, down] if high else [north, east, -RETURN_M]
-            return [0.0, 0.0, 1.0]
-        if self.taking_off_to_m is not None:
-            if down <= -self.taking_off_to_m + 0.2:
-                self.taking_off_to_m = None
-                self.target, self.target_velocity = [north, east, down], None
-                tell("taken off", self.t_s, ned=self.ned)
-            else:
-                return [north, east, -self.taking_off_to_m]
-        if self.mode in FOLLOWS and self.target_velocity is not None:
-            if self.t_s - self.target_s > VELOCITY_S:
-                self.target, self.target_velocity = [north, east, down], None
-                tell("velocity timed out", self.t_s)
-            else:
-                return [p + 10.0 * v for p, v in zip(self.ned, self.target_velocity, strict=True)]
-        if self.mode in FOLLOWS and self.target is not None:
-            return self.target
-        if self.target is None:
-            self.target = [north, east, down]
-        return self.target
-
-    def _fly(self, goal: list[float]) -> None:
-        """Towards a goal, within what it can accelerate across, and climb or sink."""
-        if not self.armed or self.landed:
-            self.velocity = [0.0, 0.0, 0.0]
-            return
-        dn, de, dd = (g - p for g, p in zip(goal, self.ned, strict=True))
-        far = math.hypot(dn, de)
-        speed = min(ACROSS_MPS, math.sqrt(2 * 0.9 * ACROSS_MPS2 * far), 1.0 * far)
-        if self.target_velocity is not None and self.mode in FOLLOWS:
-            speed = min(ACROSS_MPS, math.hypot(*self.target_velocity[:2]))
-        wanted = [speed * dn / far, speed * de / far] if far > 1e-9 else [0.0, 0.0]
-        change = [w - v for w, v in zip(wanted, self.velocity, strict=False)]
-        size = math.hypot(*change)
-        share = min(1.0, ACROSS_MPS2 * TICK_S / size) if size else 0.0
-        self.velocity[0] += change[0] * share
-        self.velocity[1] += change[1] * share
-        up, down = UP_MPS, DOWN_MPS
-        if self.ned[2] > -SLOW_M and goal[2] > 0.0:
-            down = SLOW_MPS
-        if self.target_velocity is not None and self.mode in FOLLOWS:
-            up, down = min(up, abs(self.target_velocity[2])), min(down, abs(self.target_velocity[2]))
-        self.velocity[2] = max(-up, min(down, 2.0 * dd))
-        self.ned = [p + v * TICK_S for p, v in zip(self.ned, self.velocity, strict=True)]
-        if self.ned[2] >= 0.0 and self.velocity[2] >= 0.0:
-            self.ned[2], self.velocity, self.landed = 0.0, [0.0, 0.0, 0.0], True
-            self.ground_since_s, self.taking_off_to_m = self.t_s, None
-            tell("touched down", self.t_s, ned=self.ned)
+BRIDGE = (255, 191)  # system and component of a bridge
+POSITION, VELOCITY = 0xDF8, 0xDC7  # POSITION_TARGET_TYPEMASK
+RIVAL_S, RIVAL_ACK_S, RIVAL_HEARTBEAT_S = 0.1, 2.0, 1.0
 
 
 class Codec(mav.MAVLink):
@@ -212,6 +66,11 @@ class Autopilot:
         self.copter = copter
         self.mav = Codec(self, system, 1)
         self.gimbal = Codec(self, system, 154)
+        self.rival = Codec(self, *BRIDGE)  # a second bridge, whose messages come by way of this autopilot
+        self.rival_heartbeats, self.rival_acks = False, False
+        self.rival_target: list[float] | None = None
+        self.rival_due = {"heartbeat": 0.0, "ack": 0.0, "target": 0.0}
+        self.other: Autopilot | None = None  # a second vehicle on the same link
         self.origin_sent, self.advised_s = False, -math.inf
         self.parser = mav.MAVLink(None)
         self.parser.robust_parsing = True
@@ -223,6 +82,11 @@ class Autopilot:
         self.heartbeats = 0
         self.came_s = 0.0
         self.times: list[float] | None = None  # when setpoints came, as the system stamped them; UDP only
+        self.ignores: dict[int, int] = {}  # how many more commands of a number are lost on their way
+        self.echoes, self.twice = False, False
+        self.next_late_s = 0.0  # of the next position
+        self.next_is_zeroed, self.next_is_nonsense = False, False
+        self.held_back: list[tuple[float, bytes]] = []
 
     def write(self, data: bytes) -> None:  # pymavlink calls it
         self.out += data
@@ -237,14 +101,52 @@ class Autopilot:
         self.mav.statustext_send(severity, text.encode())
 
     def speak(self) -> None:
+        if self.other is not None:
+            self.other.copter.tick()
+            self.other.answer()
+            self.other.speak()
+            self.out += self.other.out
+            self.other.out.clear()
+        self._speak_as_rival()
         t_s = self.copter.t_s
+        while self.copter.texts:
+            self.say(self.copter.texts.pop(0))
+        while self.held_back and self.held_back[0][0] <= t_s:
+            self.out += self.held_back.pop(0)[1]
         if not self.copter.ready and not self.copter.px4 and t_s - self.advised_s >= ADVICE_S:
             self.advised_s = t_s
             self.say("PreArm: AHRS: waiting for home")
         for number, (period_s, next_s) in list(self.due.items()):
             if t_s + 1e-9 >= next_s:
                 self.due[number] = (period_s, max(next_s + period_s, t_s - period_s))
+                begin = len(self.out)
                 self._send(number)
+                if number == mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED and self.next_late_s > 0.0:
+                    self.held_back.append((t_s + self.next_late_s, bytes(self.out[begin:])))
+                    self.next_late_s = 0.0
+                    del self.out[begin:]
+                elif self.twice:
+                    self.out += self.out[begin:]
+
+    def _speak_as_rival(self) -> None:
+        """What a second bridge sends, and what is answered to it."""
+        c = self.copter
+
+        def due(what: str, wanted: bool, period_s: float) -> bool:
+            if not wanted or c.t_s < self.rival_due[what]:
+                return False
+            self.rival_due[what] = c.t_s + period_s
+            return True
+
+        if due("heartbeat", self.rival_heartbeats, RIVAL_HEARTBEAT_S):
+            self.rival.heartbeat_send(mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID, 0, 0, 4)
+            c.gcs_s = c.t_s
+        if due("ack", self.rival_acks, RIVAL_ACK_S):
+            self.mav.command_ack_send(mav.MAV_CMD_DO_SET_MODE, 0, 0, 0, *BRIDGE)
+        if due("target", self.rival_target is not None, RIVAL_S) and self.rival_target is not None:
+            c.streamed_s = c.t_s
+            if c.mode in FOLLOWS and not c.landed:
+                c.aim(list(self.rival_target))
 
     def _send(self, number: int) -> None:
         c = self.copter
@@ -259,7 +161,19 @@ class Autopilot:
         elif number == mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             if c.t_s >= c.ready_s and not self.frozen:
                 ned = [p + o for p, o in zip(c.ned, self.offset, strict=True)]
-                self.mav.local_position_ned_send(boot_ms, *ned, *c.velocity)
+                if self.next_is_nonsense:
+                    ned = [math.nan, 1e9, math.inf]
+                sent_ms = 0 if self.next_is_zeroed else boot_ms
+                self.next_is_nonsense = self.next_is_zeroed = False
+                self.mav.local_position_ned_send(sent_ms, *ned, *c.velocity)
+        elif number == mav.MAVLINK_MSG_ID_ATTITUDE:
+            self.mav.attitude_send(boot_ms, c.tilt_rad, 0.0, 0.0, 0.0, 0.0, 0.0)
+        elif number == mav.MAVLINK_MSG_ID_HOME_POSITION:
+            if c.t_s >= c.ready_s:
+                here = [round(v * s) for v, s in zip(HOME, (1e7, 1e7, 1e3), strict=True)]
+                self.mav.home_position_send(*here, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+        elif number == mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED:
+            self._report_target(boot_ms)
         elif number == mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
             if c.t_s >= c.ready_s and not (c.px4 and self.origin_sent):
                 self.origin_sent = True
@@ -269,9 +183,9 @@ class Autopilot:
         elif number == mav.MAVLINK_MSG_ID_SYS_STATUS:
             ready = c.ready and not c.refuses and (not c.px4 or c.mode == "OFFBOARD")
             battery = mav.MAV_SYS_STATUS_SENSOR_BATTERY
-            health = battery | (mav.MAV_SYS_STATUS_PREARM_CHECK if ready else 0)
+            health = (0 if c.battery_failed else battery) | (mav.MAV_SYS_STATUS_PREARM_CHECK if ready else 0)
             volts, charge = round(c.volts * 1e3), round(c.charge * 100)
-            self.mav.sys_status_send(health, battery, health, 0, volts, 0, charge, 0, 0, 0, 0, 0, 0)
+            self.mav.sys_status_send(battery, battery, health, 0, volts, 0, charge, 0, 0, 0, 0, 0, 0)
         elif number == mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
             self.mav.extended_sys_state_send(0, c.landed_state)
         elif number == mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
@@ -279,21 +193,58 @@ class Autopilot:
         elif number == mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS:
             self.mav.estimator_status_send(0, FLAGS if c.ready else MADE_UP | 1, 0, 0, 0, 0, 0, 0, 0, 0)
 
+    def _report_target(self, boot_ms: int) -> None:
+        c = self.copter
+        if c.landed or not (c.px4 or c.mode in FOLLOWS):
+            return
+        if c.mode not in FOLLOWS:  # PX4: the controllers' own
+            ned, mask = [math.nan] * 3, 0
+        elif c.taking_off_to_m is not None:
+            ned, mask = [*c.ned[:2], -c.taking_off_to_m], POSITION
+        elif c.target is not None:
+            ned, mask = c.target, 0 if c.px4 else POSITION
+        else:
+            ned, mask = [0.0] * 3, VELOCITY
+        self.mav.position_target_local_ned_send(boot_ms, 1, mask, *ned, 0, 0, 0, 0, 0, 0, 0, 0)
+
+    def _tell_parameter(self, name: str) -> None:
+        """Answer for a parameter; one that it does not know has no answer."""
+        value = self.copter.parameters.get(name)
+        if value is None:
+            return
+        kind = mav.MAV_PARAM_TYPE_REAL32
+        if self.copter.px4 and isinstance(value, int):  # byte by byte, whatever number that makes
+            kind, value = mav.MAV_PARAM_TYPE_INT32, struct.unpack("<f", struct.pack("<i", value))[0]
+        self.mav.param_value_send(name.encode(), value, kind, len(self.copter.parameters), 0)
+
     # In.
 
     def hear(self, data: bytes) -> bool:
         """Take in bytes; was a message among them."""
+        if self.other is not None:
+            self.other.hear(data)
+        if self.echoes:
+            self.out += data
         messages = self.parser.parse_buffer(data) or []
         for message in messages:
             if message.get_msgbuf()[0] == mav.PROTOCOL_MARKER_V2:
                 self.mav.old = self.gimbal.old = False
             name = message.get_type()
-            if name == "COMMAND_LONG" and message.target_system == self.mav.srcSystem:
+            if getattr(message, "target_system", self.mav.srcSystem) != self.mav.srcSystem:
+                continue
+            if name == "COMMAND_LONG" and self.ignores.get(message.command, 0) > 0:
+                self.ignores[message.command] -= 1
+                self.copter.tell("lost", command=message.command)
+            elif name == "COMMAND_LONG":
                 self.later.append((self.copter.t_s + self.late_s, message))
             elif name == "SET_POSITION_TARGET_LOCAL_NED":
                 self._setpoint(message)
+            elif name == "PARAM_REQUEST_READ":
+                self._tell_parameter(message.param_id)
             elif name == "HEARTBEAT":
                 self.heartbeats += 1
+                if message.get_srcSystem() == BRIDGE[0]:
+                    self.copter.gcs_s = self.copter.t_s
         return bool(messages)
 
     def answer(self) -> None:
@@ -307,7 +258,7 @@ class Autopilot:
             if why:
                 self.say(why)
             if message.command not in (mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAV_CMD_REQUEST_MESSAGE):
-                tell("command", self.copter.t_s, command=message.command, result=result, why=why)
+                self.copter.tell("command", command=message.command, result=result, why=why)
 
     def _command(self, m: Any) -> tuple[int, str]:
         c = self.copter
@@ -366,7 +317,7 @@ class Autopilot:
         ned, key = [m.x, m.y, m.z], (m.coordinate_frame, m.type_mask, m.x, m.y, m.z, m.vx, m.vy, m.vz)
         if key != self.last_setpoint:
             self.last_setpoint = key
-            tell("setpoint", c.t_s, frame=m.coordinate_frame, mask=m.type_mask, ned=ned, mode=c.mode)
+            c.tell("setpoint", frame=m.coordinate_frame, mask=m.type_mask, ned=ned, mode=c.mode)
         frames = (1, 8) if c.px4 else (1, 7, 8, 9)
         if m.coordinate_frame not in frames:
             return
@@ -377,23 +328,51 @@ class Autopilot:
             return
         if c.taking_off_to_m is not None:
             self.interrupted += 1
-            tell("take-off interrupted", c.t_s, ned=c.ned)
+            c.tell("take-off interrupted", ned=c.ned)
             c.taking_off_to_m = None
         if not m.type_mask & 0x7:  # position
             here = c.ned if m.coordinate_frame in (7, 9) else [0.0, 0.0, 0.0]
-            c.target, c.target_velocity = [h + n for h, n in zip(here, ned, strict=True)], None
+            c.aim([h + n for h, n in zip(here, ned, strict=True)])
         elif not m.type_mask & 0x38:
-            c.target_velocity = [m.vx, m.vy, m.vz]
-        c.target_s = c.t_s
+            c.target_velocity, c.target_s = [m.vx, m.vy, m.vz], c.t_s
 
 
 class Control:
-    """Commands on standard input, a line each.
+    """Commands on standard input, a line each; 0|1 ends or begins something, times are the vehicle's.
 
-    refuse 0|1 (to arm, and tells so before); balk 0|1 (to arm, without a warning); drop SECONDS (wall);
-    freeze 0|1; jump NORTH EAST DOWN (0 0 0: back); mode NAME, arm, disarm (a pilot); battery SHARE; counted
-    SHARE (of the battery, whose voltage stays); lose 0|1 (the estimate); late SECONDS (simulated); reboot;
-    times (of setpoints, from now on); report; quit.
+    Of the vehicle:
+        mode NAME, arm, disarm           a pilot does
+        fly NORTH EAST UP                it is in the air there, in the commanded mode, as a mission left it
+        param NAME VALUE|none            sets a parameter (whole numbers are PX4's integers); none: unknown
+        wind NORTH EAST                  m/s; more than 12 blow it away: it returns, and gets no nearer
+        motor SECONDS                    a motor fails: it tilts and falls, and is armed so long after that
+        battery SHARE                    charge and voltage
+        counted SHARE                    charge alone; the voltage stays
+        volts VOLTS|none                 voltage alone; the charge stays (below 10.5 V for 10 s: a text, and
+                                         the battery's health bit off, until it is switched on anew)
+        lose 0|1                         the position estimate
+        jump NORTH EAST DOWN             of the position that it reports; 0 0 0: back
+        reboot                           parameters and wind stay
+    Of commands:
+        refuse 0|1                       to arm, and says so before
+        balk 0|1                         to arm, without a warning
+        late SECONDS                     until commands are looked at
+        ignore COMMAND N                 the next N commands of that number (MAV_CMD) are lost on the way
+    Of the link:
+        drop SECONDS                     silent, wall time; on TCP the client is hung up on
+        freeze 0|1                       no positions
+        late_position SECONDS            the next position comes so late, behind those that follow it
+        zero_time, nonsense              the next position: at time_boot_ms 0; no finite numbers
+        twice 0|1                        each message comes twice
+        echo 0|1                         what a client sends comes back to it
+    Of others on the link:
+        second_bridge_heartbeats 0|1     of system 255, component 191, once a second
+        second_bridge_acks 0|1           answers to commands that this client did not send
+        second_bridge_target NORTH EAST DOWN|none   a setpoint of its own, ten times a second
+        second_vehicle SYSTEM [KIND]     another autopilot, on the ground; its events begin with "second ";
+                                         0: it is gone
+    Of this process:
+        times (of setpoints, from now on); report; quit
     """
 
     def __init__(self, autopilot: Autopilot) -> None:
@@ -438,8 +417,44 @@ class Control:
             case "late":
                 a.late_s = float(words[0])
             case "reboot":
-                c.__init__("px4" if c.px4 else "ardupilot", c.ready_s)  # type: ignore[misc]
+                c.switch_on()
                 a.forget_rates()
+            case "fly":
+                north, east, up = map(float, words)
+                c.put([north, east, -up])
+            case "param":
+                name, value = words
+                c.parameters.pop(name, None)
+                if value != "none":
+                    c.parameters[name] = int(value) if value.lstrip("-").isdecimal() else float(value)
+            case "wind":
+                c.wind = [float(word) for word in words]
+            case "motor":
+                c.falls, c.fallen_armed_s = True, float(words[0])
+            case "volts":
+                c.volts_set = None if words[0] == "none" else float(words[0])
+            case "ignore":
+                a.ignores[int(words[0])] = int(words[1])
+            case "late_position":
+                a.next_late_s = float(words[0])
+            case "zero_time":
+                a.next_is_zeroed = True
+            case "nonsense":
+                a.next_is_nonsense = True
+            case "twice":
+                a.twice = words[0] == "1"
+            case "echo":
+                a.echoes = words[0] == "1"
+            case "second_bridge_heartbeats":
+                a.rival_heartbeats = words[0] == "1"
+            case "second_bridge_acks":
+                a.rival_acks = words[0] == "1"
+            case "second_bridge_target":
+                a.rival_target = None if words[0] == "none" else [float(word) for word in words]
+            case "second_vehicle":
+                kind = words[1] if len(words) > 1 else "ardupilot"
+                second = Autopilot(Copter(kind, 0.0, "second "), int(words[0])) if words[0] != "0" else None
+                a.other = second
             case "times":
                 a.times = []
             case "report":
@@ -455,6 +470,9 @@ class Control:
                     landed=c.landed,
                     interrupted=a.interrupted,
                     times=a.times,
+                    target=c.target,
+                    wind=c.wind,
+                    tilt_rad=c.tilt_rad,
                 )
             case "quit":
                 self.ended = True

@@ -1,5 +1,6 @@
 """The fake autopilot behaves as the real ones were seen to; asked by a client that is not this project's."""
 
+import struct
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -234,3 +235,125 @@ def test_it_refuses_to_arm_on_demand(copter: Client) -> None:
     copter.until("LOCAL_POSITION_NED")
     assert copter.arm() == 4
     assert "check frame class" in copter.until("STATUSTEXT").text
+
+
+def test_parameters_are_answered_by_name_and_unknown_ones_are_not(copter: Client, px4: Client) -> None:
+    copter.link.mav.param_request_read_send(1, 1, b"NO_SUCH_NAME", -1)
+    copter.link.mav.param_request_read_send(1, 1, b"WPNAV_SPEED_DN", -1)
+    answer = copter.until("PARAM_VALUE")
+    assert (answer.param_id, answer.param_value) == ("WPNAV_SPEED_DN", 150.0)
+    px4.link.mav.param_request_read_send(1, 1, b"GF_ACTION", -1)
+    answer = px4.until("PARAM_VALUE")
+    assert answer.param_type == mav.MAV_PARAM_TYPE_INT32
+    assert struct.unpack("<i", struct.pack("<f", answer.param_value)) == (2,), "byte by byte"
+
+
+def test_more_wind_than_it_flies_blows_it_away_and_a_return_gets_no_nearer(copter: Client) -> None:
+    copter.fake.do("fly", 0, 0, 30)
+    copter.ask_rate(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    copter.until("LOCAL_POSITION_NED")
+    copter.fake.do("wind", 8, 0)
+    copter.wait_s(20.0)
+    assert copter.place() == pytest.approx((0.0, 0.0, -30.0), abs=1.0)
+    copter.fake.do("wind", 20, 0)
+    copter.wait_s(20.0)
+    assert copter.mode(6) == 0
+    away_m = copter.place()[0]
+    assert away_m > 40.0
+    copter.wait_s(20.0)
+    assert copter.place()[0] > away_m + 100.0
+    assert copter.fake.report()["mode"] == "RTL"
+
+
+def test_a_target_outside_its_fence_is_ignored_without_a_word(copter: Client) -> None:
+    copter.fake.do("fly", 0, 0, 30)
+    copter.fake.do("param", "FENCE_ENABLE", 1)
+    copter.fake.do("param", "FENCE_RADIUS", 50)
+    copter.ask_rate(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    copter.ask_rate(mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED)
+    copter.until("LOCAL_POSITION_NED")
+    copter.send(40.0, 0.0, -30.0)
+    copter.until("POSITION_TARGET_LOCAL_NED", lambda m: m.x == 40.0)
+    copter.send(60.0, 0.0, -30.0)
+    copter.wait_s(20.0)
+    assert copter.place() == pytest.approx((40.0, 0.0, -30.0), abs=0.5)
+    assert copter.until("POSITION_TARGET_LOCAL_NED").x == 40.0
+
+
+def test_it_falls_with_a_failed_motor_and_stays_armed_for_a_while(px4: Client) -> None:
+    px4.fake.do("fly", 0, 0, 40)
+    px4.ask_rate(mav.MAVLINK_MSG_ID_ATTITUDE)
+    px4.until("ATTITUDE", lambda m: abs(m.roll) < 0.1)
+    px4.fake.do("motor", 5)
+    px4.until("ATTITUDE", lambda m: m.roll > 1.0)
+    down_s = px4.fake.wait_for("touched down")["t_s"]
+    disarmed = px4.fake.wait_for("disarmed")
+    assert disarmed["why"] == "crashed"
+    assert disarmed["t_s"] - down_s == pytest.approx(5.0, abs=0.1)
+
+
+def test_low_voltage_is_reported_and_not_acted_upon(copter: Client) -> None:
+    copter.fake.do("fly", 0, 0, 40)
+    copter.ask_rate(mav.MAVLINK_MSG_ID_SYS_STATUS)
+    battery = mav.MAV_SYS_STATUS_SENSOR_BATTERY
+    copter.until("SYS_STATUS", lambda m: m.onboard_control_sensors_health & battery)
+    copter.fake.do("volts", 9.0)
+    assert copter.until("STATUSTEXT").text.startswith("Battery 1 is low 9.00V")
+    status = copter.until("SYS_STATUS", lambda m: not m.onboard_control_sensors_health & battery)
+    assert (status.voltage_battery, status.battery_remaining > 80) == (9000, True)
+    assert copter.fake.report()["mode"] == "GUIDED"
+
+
+def test_a_ground_station_is_missed_in_the_vehicle_s_own_time(copter: Client) -> None:
+    copter.fake.do("fly", 0, 0, 40)
+    copter.fake.do("param", "FS_GCS_ENABLE", 1)
+    copter.ask_rate(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    copter.wait_s(8.0)
+    assert copter.fake.report()["mode"] == "GUIDED", "none was there yet"
+    heartbeat = (18, 8, 0, 0, 4)
+    mav.MAVLink(copter.link, 255, 191).heartbeat_send(*heartbeat)
+    begun_s = copter.fake.report()["t_s"]
+    event = copter.fake.wait_for("mode")
+    while event["mode"] != "RTL":
+        event = copter.fake.wait_for("mode")
+    assert event["t_s"] - begun_s == pytest.approx(5.0, abs=1.0)
+
+
+def test_a_second_bridge_and_a_second_vehicle_on_the_link(copter: Client) -> None:
+    copter.fake.do("fly", 0, 0, 40)
+    copter.fake.do("second_bridge_heartbeats", 1)
+    copter.fake.do("second_bridge_acks", 1)
+    copter.fake.do("second_bridge_target", 30, 0, -40)
+    copter.until("HEARTBEAT", lambda m: (m.get_srcSystem(), m.get_srcComponent()) == (255, 191))
+    copter.until("COMMAND_ACK", lambda m: m.command == mav.MAV_CMD_DO_SET_MODE)
+    copter.ask_rate(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    copter.until("LOCAL_POSITION_NED", lambda m: m.x > 29.0)
+    copter.fake.do("second_vehicle", 2)
+    copter.until("HEARTBEAT", lambda m: m.get_srcSystem() == 2)
+    copter.link.mav.command_long_send(2, 1, mav.MAV_CMD_DO_SET_MODE, 0, 1, 4, 0, 0, 0, 0, 0)
+    assert copter.fake.wait_for("second mode")["mode"] == "GUIDED"
+    assert copter.fake.all("command") == []
+
+
+def test_commands_and_positions_that_are_lost_late_or_broken(copter: Client) -> None:
+    copter.fake.do("ignore", mav.MAV_CMD_DO_SET_MODE, 1)
+    copter.link.mav.command_long_send(1, 1, mav.MAV_CMD_DO_SET_MODE, 0, 1, 4, 0, 0, 0, 0, 0)
+    copter.fake.wait_for("lost")
+    assert copter.mode(4) == 0
+    copter.ask_rate(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 10.0)
+    newest_ms = copter.until("LOCAL_POSITION_NED").time_boot_ms
+    copter.fake.do("late_position", 1.5)
+    copter.fake.wait_for("control")
+    for _ in range(40):
+        message = copter.until("LOCAL_POSITION_NED")
+        if message.time_boot_ms < newest_ms:
+            break
+        newest_ms = message.time_boot_ms
+    assert newest_ms - message.time_boot_ms == pytest.approx(1500, abs=200)
+    copter.fake.do("zero_time")
+    copter.until("LOCAL_POSITION_NED", lambda m: m.time_boot_ms == 0)
+    copter.fake.do("nonsense")
+    copter.until("LOCAL_POSITION_NED", lambda m: m.y == 1e9)
+    copter.fake.do("twice", 1)
+    times = [copter.until("LOCAL_POSITION_NED").time_boot_ms for _ in range(20)]
+    assert len(set(times[-10:])) < 8
