@@ -17,7 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from uav_dc_ros import cli, resources, scenarios
-from uav_dc_ros.autopilot import fence, mavlink
+from uav_dc_ros.autopilot import beat, fence, mavlink
 from uav_dc_ros.autopilot.links import Address
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
@@ -171,7 +171,7 @@ def test_the_table_of_parameters_is_the_bridge_s() -> None:
     told = dict(re.findall(r"\| `(\w+)` \| ([^ |]+)", section))
     rows = {row.name: row.default for row in NODES["bridge"].parameters}
     expected = {name: str(default) for name, default in rows.items()}
-    for name in ("vehicle", "connect", "datum", "scenario", "seed", "journal", "arm"):
+    for name in ("vehicle", "connect", "system", "datum", "scenario", "seed", "journal", "arm"):
         del expected[name]  # told of elsewhere: options of run_all
     assert told == expected
 
@@ -190,7 +190,7 @@ def test_every_parameter_in_the_text_is_the_bridge_s() -> None:
 
 def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert f"system {mavlink.SYSTEM}, component {mavlink.COMPONENT}" in GUIDE
-    assert (mavlink.STREAM_S, mavlink.HEARTBEAT_S, mavlink.LIFE_S) == (1 / 20, 1.0, 1.0)
+    assert (beat.STREAM_S, beat.HEARTBEAT_S, beat.LIFE_S) == (1 / 20, 1.0, 1.0)
     assert "streams the setpoint 20 times a second" in GUIDE
     assert "end a second after its last decision" in GUIDE
     margins = (fence.MARGIN_M, fence.CEILING_MARGIN_M)

@@ -6,18 +6,19 @@ The vehicle itself is in `copter`. It tells in lines of JSON on standard output 
 where it listens, and takes commands on standard input: all of them are listed in `Control`. Simulated time
 runs `--speed` times faster than the clock.
 
-Imitated, as it was seen with a real ArduCopter (4.6) in simulation, or as PX4's documentation tells:
-a TCP server starts when its first client comes; messages at the rates that were asked for; an estimate that
-is ready after a while, and arming that is refused before, with a text; GUIDED without an estimate; one
-position setpoint that is followed for ever, a velocity setpoint for 3 s; a take-off by command, which a
-setpoint interrupts; OFFBOARD only after a second of setpoints at more than 2 Hz, and a failsafe (return) when
-they end; the frames each of them takes; speeds; disarming on the ground; MAVLink 1 until MAVLink 2 is
-heard; motors that need two seconds to lift it; the last ten metres down at half a metre per second; the
-charge that ArduCopter's simulator counts to nothing within seven minutes while the voltage stays; PX4's
-origin, sent when it changes or when asked for it, and its readiness, told for the mode that it is in;
-parameters, answered by name; ArduCopter's position target, reported in GUIDED only, and ignored without a
-word where it lies outside its fence; failsafes for its fence, a ground station that fell silent (in its own
-time), and low voltage (a text and the battery's health; neither acts on it). A foreign gimbal speaks too.
+Imitated, as it was seen with a real ArduCopter (4.6) in simulation, or as PX4's documentation tells: a TCP
+server starts when its first client comes; messages at the rates that were asked for; an estimate that is
+ready after a while, and arming that is refused before, with a text; GUIDED without an estimate; one position
+setpoint that is followed for ever, a velocity setpoint for 3 s; a take-off by command, which a setpoint
+interrupts; OFFBOARD only after a second of setpoints at more than 2 Hz, and a failsafe (return) when they
+end; the frames each of them takes; speeds; disarming on the ground; MAVLink 1 until MAVLink 2 is heard;
+motors that need two seconds to lift it; the last ten metres down at half a metre per second; the charge that
+ArduCopter's simulator counts to nothing within seven minutes while the voltage stays; PX4's origin, sent
+when it changes or when asked for it, and its readiness, told for the mode that it is in; parameters,
+answered by name; ArduCopter's position target, reported in GUIDED only, and ignored without a word where it
+lies outside its fence; failsafes for its fence, a ground station that fell silent (in its own time), and low
+voltage (a text and the battery's health; neither acts on it). Its metres are those of a sphere; all events
+here have true ones. A foreign gimbal speaks too.
 
 Not imitated: noise, GPS, missions, other failsafes, links that lose single messages, yaw. Unlike any real
 one, its time waits (a quarter of a second at most) for a client that was heard lately and is late now: the
@@ -35,6 +36,7 @@ import sys
 import time
 from typing import Any
 
+import pymap3d
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, tell
@@ -42,12 +44,26 @@ from tests.autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, tell
 ADVICE_S = 30.0
 OFFBOARD_GAP_S, OFFBOARD_PROOF_S = 0.5, 1.0
 SO_TIMESTAMPNS = 35  # of Linux: when a datagram came, however late this process reads it
-PATIENCE_S, AHEAD_S, LEAP_S = 0.25, 0.4, 0.4  # wall, simulated, simulated
+PATIENCE_S, LEAP_S = 0.25, 0.4  # wall, simulated
+AHEAD_S, AHEAD_OF_HEARTBEATS_S = 0.4, 1.2  # simulated: of a client that streams; of one that does not
 FLAGS, MADE_UP = 0x33F, 0x80
 HOME = (47.397742, 8.545594, 488.0)
+EARTH_M = {"ardupilot": 111318.84502145034 * 180 / math.pi, "px4": 6371000.0}  # LATLON_TO_M; of a sphere
 BRIDGE = (255, 191)  # system and component of a bridge
 POSITION, VELOCITY = 0xDF8, 0xDC7  # POSITION_TARGET_TYPEMASK
 RIVAL_S, RIVAL_ACK_S, RIVAL_HEARTBEAT_S = 0.1, 2.0, 1.0
+
+
+def scale_of(kind: str) -> list[float]:
+    """An autopilot's metres in a true one, north, east, down: it takes the Earth for a sphere.
+
+    ArduPilot's `Location::get_distance_NE`, and PX4's projection near its centre.
+    """
+    north_deg = pymap3d.enu2geodetic(0.0, 1000.0, 0.0, *HOME)[0] - HOME[0]
+    east_deg = pymap3d.enu2geodetic(1000.0, 0.0, 0.0, *HOME)[1] - HOME[1]
+    along_m = math.radians(north_deg) * EARTH_M[kind]
+    across_m = math.radians(east_deg) * EARTH_M[kind] * math.cos(math.radians(HOME[0]))
+    return [along_m / 1000.0, across_m / 1000.0, 1.0]
 
 
 class Codec(mav.MAVLink):
@@ -64,6 +80,7 @@ class Autopilot:
 
     def __init__(self, copter: Copter, system: int) -> None:
         self.copter = copter
+        self.scale = scale_of("px4" if copter.px4 else "ardupilot")
         self.mav = Codec(self, system, 1)
         self.gimbal = Codec(self, system, 154)
         self.rival = Codec(self, *BRIDGE)  # a second bridge, whose messages come by way of this autopilot
@@ -160,7 +177,7 @@ class Autopilot:
             self.mav.system_time_send(0, boot_ms)
         elif number == mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             if c.t_s >= c.ready_s and not self.frozen:
-                ned = [p + o for p, o in zip(c.ned, self.offset, strict=True)]
+                ned = self._own([p + o for p, o in zip(c.ned, self.offset, strict=True)])
                 if self.next_is_nonsense:
                     ned = [math.nan, 1e9, math.inf]
                 sent_ms = 0 if self.next_is_zeroed else boot_ms
@@ -193,6 +210,10 @@ class Autopilot:
         elif number == mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS:
             self.mav.estimator_status_send(0, FLAGS if c.ready else MADE_UP | 1, 0, 0, 0, 0, 0, 0, 0, 0)
 
+    def _own(self, ned: list[float]) -> list[float]:
+        """True metres, in the autopilot's own."""
+        return [n * s for n, s in zip(ned, self.scale, strict=True)]
+
     def _report_target(self, boot_ms: int) -> None:
         c = self.copter
         if c.landed or not (c.px4 or c.mode in FOLLOWS):
@@ -205,7 +226,7 @@ class Autopilot:
             ned, mask = c.target, 0 if c.px4 else POSITION
         else:
             ned, mask = [0.0] * 3, VELOCITY
-        self.mav.position_target_local_ned_send(boot_ms, 1, mask, *ned, 0, 0, 0, 0, 0, 0, 0, 0)
+        self.mav.position_target_local_ned_send(boot_ms, 1, mask, *self._own(ned), 0, 0, 0, 0, 0, 0, 0, 0)
 
     def _tell_parameter(self, name: str) -> None:
         """Answer for a parameter; one that it does not know has no answer."""
@@ -238,6 +259,7 @@ class Autopilot:
             elif name == "COMMAND_LONG":
                 self.later.append((self.copter.t_s + self.late_s, message))
             elif name == "SET_POSITION_TARGET_LOCAL_NED":
+                message.x, message.y = message.x / self.scale[0], message.y / self.scale[1]
                 self._setpoint(message)
             elif name == "PARAM_REQUEST_READ":
                 self._tell_parameter(message.param_id)
@@ -572,7 +594,9 @@ def main() -> None:
             heard_wall_s, heard_s = now_s, copter.t_s
         passed_s, wall_s = now_s - wall_s, now_s
         autopilot.answer()
-        waits = now_s - heard_wall_s < PATIENCE_S and copter.t_s - heard_s >= AHEAD_S
+        streams = copter.t_s - copter.streamed_s < 2 * AHEAD_OF_HEARTBEATS_S
+        ahead_s = AHEAD_S if streams else AHEAD_OF_HEARTBEATS_S
+        waits = now_s - heard_wall_s < PATIENCE_S and copter.t_s - heard_s >= ahead_s
         if not wire.met or waits:
             continue
         owed_s = min(owed_s + passed_s * options.speed, LEAP_S)

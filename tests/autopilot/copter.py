@@ -41,6 +41,7 @@ ARDUPILOT_PARAMETERS: dict[str, float] = {
     "FENCE_ALT_MAX": 100.0,
     "FENCE_ALT_MIN": -10.0,
     "FENCE_MARGIN": 2.0,
+    "FENCE_TOTAL": 0,
     "WPNAV_SPEED": 1020.0,
     "WPNAV_SPEED_UP": 250.0,
     "WPNAV_SPEED_DN": 150.0,

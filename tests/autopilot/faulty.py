@@ -31,8 +31,8 @@ ON_GROUND = (Phase.CONNECTING, Phase.PREFLIGHT)
 PILOT = {"ardupilot": "ALT_HOLD", "px4": "POSCTL"}
 MENDED = ("freeze 0", "jump 0 0 0", "lose 0", "battery 1")
 
-# What is done, what is done half a second later (nothing: it lasts), and how it may end; "" is a landing at
-# the dock.
+# What is done, one after the other; what is done half a second later (nothing: it lasts), and how it may end;
+# "" is a landing at the dock.
 AWAY = ("no heartbeat", "no position", "mode AUTO.RTL: changed by")
 FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "none": ("", "", ("",)),
@@ -51,6 +51,8 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "lose short": ("lose 1", "lose 0", ("", "position estimate")),
     "late": ("late 4", "", ("",)),
     "disarm": ("disarm", "", ("disarmed by", "")),
+    "odd messages": ("late_position 1.5; zero_time; nonsense; twice 1", "twice 0", ("",)),
+    "late message": ("late_position 1.5", "", ("",)),
     "silent policy": ("policy", "", ("no move from the policy", "")),
 }
 
@@ -91,7 +93,8 @@ def fly(kind: str, wire: str, name: str, at_s: float | None) -> dict[str, Any]:
                 if line == "policy":
                     flight.policy = None
                 else:
-                    autopilot.do(f"mode {PILOT[kind]}" if line == "pilot" else line)
+                    for one in (f"mode {PILOT[kind]}" if line == "pilot" else line).split("; "):
+                        autopilot.do(one)
             if begun_s is None or ended:
                 return
             if ending and now_s - begun_s > 0.5:

@@ -6,12 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uav_dc_ros.autopilot.dialects import ARDUCOPTER
 from uav_dc_ros.autopilot.frames import (
     Enu,
     Geodetic,
     LocalFrame,
     Ned,
     heading_of_yaw,
+    sphere_scale,
     to_enu,
     to_ned,
     wrapped,
@@ -94,6 +96,29 @@ def test_the_origin_of_an_autopilot_north_east_of_the_datum_counts_positive() ->
     origin = ZURICH.at(Enu(30.0, 40.0, 5.0))
     frame = LocalFrame(origin=origin.seen_from(ZURICH))
     assert frame.from_autopilot(Ned(0.0, 0.0, 0.0)) == pytest.approx(Enu(30.0, 40.0, 5.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("latitude_deg", [-60.0, -35.363261, 0.0, 47.4, 70.0])
+@pytest.mark.parametrize(("east_m", "north_m"), [(1000.0, 0.0), (0.0, 1000.0), (-700.0, 700.0)])
+def test_a_kilometre_of_the_grid_is_one_on_the_earth_in_arducopter_s_metres(
+    latitude_deg: float, east_m: float, north_m: float
+) -> None:
+    """Compared with what ArduPilot itself makes of two places: `Location::get_distance_NE`."""
+    origin = Geodetic(latitude_deg=latitude_deg, longitude_deg=149.165230, altitude_m=584.0)
+    there = origin.at(Enu(east_m, north_m, 0.0))
+    metres = 0.011131884502145034 * 1e7  # a degree of latitude
+    middle_deg = (latitude_deg + there.latitude_deg) / 2
+    own_m = (
+        (there.latitude_deg - latitude_deg) * metres,
+        (there.longitude_deg - origin.longitude_deg) * metres * math.cos(math.radians(middle_deg)),
+    )
+    frame = LocalFrame(origin=Enu(0.0, 0.0, 0.0), scale=sphere_scale(origin, ARDUCOPTER.earth_radius_m))
+    sent = frame.to_autopilot(Enu(east_m, north_m, 50.0))
+    # Axes are taken as parallel: at 70 degrees the meridians turn by 0.2 m on the way.
+    assert sent[:2] == pytest.approx(own_m, abs=0.25)
+    assert frame.from_autopilot(sent) == pytest.approx((east_m, north_m, 50.0))
+    off_m = math.dist(own_m, (north_m, east_m))
+    assert off_m > 0.6, "what it would be off by"
 
 
 @pytest.mark.parametrize(

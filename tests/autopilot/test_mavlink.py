@@ -1,6 +1,5 @@
 """The transport: addresses, whom it listens to, the stream, links that break."""
 
-import math
 import os
 import socket
 import subprocess
@@ -10,16 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.autopilot.flight import ROOT, Fake, fake, free_udp_port
+from uav_dc_ros.autopilot.beat import Heartbeat
 from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.hearing import Hearing
 from uav_dc_ros.autopilot.links import Address, LinkDown
 from uav_dc_ros.autopilot.mavlink import LIFE_S, Mavlink
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
+from uav_dc_ros.autopilot.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry
 from uav_dc_ros.errors import VehicleError
 
 HOME = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
@@ -79,25 +79,6 @@ def test_what_cannot_be_opened_now_is_told_and_tried_again(tmp_path: Path) -> No
     os.close(master)
 
 
-def test_messages_that_make_no_sense_change_nothing() -> None:
-    hearing = Hearing(HOME, Enu(0.0, 0.0, 0.0))
-    heartbeat(hearing, 1, 1, 3)
-    codec = mav.MAVLink(None, 1, 1)
-    for number, message in enumerate(
-        [
-            codec.gps_global_origin_encode(2_000_000_000, 85455940, 488000),
-            codec.gps_global_origin_encode(473977420, 85455940, 488000),
-            codec.local_position_ned_encode(1000, math.nan, 2.0, -3.0, 0.0, 0.0, 0.0),
-            codec.local_position_ned_encode(2000, 1.0, 2.0, math.inf, 0.0, 0.0, 0.0),
-            codec.sys_status_encode(0, 0, 0, 0, 65535, -1, -1, 0, 0, 0, 0, 0, 0),
-        ]
-    ):
-        hearing.hear(mav.MAVLink(None).parse_buffer(message.pack(codec))[0], float(number))
-    known = hearing.telemetry(5.0)
-    assert (known.position, known.position_s, known.battery, known.battery_v) == (None, None, None, None)
-    assert hearing.frame is not None
-
-
 @pytest.mark.parametrize(
     ("package", "address"),
     [("pymavlink.dialects.v20", "tcp:127.0.0.1:5760"), ("serial", "serial:/dev/ttyUSB0:57600")],
@@ -132,40 +113,6 @@ def test_a_mode_that_is_asked_for_is_the_one_that_is_understood(dialect: Any) ->
     if dialect is ARDUCOPTER:
         for number, name in dialect.names.items():
             assert names[number] == f"COPTER_MODE_{name}"
-
-
-def heartbeat(hearing: Hearing, system: int, component: int, autopilot: int, kind: int = 2) -> None:
-    codec = mav.MAVLink(None, system, component)
-    packed = codec.heartbeat_encode(kind, autopilot, 0, 4, 4).pack(codec)
-    hearing.hear(mav.MAVLink(None).parse_buffer(packed)[0], 1.0)
-
-
-def test_only_an_autopilot_is_listened_to() -> None:
-    hearing = Hearing(None, Enu(0.0, 0.0, 0.0))
-    heartbeat(hearing, 255, 190, 8, 6)  # a ground station
-    heartbeat(hearing, 1, 154, 8, 26)  # a gimbal
-    assert hearing.system is None
-    heartbeat(hearing, 7, 1, 3, 1)  # an aeroplane
-    assert hearing.telemetry(1.0).missing == ("system 7 is a vehicle of type 1; expected a multicopter")
-    heartbeat(hearing, 8, 1, 4)
-    assert "autopilot of kind 4; expected 3 (ArduCopter) or 12 (PX4)" in str(hearing.telemetry(1.0).missing)
-    heartbeat(hearing, 1, 1, 3)
-    heartbeat(hearing, 2, 1, 12)  # another aircraft
-    assert (hearing.system, hearing.dialect) == (1, ARDUCOPTER)
-
-
-def test_a_long_text_comes_in_parts() -> None:
-    hearing = Hearing(None, Enu(0.0, 0.0, 0.0))
-    heartbeat(hearing, 1, 1, 12)
-    codec, text = mav.MAVLink(None, 1, 1), "Preflight Fail: " + "x" * 60 + " the end"
-    for number in range(2):
-        part = text[number * 50 : number * 50 + 50].encode()
-        packed = codec.statustext_encode(2, part, 9, number).pack(codec)
-        hearing.hear(mav.MAVLink(None).parse_buffer(packed)[0], 1.0)
-    hearing.refused("arming", "failed", 1.5)
-    assert hearing.telemetry(1.5).refusal == f"arming refused: {text}"
-    hearing.granted("arming")
-    assert hearing.telemetry(1.5).refusal is None
 
 
 def until(vehicle: Mavlink, right: Callable[[Telemetry], bool], setpoint: Enu | None = None) -> Telemetry:
@@ -237,6 +184,143 @@ def test_the_stream_ends_with_those_who_decide() -> None:
             time.sleep(0.01)
 
 
+@pytest.mark.parametrize("kind", ["udpin", "udpout"])
+def test_the_first_heartbeat_goes_out_as_soon_as_somebody_can_hear_it(kind: str) -> None:
+    """The autopilot of a bridge that was killed waits for it: nobody has to steer first."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.settimeout(15.0)
+        autopilot.bind(("127.0.0.1", 0))
+        port = autopilot.getsockname()[1] if kind == "udpout" else free_udp_port()
+        with Mavlink(f"{kind}:127.0.0.1:{port}") as vehicle:
+            if kind == "udpin":
+                until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot")
+                autopilot.sendto(b"anything", ("127.0.0.1", port))
+            (message,) = mav.MAVLink(None).parse_buffer(autopilot.recv(4096))
+    assert (message.get_type(), message.get_srcSystem(), message.get_srcComponent()) == (
+        "HEARTBEAT",
+        255,
+        191,
+    )
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 8.0, 30.0])
+def test_heartbeats_keep_up_with_the_clock_and_with_the_vehicle(speed: float) -> None:
+    heartbeat, sent_s = Heartbeat(), []
+    for tick in range(2000):
+        now_s = 100.0 + 0.005 * tick
+        if heartbeat.is_due(now_s, speed * now_s):
+            heartbeat.sent(now_s, speed * now_s)
+            sent_s.append(now_s)
+    assert sent_s[0] == 100.0
+    assert np.diff(sent_s) == pytest.approx(1.0 / max(1.0, speed), abs=0.01)
+    heartbeat.begin()
+    assert heartbeat.is_due(now_s, speed * now_s), "another link, which has had none"
+
+
+def test_a_simulated_vehicle_that_is_faster_than_the_clock_misses_no_heartbeat() -> None:
+    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+        autopilot.do("param FS_GCS_ENABLE 1")
+        target = hover(autopilot, vehicle)
+        begun_s = vehicle.telemetry().vehicle_s
+        known = until(vehicle, lambda known: known.vehicle_s > begun_s + 40.0, target)
+        assert known.mode_name == "GUIDED", known.said
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_the_autopilot_s_limits_home_and_target_are_read(kind: str) -> None:
+    place = Enu(300.0, 400.0, 0.0)
+    fence = "FENCE_RADIUS" if kind == "ardupilot" else "GF_MAX_HOR_DIST"
+    with fake(kind, speed=20.0, ready_s=1.0) as autopilot:
+        autopilot.do("param FENCE_ENABLE 1")
+        autopilot.do(f"param {fence} 250.0")
+        with Mavlink(autopilot.address, place=place) as vehicle:
+            known = until(vehicle, lambda known: known.missing is None and known.home is not None)
+            assert known.system == f"system 1, {'ArduCopter' if kind == 'ardupilot' else 'PX4'}"
+            assert known.limits is not None
+            assert known.limits.fence_radius_m == 250.0
+            speeds = known.limits.speed_mps, known.limits.climb_mps, known.limits.descent_mps
+            assert speeds == pytest.approx((10.2, 2.5, 1.5))
+            assert known.home == pytest.approx(place, abs=0.05)
+            autopilot.do("fly 0 0 20")
+            target = Enu(310.0, 400.0, 20.0)
+            known = until(vehicle, lambda known: known.target is not None, target)
+            known = until(vehicle, lambda known: known.target == pytest.approx(target, abs=0.1), target)
+            autopilot.do("motor 1")
+            until(vehicle, lambda known: (known.tilt_rad or 0.0) > 1.0, target)
+
+
+def test_parameters_that_a_vehicle_does_not_know_hold_nobody_up() -> None:
+    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot:
+        for name in ("FENCE_AUTOENABLE", "WPNAV_SPEED", "WPNAV_SPEED_UP", "WPNAV_SPEED_DN"):
+            autopilot.do(f"param {name} none")
+        for name, value in (("WP_SPD", 8.5), ("WP_SPD_UP", 2.0), ("WP_SPD_DN", 1.0)):
+            autopilot.do(f"param {name} {value}")
+        autopilot.wait_for("control")
+        with Mavlink(autopilot.address) as vehicle:
+            known = until(vehicle, lambda known: known.missing is None)
+            assert known.limits == Limits(speed_mps=8.5, climb_mps=2.0, descent_mps=1.0)
+
+
+def test_of_two_vehicles_on_a_link_the_one_that_is_named_is_commanded() -> None:
+    with fake("ardupilot", "udp", speed=20.0, ready_s=1.0) as autopilot:
+        autopilot.do("second_vehicle 7 px4")
+        with Mavlink(autopilot.address) as vehicle:
+            known = until(vehicle, lambda known: "2 autopilots on this link" in str(known.missing))
+            assert "system 7, PX4" in str(known.missing)
+            assert "expected --system N" in str(known.missing)
+        with Mavlink(autopilot.address, system=1) as vehicle:
+            hover(autopilot, vehicle)
+            assert vehicle.telemetry().system == "system 1, ArduCopter"
+        with Mavlink(autopilot.address, system=7) as vehicle:
+            known = until(vehicle, lambda known: known.missing is None)
+            assert (known.system, known.armed) == ("system 7, PX4", False)
+    assert not [event for event in autopilot.events if event["event"].startswith("second ")]
+
+
+def test_a_second_bridge_is_noticed_and_a_router_s_echo_is_none() -> None:
+    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+        autopilot.do("echo 1")
+        target = hover(autopilot, vehicle)
+        begun_s = vehicle.telemetry().vehicle_s
+        known = until(vehicle, lambda known: known.vehicle_s > begun_s + 20.0, target)
+        assert known.other_controller is None
+        autopilot.do("second_bridge_heartbeats 1")
+        known = until(vehicle, lambda known: known.other_controller is not None, target)
+        assert str(known.other_controller).startswith("heartbeats of system 255, component 191")
+        autopilot.do("second_bridge_heartbeats 0")
+        until(vehicle, lambda known: known.other_controller is None, target)
+        autopilot.do("second_bridge_target 40 40 -20")
+        known = until(vehicle, lambda known: known.other_controller is not None, target)
+        assert str(known.other_controller).startswith("position targets")
+
+
+def test_a_take_off_command_that_was_lost_twice_is_followed_when_it_comes() -> None:
+    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+        autopilot.do(f"ignore {mav.MAV_CMD_NAV_TAKEOFF} 2")
+        until(vehicle, lambda known: known.missing is None and known.estimate_ok)
+        for wish, right in [
+            (SetMode(Mode.COMMANDED), lambda known: known.mode is Mode.COMMANDED),
+            (Arm(), lambda known: known.armed),
+        ]:
+            vehicle.ask(wish)
+            until(vehicle, right)
+        for _ in range(2):
+            vehicle.ask(TakeOff(10.0))
+            autopilot.wait_for("lost")
+        vehicle.ask(TakeOff(10.0))
+        autopilot.wait_for("taken off")
+
+
+def test_a_flying_vehicle_without_a_datum_says_what_to_give() -> None:
+    with fake("px4", speed=20.0, ready_s=1.0) as autopilot:
+        autopilot.do("fly 10 10 20")
+        with Mavlink(autopilot.address) as vehicle:
+            until(vehicle, lambda known: "expected a datum" in str(known.missing))
+        with Mavlink(autopilot.address, datum=HOME) as vehicle:
+            known = until(vehicle, lambda known: known.missing is None)
+            assert known.position is not None
+
+
 def test_it_comes_back_to_a_vehicle_that_flies_and_repeats_no_wish() -> None:
     with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
         target = hover(autopilot, vehicle)
@@ -275,34 +359,6 @@ def test_what_keeps_a_vehicle_on_the_ground_is_told_in_its_own_words() -> None:
         until(vehicle, lambda known: known.missing == waiting)
         autopilot.do("lose", 0)
         until(vehicle, lambda known: known.missing is None and known.estimate_ok)
-
-
-def test_px4_is_ready_whatever_it_says_of_the_mode_that_it_is_in() -> None:
-    assert PX4.estimate_ok(0x37, 0, armed=False)
-    assert not PX4.estimate_ok(0x37 | 0x80, 0, armed=False)
-    assert not ARDUCOPTER.estimate_ok(0x33F, 0, armed=False)
-    assert ARDUCOPTER.estimate_ok(0x33F, 1 << 28, armed=False)
-    assert not ARDUCOPTER.estimate_ok(0x37, 1 << 28, armed=False), "not where it would arm"
-    assert ARDUCOPTER.estimate_ok(0x37, 0, armed=True), "what it predicts on the ground is gone in the air"
-
-
-def test_the_time_of_a_vehicle_that_starts_anew_goes_on_and_its_position_is_forgotten() -> None:
-    hearing = Hearing(HOME, Enu(0.0, 0.0, 0.0))
-    heartbeat(hearing, 1, 1, 3)
-    codec = mav.MAVLink(None, 1, 1)
-
-    def hear(message: Any) -> Telemetry:
-        hearing.hear(mav.MAVLink(None).parse_buffer(message.pack(codec))[0], 1.0)
-        return hearing.telemetry(1.0)
-
-    hear(codec.gps_global_origin_encode(473977420, 85455940, 488000))
-    known = hear(codec.local_position_ned_encode(600_000, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0))
-    assert known.position == pytest.approx((2.0, 1.0, 3.0), abs=0.01)
-    assert known.vehicle_s == 600.0
-    known = hear(codec.system_time_encode(0, 599_900))
-    assert (known.vehicle_s, known.position is None) == (600.0, False), "a message that was overtaken"
-    known = hear(codec.system_time_encode(0, 2_000))
-    assert (known.vehicle_s, known.position, known.position_s) == (602.0, None, None), "or it would be fresh"
 
 
 def test_a_link_that_cannot_be_opened_says_why() -> None:

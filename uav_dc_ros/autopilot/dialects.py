@@ -3,10 +3,11 @@
 Modes are MAVLink's `custom_mode`: ArduCopter's are plain numbers; PX4 packs a main and a sub mode into one.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from uav_dc_ros.autopilot.vehicle import Mode
+from uav_dc_ros.autopilot import limits
+from uav_dc_ros.autopilot.vehicle import Limits, Mode
 
 ON_GROUND, IN_AIR, TAKING_OFF, LANDING = 1, 2, 3, 4  # MAV_LANDED_STATE
 COPTERS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})  # MAV_TYPE of what hovers
@@ -35,6 +36,10 @@ class Dialect:
             which is not the one that it is to arm in.
         climbs_by_setpoint: takes off by setpoints, and wants to see some before it follows any. Otherwise it
             is given a command to take off, and setpoints would interrupt that.
+        parameters: names of those that hold its limits.
+        limits: what their values mean.
+        parameters_are_bytes: does it send a parameter's bytes, where that is an integer?
+        earth_radius_m: of the sphere that it takes the Earth for, see `frames.sphere_scale`.
     """
 
     name: str
@@ -45,6 +50,10 @@ class Dialect:
     ready_flags: int
     tells_readiness: bool
     climbs_by_setpoint: bool
+    parameters: limits.Names
+    limits: Callable[[Mapping[str, float]], Limits]
+    parameters_are_bytes: bool
+    earth_radius_m: float
 
     def mode(self, custom_mode: int) -> Mode:
         """What a mode is here."""
@@ -122,6 +131,10 @@ ARDUCOPTER = Dialect(
     ready_flags=ARMABLE,
     tells_readiness=True,
     climbs_by_setpoint=False,
+    parameters=limits.ARDUCOPTER,
+    limits=limits.of_arducopter,
+    parameters_are_bytes=False,
+    earth_radius_m=6_378_100.0,
 )
 
 PX4 = Dialect(
@@ -159,6 +172,10 @@ PX4 = Dialect(
     ready_flags=FLYABLE,
     tells_readiness=False,
     climbs_by_setpoint=True,
+    parameters=limits.PX4,
+    limits=limits.of_px4,
+    parameters_are_bytes=True,
+    earth_radius_m=6_371_000.0,
 )
 
 DIALECTS = {3: ARDUCOPTER, 12: PX4}  # by MAV_AUTOPILOT

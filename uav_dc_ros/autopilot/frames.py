@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 from uav_dc_ros.errors import VehicleError
 
 HIGHEST_M = 10_000.0
+EQUATOR_M, SQUARED_ECCENTRICITY = 6_378_137.0, 6.694379990141e-3  # of WGS84
 
 
 class Enu(NamedTuple):
@@ -118,6 +119,9 @@ class Geodetic:
         )
 
 
+NO_SCALE = Enu(1.0, 1.0, 1.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class LocalFrame:
     """Between the grid's ENU metres and an autopilot's local NED metres.
@@ -126,17 +130,35 @@ class LocalFrame:
 
     Attributes:
         origin: where the autopilot counts from, in the grid's ENU frame.
+        scale: its metres in one metre, east, north and up; see `sphere_scale`.
     """
 
     origin: Enu
+    scale: Enu = NO_SCALE
 
     def to_autopilot(self, position: Enu) -> Ned:
         """A position of the grid, as the autopilot's local NED."""
-        return to_ned(Enu(*(p - o for p, o in zip(position, self.origin, strict=True))))
+        return to_ned(Enu(*((p - o) * s for p, o, s in zip(position, self.origin, self.scale, strict=True))))
 
     def from_autopilot(self, position: Ned) -> Enu:
         """A position of the autopilot's, in the grid's ENU frame."""
-        return Enu(*(p + o for p, o in zip(to_enu(position), self.origin, strict=True)))
+        return Enu(*(p / s + o for p, o, s in zip(to_enu(position), self.origin, self.scale, strict=True)))
+
+
+def sphere_scale(origin: Geodetic, radius_m: float) -> Enu:
+    """Metres of an autopilot that takes the Earth for a sphere, in one metre of WGS84: east, north and up.
+
+    It turns degrees into metres by one radius; an ellipsoid has two at each latitude, and they differ from
+    that by up to 0.5 %, which is metres at the end of a kilometre.
+
+    Args:
+        origin: where it counts from.
+        radius_m: of its sphere.
+    """
+    flat = 1 - SQUARED_ECCENTRICITY * math.sin(math.radians(origin.latitude_deg)) ** 2
+    across_m = EQUATOR_M / math.sqrt(flat) + origin.altitude_m
+    along_m = EQUATOR_M * (1 - SQUARED_ECCENTRICITY) / flat**1.5 + origin.altitude_m
+    return Enu(radius_m / across_m, radius_m / along_m, 1.0)
 
 
 def _pymap3d() -> Any:

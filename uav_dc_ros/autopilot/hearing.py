@@ -1,27 +1,30 @@
 """What is known of the vehicle, from the MAVLink messages that came. No input or output."""
 
 import math
-from collections import deque
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from uav_dc_ros.autopilot.dialects import BATTERY, COPTERS, DIALECTS, ON_GROUND, Dialect
-from uav_dc_ros.autopilot.frames import Enu, Geodetic, LocalFrame, Ned
-from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
+from uav_dc_ros.autopilot import limits
+from uav_dc_ros.autopilot.dialects import BATTERY, LANDING, ON_GROUND, Dialect
+from uav_dc_ros.autopilot.frames import Enu, Geodetic, LocalFrame, Ned, sphere_scale
+from uav_dc_ros.autopilot.ordering import Discard, Sequence, VehicleClock
+from uav_dc_ros.autopilot.rivals import Rivals
+from uav_dc_ros.autopilot.systems import AUTOPILOT, COMPONENT, SYSTEM, Systems
+from uav_dc_ros.autopilot.vehicle import Limits, Mode, Telemetry
 
-AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a camera, a ground station
+POSITION_IGNORED = 0x7  # POSITION_TARGET_TYPEMASK
 ACCEPTED, IN_PROGRESS = 0, 5  # MAV_RESULT
 WARNING = 4  # MAV_SEVERITY; what is below is worse
 CHUNK = 50  # characters of a STATUSTEXT
 NO_VOLTAGE = 65535
 ADVICE_S = 60.0  # age of a reason not to arm that may still hold; ArduPilot repeats it every 30 s
 TEXT_S = 2.0  # a reason comes within this time before or after the refusal, steady clock
-STALE_S = 3.0  # age after which the last report on an estimate says nothing, steady clock
-REBOOT_S = 1.0  # a vehicle whose time goes back by more has started anew
+STALE_S = 3.0  # age after which a report on an estimate, an attitude or a target says nothing, steady clock
+FARTHEST_M = 1e5  # no vehicle is further from where it was switched on
 
-# What is asked for, Hz of the vehicle's time; its dialect adds the estimate's message.
+# What is asked for, Hz of the vehicle's time; its dialect adds the estimate's message. Nobody flies without.
 RATES_HZ = {
     "LOCAL_POSITION_NED": 20.0,
     "EXTENDED_SYS_STATE": 5.0,
@@ -29,10 +32,27 @@ RATES_HZ = {
     "SYS_STATUS": 2.0,
     "GPS_GLOBAL_ORIGIN": 1.0,
 }
+# What helps where a vehicle sends it; few, for a telemetry radio carries a kilobyte or two a second.
+HELPFUL_HZ = {"ATTITUDE": 4.0, "POSITION_TARGET_LOCAL_NED": 2.0, "HOME_POSITION": 0.5}
 ONCE = frozenset({"GPS_GLOBAL_ORIGIN"})  # PX4 sends it when it changes, or is asked for this one
 ESTIMATE_HZ = 5.0
 ADVICE = ("PreArm", "Preflight", "Arm:")
 SEEN = 64  # texts that are kept
+
+
+def _is_on_earth(message: Any) -> bool:
+    return abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7
+
+
+# Messages whose values no vehicle can have are discarded.
+IS_POSSIBLE: dict[str, Callable[[Any], bool]] = {
+    "LOCAL_POSITION_NED": lambda m: all(abs(value) <= FARTHEST_M for value in (m.x, m.y, m.z)),
+    "GPS_GLOBAL_ORIGIN": _is_on_earth,
+    "HOME_POSITION": _is_on_earth,
+    "ATTITUDE": lambda m: math.isfinite(m.roll) and math.isfinite(m.pitch),
+    "SYS_STATUS": lambda m: -1 <= m.battery_remaining <= 100,
+    "EXTENDED_SYS_STATE": lambda m: m.landed_state <= LANDING,
+}
 
 
 class Hearing:
@@ -41,27 +61,33 @@ class Hearing:
     Args:
         datum: of the grid. None: the vehicle stands at `place` when its first position comes.
         place: in the grid's ENU frame, see `datum`.
-        system: whom to listen to; None: to the first autopilot that speaks.
+        system: whom to listen to; None: to the only autopilot.
+        again: was the vehicle flown by this mission before?
 
     Attributes:
-        system: the vehicle's number; None: nobody spoke yet.
-        dialect: what kind of autopilot it has.
+        systems: the vehicle among those on the link.
+        rivals: evidence of another controller.
+        parameters: of the vehicle.
+        discarded: messages of the vehicle that were ignored, by reason.
         datum: of the grid, once it is known.
         texts: what it said of itself, with the steady time, seconds.
         landed_state: MAV_LANDED_STATE.
         heard: when a message of each name last came, steady time, seconds.
         frame: of its local position.
-        vehicle_s: its own time, seconds; goes on where it starts anew.
     """
 
-    def __init__(self, datum: Geodetic | None, place: Enu, system: int | None = None) -> None:
-        self.datum, self.place, self.system = datum, place, system
-        self.dialect: Dialect | None = None
+    def __init__(
+        self, datum: Geodetic | None, place: Enu, system: int | None = None, again: bool = False
+    ) -> None:
+        self.datum, self.place = datum, place
+        self.systems, self.rivals = Systems(system, again), Rivals((SYSTEM, COMPONENT))
+        self.parameters = limits.Parameters()
+        self.discarded: Counter[str] = Counter()
+        self._sequence, self._clock = Sequence(), VehicleClock()
         self.frame: LocalFrame | None = None
         self.texts: deque[tuple[float, str]] = deque(maxlen=SEEN)
         self.landed_state: int | None = None
         self.heard: dict[str, float] = {}
-        self._stranger: str | None = None  # why somebody who spoke was not listened to
         self._custom_mode, self._armed = 0, False
         self._flags, self._health = 0, 0
         self._battery: float | None = None
@@ -71,23 +97,60 @@ class Hearing:
         self._ned: Ned | None = None
         self._position: Enu | None = None
         self._position_s: float | None = None
-        self._position_ms = -1
-        self._boot_s, self.vehicle_s = 0.0, 0.0
+        self._home: Geodetic | None = None
+        self._target: Ned | None = None
+        self._tilt_rad: float | None = None
         self._refusals: dict[str, tuple[float, str]] = {}  # by what was refused
         self._chunks: dict[int, str] = {}
 
-    def hear(self, message: Any, now_s: float) -> None:
-        """Take in a message of pymavlink's, at a steady time."""
-        name = message.get_type()
-        if name == "HEARTBEAT":
-            self._meet(message)
-        if message.get_srcSystem() != self.system or message.get_srcComponent() != AUTOPILOT:
-            return
+    @property
+    def system(self) -> int | None:
+        """The vehicle's number; None: it has not spoken yet, and was not named."""
+        return self.systems.number
+
+    @property
+    def dialect(self) -> Dialect | None:
+        """What kind of autopilot it has; None: it has not spoken yet."""
+        return self.systems.dialect
+
+    @property
+    def vehicle_s(self) -> float:
+        """Its own time, seconds; goes on where it starts anew."""
+        return self._clock.vehicle_s
+
+    def hear(self, message: Any, now_s: float) -> bool:
+        """Take in a message of pymavlink's, at a steady time; was it the vehicle's, and news."""
+        name, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        known = self.dialect is not None and source == (self.system, AUTOPILOT)
+        if name == "HEARTBEAT" and source == (SYSTEM, COMPONENT):
+            self.rivals.heartbeat(message.get_seq(), self.vehicle_s)
+        if name == "HEARTBEAT" and not known:
+            self.systems.meet(message, now_s)
+        if source != (self.system, AUTOPILOT) or self.dialect is None:
+            return False
+        if (why := self._discards(name, message, now_s)) is not None:
+            self.discarded[why] += 1
+            return False
+        if name == "HEARTBEAT" and known:
+            self.systems.meet(message, now_s)
         self.heard[name] = now_s
-        if (boot_ms := getattr(message, "time_boot_ms", None)) is not None:
-            self._pass_time(boot_ms / 1e3)
         if (take := getattr(self, f"_on_{name.lower()}", None)) is not None:
             take(message, now_s)
+        return True
+
+    def _discards(self, name: str, message: Any, now_s: float) -> Discard | None:
+        """Why a message of the vehicle is ignored; None: it is not."""
+        if (why := self._sequence.take(message.get_seq(), now_s)) is not None:
+            return why
+        if not IS_POSSIBLE.get(name, lambda _: True)(message):
+            return Discard.IMPOSSIBLE
+        if (boot_ms := getattr(message, "time_boot_ms", None)) is None:
+            return None
+        restarts = self._clock.restarts
+        why = self._clock.take(name, boot_ms, now_s)
+        if self._clock.restarts != restarts:
+            self._forget()
+        return why
 
     def refused(self, what: str, result: str, now_s: float) -> None:
         """Keep that something was refused."""
@@ -101,7 +164,8 @@ class Hearing:
         """What is known now."""
         dialect = self.dialect
         estimate_s = self.heard.get(dialect.estimate_message) if dialect else None
-        sure = estimate_s is not None and now_s - estimate_s <= STALE_S and dialect is not None
+        sure = dialect is not None and self._is_fresh(dialect.estimate_message, now_s)
+        target = self._target if self._is_fresh("POSITION_TARGET_LOCAL_NED", now_s) else None
         return Telemetry(
             heartbeat_s=self.heard.get("HEARTBEAT"),
             mode=dialect.mode(self._custom_mode) if dialect else Mode.OTHER,
@@ -113,6 +177,7 @@ class Hearing:
             estimate_ok=bool(
                 sure and dialect and dialect.estimate_ok(self._flags, self._health, self._armed)
             ),
+            estimate_s=estimate_s,
             battery=self._battery,
             battery_v=self._battery_v,
             battery_fails=self._battery_fails,
@@ -120,39 +185,42 @@ class Hearing:
             missing=self._missing(now_s),
             refusal=self._refusal(),
             said="; ".join(self._said(now_s - TEXT_S, now_s)),
+            home=self._home.seen_from(self.datum) if self._home and self.datum else None,
+            target=self.frame.from_autopilot(target) if self.frame and target else None,
+            tilt_rad=self._tilt_rad if self._is_fresh("ATTITUDE", now_s) else None,
+            limits=self._limits(),
+            other_controller=self.rivals.found(self.vehicle_s),
+            system=str(self.systems),
+            discarded=dict(self.discarded),
         )
 
     def wanted(self) -> Mapping[str, float]:
         """The messages that the vehicle shall send, Hz."""
+        return {**self._needed(), **HELPFUL_HZ} if self.dialect else {}
+
+    def unanswered(self, now_s: float) -> list[str]:
+        """Parameters to ask for now, at a steady time; they count as asked for."""
+        return self.parameters.due(self.dialect.parameters, now_s) if self.dialect else []
+
+    def _needed(self) -> dict[str, float]:
         return {**RATES_HZ, self.dialect.estimate_message: ESTIMATE_HZ} if self.dialect else {}
 
-    # Who speaks.
+    def _is_fresh(self, name: str, now_s: float) -> bool:
+        return now_s - self.heard.get(name, -math.inf) <= STALE_S
 
-    def _meet(self, heartbeat: Any) -> None:
-        if heartbeat.get_srcComponent() != AUTOPILOT or heartbeat.autopilot == NO_AUTOPILOT:
-            return
-        system = heartbeat.get_srcSystem()
-        if self.system is not None and (system != self.system or self.dialect is not None):
-            return
-        dialect = DIALECTS.get(heartbeat.autopilot)
-        if dialect is None:
-            self._stranger = f"system {system} has an autopilot of kind {heartbeat.autopilot}; expected " + (
-                " or ".join(f"{number} ({known.name})" for number, known in DIALECTS.items())
-            )
-        elif heartbeat.type not in COPTERS:
-            self._stranger = f"system {system} is a vehicle of type {heartbeat.type}; expected a multicopter"
-        else:
-            self.system, self.dialect, self._stranger = system, dialect, None
+    def _limits(self) -> Limits | None:
+        return (
+            self.dialect.limits(self.parameters.values) if self.dialect and self.parameters.values else None
+        )
 
     def _missing(self, now_s: float) -> str | None:
-        if self.dialect is None:
-            return self._stranger or (
-                "no heartbeat from an autopilot"
-                + (f" of system {self.system}" if self.system is not None else "")
-            )
-        lacking = [name for name in self.wanted() if name not in self.heard]
+        if (missing := self.systems.missing(now_s)) is not None or self.dialect is None:
+            return missing
+        lacking = [name for name in self._needed() if name not in self.heard]
         if lacking:
             return f"the autopilot has not sent {', '.join(lacking)} yet"
+        if not self._armed and self.parameters.are_waited_for(self.dialect.parameters, now_s):
+            return "the autopilot has not answered for its parameters yet"
         if not self._armed and not self._flags_ok():
             told = [text for text in self._said(now_s - ADVICE_S, now_s) if text.startswith(ADVICE)]
             return f"the autopilot is not ready to arm: {told[-1] if told else 'no position estimate yet'}"
@@ -170,25 +238,33 @@ class Hearing:
             self.granted("arming")
 
     def _on_gps_global_origin(self, message: Any, now_s: float) -> None:
-        if abs(message.latitude) > 90e7 or abs(message.longitude) > 180e7:
-            return  # nowhere on the Earth
-        self._origin = Geodetic(
-            latitude_deg=message.latitude / 1e7,
-            longitude_deg=message.longitude / 1e7,
-            altitude_m=message.altitude / 1e3,
-        )
+        self._origin = _geodetic(message)
         if self.datum is not None:
-            self.frame = LocalFrame(origin=self._origin.seen_from(self.datum))
+            self.frame = self._frame_at(self._origin.seen_from(self.datum))
         self._place()
 
+    def _on_home_position(self, message: Any, now_s: float) -> None:
+        self._home = _geodetic(message)
+
     def _on_local_position_ned(self, message: Any, now_s: float) -> None:
-        if message.time_boot_ms == self._position_ms:
-            return  # the same again
-        if not all(map(math.isfinite, (message.x, message.y, message.z))):
-            return  # no position
-        self._position_ms = message.time_boot_ms
-        self._ned, self._position_s = Ned(message.x, message.y, message.z), now_s
+        self._ned = Ned(message.x, message.y, message.z)
+        self._position_s = now_s - self._clock.lag_s(message.time_boot_ms)
         self._place()
+
+    def _on_position_target_local_ned(self, message: Any, now_s: float) -> None:
+        target = Ned(message.x, message.y, message.z)
+        has_one = not message.type_mask & POSITION_IGNORED and all(map(math.isfinite, target))
+        self._target = target if has_one else None
+        if self.dialect is not None and self.dialect.mode(self._custom_mode) is Mode.COMMANDED:
+            self.rivals.target(self._target, self.vehicle_s)
+
+    def _on_attitude(self, message: Any, now_s: float) -> None:
+        self._tilt_rad = math.acos(math.cos(message.roll) * math.cos(message.pitch))
+
+    def _on_param_value(self, message: Any, now_s: float) -> None:
+        if self.dialect is not None:
+            value = limits.number(message, bytewise=self.dialect.parameters_are_bytes)
+            self.parameters.take(message.param_id, value)
 
     def _on_extended_sys_state(self, message: Any, now_s: float) -> None:
         self.landed_state = message.landed_state
@@ -225,25 +301,29 @@ class Hearing:
             if self.landed_state != ON_GROUND or not self._flags_ok():
                 return
             # Here is `place`, as far as the autopilot knows: the datum lies as far away as that says.
-            here = LocalFrame(origin=Enu(0.0, 0.0, 0.0)).from_autopilot(self._ned)
+            here = self._frame_at(Enu(0.0, 0.0, 0.0)).from_autopilot(self._ned)
             offset = Enu(*(h - p for h, p in zip(here, self.place, strict=True)))
             self.datum = self._origin.at(offset)
-            self.frame = LocalFrame(origin=self._origin.seen_from(self.datum))
+            self.frame = self._frame_at(self._origin.seen_from(self.datum))
         if self.frame is not None:
             self._position = self.frame.from_autopilot(self._ned)
 
     def _flags_ok(self) -> bool:
         return self.dialect is not None and self.dialect.estimate_ok(self._flags, self._health, self._armed)
 
-    def _pass_time(self, boot_s: float) -> None:
-        vehicle_s = self._boot_s + boot_s
-        if vehicle_s < self.vehicle_s - REBOOT_S:
-            self._boot_s = self.vehicle_s
-            self.heard = {"HEARTBEAT": self.heard["HEARTBEAT"]} if "HEARTBEAT" in self.heard else {}
-            self._position, self._ned, self._origin, self._position_s = None, None, None, None
-            self.landed_state, self._flags = None, 0
-            vehicle_s = self._boot_s + boot_s
-        self.vehicle_s = max(self.vehicle_s, vehicle_s)
+    def _frame_at(self, origin: Enu) -> LocalFrame:
+        """The autopilot's local frame; it has spoken, and told its origin."""
+        assert self.dialect is not None
+        assert self._origin is not None
+        return LocalFrame(origin=origin, scale=sphere_scale(self._origin, self.dialect.earth_radius_m))
+
+    def _forget(self) -> None:
+        """It was started anew: what it told before says nothing."""
+        self.heard = {"HEARTBEAT": self.heard["HEARTBEAT"]} if "HEARTBEAT" in self.heard else {}
+        self._position, self._ned, self._origin, self._position_s = None, None, None, None
+        self._home, self._target, self._tilt_rad = None, None, None
+        self.landed_state, self._flags = None, 0
+        self.parameters = limits.Parameters()
 
     def _said(self, from_s: float, to_s: float) -> list[str]:
         """What it warned of between two steady times, each of it once."""
@@ -255,3 +335,12 @@ class Hearing:
         what, (at_s, result) = max(self._refusals.items(), key=lambda refusal: refusal[1][0])
         said = self._said(at_s - TEXT_S, at_s + TEXT_S)
         return f"{what} refused: {'; '.join(said) or result}"
+
+
+def _geodetic(message: Any) -> Geodetic:
+    """The place of a message, which has degrees times 1e7 and millimetres."""
+    return Geodetic(
+        latitude_deg=message.latitude / 1e7,
+        longitude_deg=message.longitude / 1e7,
+        altitude_m=message.altitude / 1e3,
+    )

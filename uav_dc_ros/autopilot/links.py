@@ -30,8 +30,8 @@ class Link(Protocol):
     def read(self) -> bytes:
         """What has come; nothing, if nothing has."""
 
-    def write(self, data: bytes) -> None:
-        """Send all of it."""
+    def write(self, data: bytes) -> bool:
+        """Send all of it; was there anybody to send it to."""
 
     def close(self) -> None:
         """End it."""
@@ -128,7 +128,7 @@ class _Tcp:
             raise LinkDown(f"{self.address} was closed by the other side")
         return data
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         try:
             sent = self.socket.send(data)
         except BlockingIOError:
@@ -137,6 +137,7 @@ class _Tcp:
             raise LinkDown(f"{self.address} broke: {error.strerror}") from None
         if sent < len(data):  # half a message would spoil the next one
             raise LinkDown(f"{self.address} takes nothing any more")
+        return True
 
     def close(self) -> None:
         self.socket.close()
@@ -170,12 +171,13 @@ class _Udp:
             raise LinkDown(f"{self.address} broke: {error.strerror}") from None
         return data
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         if self.peer is None:
-            return  # nobody has called yet
+            return False  # nobody has called yet
         # What does not go out is lost, as UDP may lose anything: heartbeats tell.
         with contextlib.suppress(OSError):
             self.socket.sendto(data, self.peer)
+        return True
 
     def close(self) -> None:
         self.socket.close()
@@ -198,13 +200,14 @@ class _Serial:
         except OSError as error:
             raise LinkDown(f"{self.address} broke: {error}") from None
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         try:
             sent = self.port.write(data)
         except OSError as error:
             raise LinkDown(f"{self.address} broke: {error}") from None
         if sent is not None and sent < len(data):
             raise LinkDown(f"{self.address} takes nothing any more")
+        return True
 
     def close(self) -> None:
         with contextlib.suppress(OSError):

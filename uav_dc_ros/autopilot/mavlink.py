@@ -17,23 +17,23 @@ import time
 from collections import deque
 from typing import Any, Self
 
-from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S, STREAM_VEHICLE_S, following
+from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S, STREAM_VEHICLE_S, Heartbeat, following
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.hearing import ACCEPTED, AUTOPILOT, IN_PROGRESS, ONCE, Hearing
+from uav_dc_ros.autopilot.hearing import ACCEPTED, HELPFUL_HZ, IN_PROGRESS, ONCE, Hearing
 from uav_dc_ros.autopilot.links import Address, Link, LinkDown, load_serial
 from uav_dc_ros.autopilot.priority import run_when_due
+from uav_dc_ros.autopilot.systems import AUTOPILOT, COMPONENT, SYSTEM
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 
-SYSTEM, COMPONENT = 255, 191  # as what FS_GCS_ENABLE of ArduPilot looks after; MAV_COMP_ID_ONBOARD_COMPUTER
 ONBOARD_CONTROLLER, NO_AUTOPILOT, ACTIVE = 18, 8, 4  # MAV_TYPE, MAV_AUTOPILOT, MAV_STATE of this end
 SET_MODE, ARM, TAKE_OFF, SET_INTERVAL, REQUEST = 176, 400, 22, 511, 512  # MAV_CMD
 CUSTOM_MODE = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 LOCAL_NED = 1  # MAV_FRAME; the one that ArduPilot and PX4 both take
 POSITION_ONLY = 0xDF8  # POSITION_TARGET_TYPEMASK: ignore velocity, acceleration, yaw and its rate
 
-HEARTBEAT_S = 1.0
-ASK_AGAIN_S = 3.0  # for a message that does not come
+ASK_S = 0.5  # between looks for messages and parameters that do not come
+ASK_AGAIN_S, ASK_AGAIN_HELPFUL_S = 3.0, 10.0  # for a message that does not come; that nobody needs
 OPEN_AGAIN_S = 0.5
 SILENCE_S = 10.0  # after which a link that says nothing is opened anew
 
@@ -63,7 +63,7 @@ class Mavlink:
         datum: of the grid. None: the vehicle stands at `place` when its first position comes.
         place: in the grid's ENU frame, see `datum`.
         anchor: of the same transport before it was started again: takes the place of a datum.
-        system: whom to talk to; None: to the first autopilot that speaks.
+        system: whom to talk to; None: to the only autopilot on the link.
 
     Raises:
         VehicleError: the address is none, or a package is missing.
@@ -86,7 +86,7 @@ class Mavlink:
             load_serial(self.address)
         self._mav = self._codec.MAVLink(None, SYSTEM, COMPONENT)
         self._mav.robust_parsing = True  # skips bytes that are no message
-        self._hearing = Hearing(datum, place, system)
+        self._hearing = Hearing(datum, place, system, again=bool(anchor))
         self._lock = threading.Lock()  # of all below, and of `_hearing`
         self._setpoint: Enu | None = None
         self._alive_s = -math.inf  # last sign of life of those who decide
@@ -96,6 +96,7 @@ class Mavlink:
         self._link: Link | None = None
         self._met_s = math.inf  # when the link that is open was opened; wishes wait until it was heard on it
         self._asked_s: dict[str, float] = {}
+        self._heartbeat = Heartbeat()
         self._wake_out, self._wake_in = os.pipe()
         os.set_blocking(self._wake_in, False)
         os.set_blocking(self._wake_out, False)
@@ -112,7 +113,8 @@ class Mavlink:
         self.close()
 
     def open(self) -> None:
-        """Begin to listen."""
+        """Begin to listen, and to send heartbeats: who opens it is alive."""
+        self._alive_s = time.monotonic()
         self._thread.start()
 
     def close(self) -> None:
@@ -160,9 +162,10 @@ class Mavlink:
     def steer(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at least at 2 Hz."""
         with self._lock:
-            changed = setpoint != self._setpoint
-            self._setpoint, self._alive_s = setpoint, time.monotonic()
-        if changed:
+            now_s = time.monotonic()
+            news = setpoint != self._setpoint or now_s - self._alive_s > LIFE_S
+            self._setpoint, self._alive_s = setpoint, now_s
+        if news:
             self._wake()
 
     def ask(self, wish: Wish) -> None:
@@ -179,7 +182,7 @@ class Mavlink:
 
     def _run(self) -> None:
         run_when_due()
-        heartbeat_s = stream_s = time.monotonic()
+        ask_s = stream_s = time.monotonic()
         streamed_vehicle_s, streamed, opened_s = 0.0, None, -math.inf
         heard_s = 0.0
         while not self._ended:
@@ -188,12 +191,12 @@ class Mavlink:
                 if now_s - opened_s >= OPEN_AGAIN_S:
                     opened_s = heard_s = now_s
                     self._open()
-                    now_s = time.monotonic()
+                    now_s = stream_s = time.monotonic()
                 if self._link is None:
                     self._pause(OPEN_AGAIN_S)
                     continue
             try:
-                self._pause(max(0.0, min(stream_s, heartbeat_s) - now_s), self._link)
+                self._pause(max(0.0, stream_s - now_s), self._link)
                 data = self._link.read()
                 now_s = time.monotonic()
                 heard_s = now_s if data else heard_s
@@ -206,11 +209,10 @@ class Mavlink:
                     alive = now_s - self._alive_s <= LIFE_S
                     wishes = list(self._wishes)
                     self._wishes.clear()
-                if due_anew := now_s >= heartbeat_s:
-                    heartbeat_s = following(heartbeat_s, HEARTBEAT_S, now_s)
-                    if alive:
-                        self._send_heartbeat()
-                if due_anew or self._hearing.wanted().keys() - self._asked_s.keys():
+                if alive and self._heartbeat.is_due(now_s, vehicle_s):
+                    self._send_heartbeat(now_s, vehicle_s)
+                if now_s >= ask_s or self._hearing.wanted().keys() - self._asked_s.keys():
+                    ask_s = following(ask_s, ASK_S, now_s)
                     self._ask_for_messages(now_s)
                 for wish in wishes:
                     self._send_wish(wish)
@@ -243,6 +245,7 @@ class Mavlink:
                 self._link, self._down, self._met_s = link, None, time.monotonic()
                 self._wishes.clear()  # uttered to a vehicle that may be another's by now
                 self._asked_s.clear()
+                self._heartbeat.begin()
 
     def _drop(self, why: str) -> None:
         if self._link is not None:
@@ -253,13 +256,13 @@ class Mavlink:
     # Hearing and sending.
 
     def _take(self, message: Any, now_s: float) -> None:
-        self._hearing.hear(message, now_s)
-        if message.get_type() != "COMMAND_ACK" or message.get_srcSystem() != self._hearing.system:
+        if not self._hearing.hear(message, now_s) or message.get_type() != "COMMAND_ACK":
             return
         if (message.target_system or SYSTEM) != SYSTEM or (
             message.target_component or COMPONENT
         ) != COMPONENT:
             return  # the answer to somebody else
+        self._hearing.rivals.answer(message.command, self._hearing.vehicle_s)
         name = NAMES.get(message.command)
         if name is None or message.result == IN_PROGRESS:
             return
@@ -270,21 +273,31 @@ class Mavlink:
             result = results[message.result].name if message.result in results else str(message.result)
             self._hearing.refused(name, result.removeprefix("MAV_RESULT_").lower().replace("_", " "), now_s)
 
-    def _write(self, message: Any) -> None:
-        if self._link is not None:
-            self._link.write(message.pack(self._mav))
-            self._mav.seq = (self._mav.seq + 1) % 256
+    def _write(self, message: Any) -> bool:
+        """Send a message; was there anybody to send it to."""
+        if self._link is None or not self._link.write(message.pack(self._mav)):
+            return False
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return True
 
-    def _send_heartbeat(self) -> None:
-        self._write(self._mav.heartbeat_encode(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE))
+    def _send_heartbeat(self, now_s: float, vehicle_s: float) -> None:
+        number = self._mav.seq
+        if self._write(self._mav.heartbeat_encode(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE)):
+            self._heartbeat.sent(now_s, vehicle_s)
+            self._hearing.rivals.sent_heartbeat(number)
 
     def _ask_for_messages(self, now_s: float) -> None:
         """Ask for messages that do not come: on a new link, or started anew, a vehicle sends none unasked."""
         with self._lock:
             heard, wanted = dict(self._hearing.heard), self._hearing.wanted()
+            parameters = self._hearing.unanswered(now_s)
+        for parameter in parameters:
+            what = parameter.encode(), -1  # by name
+            self._write(self._mav.param_request_read_encode(self._hearing.system, AUTOPILOT, *what))
         for name, rate_hz in wanted.items():
+            again_s = ASK_AGAIN_HELPFUL_S if name in HELPFUL_HZ else ASK_AGAIN_S
             last_s = max(heard.get(name, -math.inf), self._asked_s.get(name, -math.inf))
-            if now_s - last_s >= ASK_AGAIN_S or name not in self._asked_s:
+            if now_s - last_s >= again_s or name not in self._asked_s:
                 self._asked_s[name] = now_s
                 number = getattr(self._codec, f"MAVLINK_MSG_ID_{name}")
                 self._send_command(SET_INTERVAL, float(number), 1e6 / rate_hz)
@@ -293,6 +306,7 @@ class Mavlink:
 
     def _send_command(self, command: int, *parameters: float) -> None:
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
+        self._hearing.rivals.sent_command(command, self._hearing.vehicle_s)
         self._write(self._mav.command_long_encode(self._hearing.system, AUTOPILOT, command, 0, *filled))
 
     def _send_wish(self, wish: Wish) -> None:
@@ -318,6 +332,7 @@ class Mavlink:
         ):
             return
         ned = hearing.frame.to_autopilot(setpoint)
+        hearing.rivals.sent_setpoint(ned)
         self._write(
             self._mav.set_position_target_local_ned_encode(
                 *(int(vehicle_s * 1e3) & 0xFFFFFFFF, hearing.system, AUTOPILOT, LOCAL_NED, POSITION_ONLY),

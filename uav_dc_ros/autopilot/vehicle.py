@@ -51,6 +51,7 @@ class Telemetry:
         position: in the grid's ENU frame; None: not known yet.
         position_s: when that came.
         estimate_ok: does the autopilot trust its position enough to fly by it?
+        estimate_s: when the last report on that came; None: never.
         battery: charge that is left, 0 to 1; None: it does not tell.
         battery_v: its voltage, volts; None: it does not tell.
         battery_fails: does the autopilot itself find the battery too low, or broken?
@@ -75,6 +76,7 @@ class Telemetry:
     position: Enu | None = None
     position_s: float | None = None
     estimate_ok: bool = False
+    estimate_s: float | None = None
     battery: float | None = None
     battery_v: float | None = None
     battery_fails: bool = False
