@@ -5,13 +5,14 @@ python -m uav_dc_ros.run_all --vehicle mavlink --connect tcp:127.0.0.1:5760 --ar
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
 from uav_dc_ros import __version__, cli
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
-from uav_dc_ros.topics import SIMULATED, VEHICLES
+from uav_dc_ros.topics import SIMULATED, SYSTEM_MAX, VEHICLES
 
 PROG = "python -m uav_dc_ros.run_all"
 PORT_MAX = 65535
@@ -73,6 +74,12 @@ def parser() -> cli.Parser:
         "serial:DEVICE:BAUD",
     )
     vehicle.add_argument(
+        "--system",
+        type=_whole(1, SYSTEM_MAX, f"a MAVLink system number from 1 to {SYSTEM_MAX}"),
+        metavar="N",
+        help="MAVLink system number of the vehicle, 1 to 255 (default: the only autopilot on the link)",
+    )
+    vehicle.add_argument(
         "--arm",
         action="store_true",
         help="set the mode, arm and take off; without it a pilot does the first two",
@@ -118,7 +125,7 @@ def parser() -> cli.Parser:
     )
     options.add_argument(
         "--live",
-        type=_port,
+        type=_whole(0, PORT_MAX, f"a TCP port from 0 (any) to {PORT_MAX}"),
         nargs="?",
         const=LIVE_PORT,
         metavar="PORT",
@@ -169,10 +176,15 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _port(text: str) -> int:
-    if not (text.isdecimal() and int(text) <= PORT_MAX):
-        raise argparse.ArgumentTypeError(f"{text!r}; expected a TCP port from 0 (any) to {PORT_MAX}")
-    return int(text)
+def _whole(least: int, most: int, expected: str) -> Callable[[str], int]:
+    """The type of an option that is a whole number within a range."""
+
+    def whole(text: str) -> int:
+        if not (text.isascii() and text.isdecimal() and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}")
+        return int(text)
+
+    return whole
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ class Topic:
 # What flies: the world node's own vehicle, or the way to a real one.
 SIMULATED = "simulated"
 VEHICLES = ("mavlink", "mavros", "px4")
+SYSTEM_MAX = 255  # the highest number that a vehicle has on MAVLink
 
 JSON = "std_msgs/msg/String"
 POSE = "geometry_msgs/msg/PoseStamped"

@@ -94,13 +94,18 @@ def simulated_cells(seed: int) -> list[list[int]]:
     ("kind", "wire"), [("ardupilot", "tcp"), pytest.param("px4", "udp", marks=pytest.mark.long)]
 )
 def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
-    """It takes off, flies the cells of the simulation with that seed among the same users, and lands."""
+    """It takes off, flies the cells of the simulation with that seed among the same users, and lands.
+
+    Another aircraft is on the same link, and left alone.
+    """
     with fake(kind, wire, speed=100.0) as autopilot:
+        autopilot.do("second_vehicle 7")
         summary = ros.folder / "summary.json"
         status, output = ros.run_all(
-            *beside(autopilot, "--arm", "--seed", 3, "--bag", "bag", "--summary", summary)
+            *beside(autopilot, "--arm", "--seed", 3, "--bag", "bag", "--summary", summary, "--system", 1)
         )
         report = autopilot.report()
+    assert not [told for told in autopilot.events if told["event"].startswith("second ")]
     assert status == 0, output
     assert "Traceback" not in output
     kept = json.loads(next((ros.folder / "state").rglob("*.json")).read_text())

@@ -34,6 +34,8 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--seed", "-1"), "argument --seed: '-1'; expected a whole number of at least 0"),
         (("--seed", "x"), "argument --seed: 'x'; expected a whole number"),
         (("--missions", "0"), "argument --missions: '0'; expected a whole number of at least 1"),
+        (("--system", "256"), "argument --system: '256'; expected a MAVLink system number from 1 to 255"),
+        (("--system", "7"), "--system: expected --vehicle mavlink, mavros, px4 with it"),
         (("--pace", "0"), "argument --pace: '0'; expected 'lockstep' or a number above 0"),
         (("--pace", "1e6"), "pace: 1e+06; expected at most 3000, which makes steps of 5 ms, or 'lockstep'"),
         (

@@ -60,7 +60,7 @@ class AutopilotBridge(MissionNode):
         self.settings = Settings(**settings | {"then": Mode(values["then"])})
         self.journal = Journal(values["journal"])
         self.fence = Fence.around(self.scenario, values["fence_margin_m"])
-        vehicles.check(values["vehicle"], values["connect"], values["arm"])
+        vehicles.check(*(values[name] for name in ("vehicle", "connect", "system", "arm")))
         self._restore()
         self._datum()
 

@@ -3,7 +3,7 @@
 from uav_dc_ros.autopilot.fence import MARGIN_M
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.nodes.parameters import Parameter, one_of
-from uav_dc_ros.topics import VEHICLES
+from uav_dc_ros.topics import SYSTEM_MAX, VEHICLES
 
 VEHICLE = Parameter(
     name="vehicle",
@@ -23,6 +23,13 @@ DATUM = Parameter(
     description="where the grid's corner lies: here (the vehicle stands where the scenario starts when its "
     "first good position comes), last (as in the last flight), or latitude, longitude (degrees) and altitude "
     "(metres) with a comma between; needed with arm; empty: here",
+)
+SYSTEM = Parameter(
+    name="system",
+    default=0,
+    least=0,
+    most=SYSTEM_MAX,
+    description="MAVLink system number of the vehicle; 0: the only autopilot on the link",
 )
 FENCE_MARGIN_M = Parameter(
     name="fence_margin_m",

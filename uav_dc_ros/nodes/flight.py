@@ -200,6 +200,7 @@ class Flight:
             "bag": str(self.bag),
             "vehicle": options.vehicle,
             "connect": options.connect or "",
+            "system": options.system or 0,
             "arm": options.arm,
             "datum": options.datum or "",
             **({} if options.live is None else {"port": options.live}),

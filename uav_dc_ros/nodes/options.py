@@ -15,7 +15,19 @@ from uav_dc_ros.nodes.table import COMPOSABLE, NODES
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
 # Parameters that are options of run_all.
-OPTIONS = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", "connect", "arm", "datum")
+OPTIONS = (
+    "scenario",
+    "policy",
+    "seed",
+    "missions",
+    "pace",
+    "bag",
+    "vehicle",
+    "connect",
+    "system",
+    "arm",
+    "datum",
+)
 
 
 def nodes(options: argparse.Namespace) -> list[str]:
@@ -97,7 +109,8 @@ def check_vehicle(options: argparse.Namespace, nodes: list[str], scenario: Scena
         UavDcError: what was wrong.
     """
     simulated = options.vehicle == SIMULATED
-    for name, value in (("connect", options.connect), ("arm", options.arm), ("datum", options.datum)):
+    for name in ("connect", "system", "arm", "datum"):
+        value = getattr(options, name)
         if value and simulated:
             raise ParameterError(f"--{name}: expected --vehicle {', '.join(VEHICLES)} with it")
         if value and "bridge" not in nodes:
@@ -110,7 +123,7 @@ def check_vehicle(options: argparse.Namespace, nodes: list[str], scenario: Scena
         raise ParameterError(f"--missions {options.missions}: expected 1 with --vehicle {options.vehicle}")
     if "bridge" in nodes:
         datums.parse(options.datum or "", scenario, options.vehicle, arm=options.arm)
-        vehicles.check(options.vehicle, options.connect or "", options.arm)
+        vehicles.check(options.vehicle, options.connect or "", options.system or 0, options.arm)
 
 
 def check_writable(summary: Path, bag: Path | None) -> None:

@@ -59,7 +59,8 @@ NODES: dict[str, NodeRow] = {
             publishes=("pose", "mission", "target", "diagnostics"),
             subscribes=("move", "ready"),
             parameters=(
-                *(bridge_parameters.VEHICLE, bridge_parameters.CONNECT, bridge_parameters.DATUM),
+                *(bridge_parameters.VEHICLE, bridge_parameters.CONNECT, bridge_parameters.SYSTEM),
+                bridge_parameters.DATUM,
                 *(p.SCENARIO, p.SEED, p.JOURNAL, bridge_parameters.FENCE_MARGIN_M),
                 *bridge_parameters.SETTINGS,
             ),

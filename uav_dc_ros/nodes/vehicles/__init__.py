@@ -35,23 +35,26 @@ def make(
     east_m, north_m, _ = scenario.mission.start_m
     place = Enu(east_m, north_m, 0.0)
     kind, connect = values["vehicle"], values["connect"]
-    check(kind, connect, values["arm"])
+    check(kind, connect, values["system"], values["arm"])
     if kind == "mavlink":
-        return Mavlink(connect, datum=datum, place=place, anchor=anchor)
+        system = values["system"] or None
+        return Mavlink(connect, datum=datum, place=place, anchor=anchor, system=system)
     if kind == "mavros":
         return Mavros(node, place=place, anchor=anchor, datum=datum, arms=values["arm"])
     return Px4(node, place=place, anchor=anchor, datum=datum)
 
 
-def check(kind: str, connect: str, arm: bool) -> None:
+def check(kind: str, connect: str, system: int, arm: bool) -> None:
     """Refuse a way that this machine does not have, or cannot arm by; an address that is none.
 
     Raises:
         VehicleError: what was wrong.
-        ParameterError: an address where none belongs, or none where one is needed.
+        ParameterError: an address or system where none belongs, or no address where one is needed.
     """
     if kind != "mavlink" and connect:
         raise ParameterError(f"connect: {connect!r}; expected none with a vehicle on {kind}")
+    if kind != "mavlink" and system:
+        raise ParameterError(f"system: {system}; expected none (0) with a vehicle on {kind}")
     if kind == "mavlink":
         if not connect:
             raise ParameterError("connect: none given; expected where the vehicle is: tcp:127.0.0.1:5760")
