@@ -17,7 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from uav_dc_ros import cli, resources, scenarios
-from uav_dc_ros.autopilot import beat, fence, mavlink
+from uav_dc_ros.autopilot import beat, fence, systems
 from uav_dc_ros.autopilot.links import Address
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
@@ -189,7 +189,7 @@ def test_every_parameter_in_the_text_is_the_bridge_s() -> None:
 
 
 def test_the_numbers_in_the_text_are_the_code_s() -> None:
-    assert f"system {mavlink.SYSTEM}, component {mavlink.COMPONENT}" in GUIDE
+    assert f"system {systems.SYSTEM}, component {systems.COMPONENT}" in GUIDE
     assert (beat.STREAM_S, beat.HEARTBEAT_S, beat.LIFE_S) == (1 / 20, 1.0, 1.0)
     assert "streams the setpoint 20 times a second" in GUIDE
     assert "end a second after its last decision" in GUIDE

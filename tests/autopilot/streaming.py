@@ -19,8 +19,10 @@ import numpy as np
 from pymavlink import mavutil
 
 from tests.autopilot.flight import ROOT, Fake, fake
-from uav_dc_ros.autopilot.mavlink import POSITION_ONLY, STREAM_S, Mavlink
+from uav_dc_ros.autopilot.beat import STREAM_S
+from uav_dc_ros.autopilot.mavlink import Mavlink
 from uav_dc_ros.autopilot.priority import run_when_due
+from uav_dc_ros.autopilot.session import POSITION_ONLY
 
 BURN = "while True: pass"
 LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_dueling')"

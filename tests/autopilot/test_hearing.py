@@ -235,6 +235,13 @@ def test_many_lost_messages_do_not_make_the_next_ones_old() -> None:
     assert known.position_s == radio.now_s
 
 
+def test_a_router_that_does_not_count_is_listened_to() -> None:
+    radio = met()
+    for tick in range(1, 40):
+        radio.codec.seq, radio.now_s = 1, 0.05 * tick
+        assert radio.position(600.0 + 0.05 * tick).position_s == radio.now_s
+
+
 FATES = st.sampled_from(["late", "twice", "zeroed", "nonsense", "lost", "ahead"])
 
 

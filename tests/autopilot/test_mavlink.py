@@ -1,5 +1,6 @@
 """The transport: addresses, whom it listens to, the stream, links that break."""
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -14,11 +15,11 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.autopilot.flight import ROOT, Fake, fake, free_udp_port
-from uav_dc_ros.autopilot.beat import Heartbeat
+from uav_dc_ros.autopilot.beat import LIFE_S, Heartbeat
 from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.links import Address, LinkDown
-from uav_dc_ros.autopilot.mavlink import LIFE_S, Mavlink
+from uav_dc_ros.autopilot.mavlink import Mavlink
 from uav_dc_ros.autopilot.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry
 from uav_dc_ros.errors import VehicleError
 
@@ -275,6 +276,29 @@ def test_of_two_vehicles_on_a_link_the_one_that_is_named_is_commanded() -> None:
             known = until(vehicle, lambda known: known.missing is None)
             assert (known.system, known.armed) == ("system 7, PX4", False)
     assert not [event for event in autopilot.events if event["event"].startswith("second ")]
+
+
+def test_on_a_port_that_several_vehicles_send_to_the_right_one_is_answered() -> None:
+    port = free_udp_port()
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
+        codecs = {system: mav.MAVLink(None, system, 1) for system in (7, 1)}
+        vehicle = stack.enter_context(Mavlink(f"udpin:127.0.0.1:{port}", system=1))
+        until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot of system 1")
+        heard: list[Any] = []
+        ends_s = time.monotonic() + 15.0
+        while sum(message.get_type() == "COMMAND_LONG" for message in heard) < 20:
+            assert time.monotonic() < ends_s
+            for one, codec in zip(sockets, codecs.values(), strict=True):
+                one.settimeout(0.05)
+                packed = codec.heartbeat_encode(2, 3, 0, 4, 4).pack(codec)
+                codec.seq = (codec.seq + 1) % 256
+                one.sendto(packed, ("127.0.0.1", port))
+                with contextlib.suppress(TimeoutError):
+                    while True:
+                        message = mav.MAVLink(None).parse_buffer(one.recv(4096))[0]
+                        heard += [message] if one is sockets[1] else []
+                        assert message.get_type() != "COMMAND_LONG" or one is sockets[1]
 
 
 def test_a_second_bridge_is_noticed_and_a_router_s_echo_is_none() -> None:

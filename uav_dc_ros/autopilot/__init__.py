@@ -11,8 +11,16 @@ asking   when to utter a wish
 course   where a mission stands on the grid
 ground   before the first step
 descent  what brings a vehicle down
-beat     of a stream of setpoints
+beat     of heartbeats and a stream of setpoints
 priority running when it is due
 bridge   from connecting to landing: phases, steps, faults
-mavlink  a transport: an autopilot on MAVLink, over TCP, UDP or a serial line
+mavlink  a transport: an autopilot on MAVLink, over TCP, UDP or a serial line, with
+  session   what is sent when, and what came
+  links     TCP, UDP, a serial line
+  hearing   what is known of the vehicle, with
+    systems   which vehicle is meant
+    ordering  which messages are news
+    rivals    evidence of another controller
+    limits    the autopilot's own, from its parameters
+    dialects  what ArduCopter and PX4 do differently
 """

@@ -34,6 +34,7 @@ RATES_HZ = {
 }
 # What helps where a vehicle sends it; few, for a telemetry radio carries a kilobyte or two a second.
 HELPFUL_HZ = {"ATTITUDE": 4.0, "POSITION_TARGET_LOCAL_NED": 2.0, "HOME_POSITION": 0.5}
+TIMED = frozenset({"LOCAL_POSITION_NED", "SYSTEM_TIME", "ATTITUDE", "POSITION_TARGET_LOCAL_NED"})
 ONCE = frozenset({"GPS_GLOBAL_ORIGIN"})  # PX4 sends it when it changes, or is asked for this one
 ESTIMATE_HZ = 5.0
 ADVICE = ("PreArm", "Preflight", "Arm:")
@@ -140,14 +141,14 @@ class Hearing:
 
     def _discards(self, name: str, message: Any, now_s: float) -> Discard | None:
         """Why a message of the vehicle is ignored; None: it is not."""
-        if (why := self._sequence.take(message.get_seq(), now_s)) is not None:
+        if (why := self._sequence.take(message.get_seq(), message.get_crc(), now_s)) is not None:
             return why
         if not IS_POSSIBLE.get(name, lambda _: True)(message):
             return Discard.IMPOSSIBLE
-        if (boot_ms := getattr(message, "time_boot_ms", None)) is None:
+        if name not in TIMED:
             return None
         restarts = self._clock.restarts
-        why = self._clock.take(name, boot_ms, now_s)
+        why = self._clock.take(name, message.time_boot_ms, now_s)
         if self._clock.restarts != restarts:
             self._forget()
         return why

@@ -33,6 +33,9 @@ class Link(Protocol):
     def write(self, data: bytes) -> bool:
         """Send all of it; was there anybody to send it to."""
 
+    def answer_here(self) -> None:
+        """What was read last is the vehicle's: on UDP, send to where that came from from now on."""
+
     def close(self) -> None:
         """End it."""
 
@@ -139,6 +142,9 @@ class _Tcp:
             raise LinkDown(f"{self.address} takes nothing any more")
         return True
 
+    def answer_here(self) -> None:
+        pass
+
     def close(self) -> None:
         self.socket.close()
 
@@ -152,6 +158,7 @@ class _Udp:
         self.socket = socket.socket(family, kind, protocol)
         self.socket.setblocking(False)
         self.peer: Any = where if address.kind == "udpout" else None
+        self.sender: Any = self.peer  # of what was read last; several vehicles may send to one port
         if address.kind == "udpin":
             try:
                 self.socket.bind(where)
@@ -164,12 +171,16 @@ class _Udp:
 
     def read(self) -> bytes:
         try:
-            data, self.peer = self.socket.recvfrom(READ_BYTES)
+            data, self.sender = self.socket.recvfrom(READ_BYTES)
         except (BlockingIOError, ConnectionRefusedError):  # refused: nobody is there yet
             return b""
         except OSError as error:
             raise LinkDown(f"{self.address} broke: {error.strerror}") from None
+        self.peer = self.peer or self.sender
         return data
+
+    def answer_here(self) -> None:
+        self.peer = self.sender
 
     def write(self, data: bytes) -> bool:
         if self.peer is None:
@@ -208,6 +219,9 @@ class _Serial:
         if sent is not None and sent < len(data):
             raise LinkDown(f"{self.address} takes nothing any more")
         return True
+
+    def answer_here(self) -> None:
+        pass
 
     def close(self) -> None:
         with contextlib.suppress(OSError):

@@ -33,21 +33,25 @@ class Sequence:
 
     def __init__(self) -> None:
         self._newest: int | None = None
-        self._newest_s = 0.0
+        self._newest_s, self._checksum = 0.0, 0
         self._behind: int | None = None  # the last number that was not news,
         self._in_a_row = 0  # and how many before it make one count with it
 
-    def take(self, number: int, now_s: float) -> Discard | None:
-        """Is a message with this number, at a steady time, no news, and why; None: it is news."""
+    def take(self, number: int, checksum: int, now_s: float) -> Discard | None:
+        """Is a message with this number, at a steady time, no news, and why; None: it is news.
+
+        Other messages with the same number, one after the other, are those of a router that does not count.
+        """
         ahead = 0 if self._newest is None else (number - self._newest) % NUMBERS
-        news = self._newest is None or now_s - self._newest_s > SILENT_S or 0 < ahead < NUMBERS // 2
+        news = 0 < ahead < NUMBERS // 2 or (ahead == 0 and checksum != self._checksum)
+        news = news or self._newest is None or now_s - self._newest_s > SILENT_S
         if not news:
             follows = self._behind is not None and 0 < (number - self._behind) % NUMBERS < SAME_COUNT
             self._in_a_row = self._in_a_row + 1 if follows else 1
             self._behind = number
         if not news and self._in_a_row < SAME_COUNT:
             return Discard.LATE if ahead else Discard.REPEATED
-        self._newest, self._newest_s = number, now_s
+        self._newest, self._newest_s, self._checksum = number, now_s, checksum
         self._behind, self._in_a_row = None, 0
         return None
 
