@@ -117,8 +117,6 @@ def test_a_kilometre_of_the_grid_is_one_on_the_earth_in_arducopter_s_metres(
     # Axes are taken as parallel: at 70 degrees the meridians turn by 0.2 m on the way.
     assert sent[:2] == pytest.approx(own_m, abs=0.25)
     assert frame.from_autopilot(sent) == pytest.approx((east_m, north_m, 50.0))
-    off_m = math.dist(own_m, (north_m, east_m))
-    assert off_m > 0.6, "what it would be off by"
 
 
 @pytest.mark.parametrize(

@@ -126,6 +126,8 @@ def test_a_second_vehicle_on_the_link_is_left_alone(kind: str) -> None:
     flight.autopilot.other = other = Autopilot(Copter(kind, 0.0, "second "), 7)
     flight.until_over()
     check_landed(flight)
+    named = f"connected to system 1, {'PX4' if kind == 'px4' else 'ArduCopter'}"
+    assert (Phase.PREFLIGHT, 0, named) in flight.log, "the display and the bag say which one it took"
     assert (other.copter.armed, other.setpoints) == (False, 0)
 
 

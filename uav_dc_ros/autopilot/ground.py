@@ -67,7 +67,8 @@ class Ground:
             why = "it flies already: to the cell where the mission stands"
             return Next(phase=Phase.TAKEOFF, why=why, setpoint=self.course.target)
         # An autopilot may want to see setpoints before it follows any.
-        return Next(phase=Phase.PREFLIGHT, why="connected", setpoint=known.position)
+        why = f"connected to {known.system}" if known.system else "connected"
+        return Next(phase=Phase.PREFLIGHT, why=why, setpoint=known.position)
 
     def _left_alone(self, known: Telemetry, breach: str | None) -> Next | None:
         """Why a mission that was in the air is not taken up again, or goes on coming down; None: it is."""
