@@ -105,7 +105,9 @@ def where(flown: Flown, rate_hz: float) -> None:
         ("policy", "rates"),
         ("world", "move"),
     )
-    medians = [f"{topic} {flown.last(node, f'{topic} latency p50 [ms]'):.2f}" for node, topic in ways]
+    medians = [
+        f"{topic} {flown.last(node, f'{topic} handling latency p50 [ms]'):.2f}" for node, topic in ways
+    ]
     print(f"from publishing to the end of the handling, ms, median: {', '.join(medians)}")
 
 

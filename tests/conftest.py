@@ -64,6 +64,15 @@ class Ros:
             text=True,
         )
 
+    def run_id(self) -> str:
+        """Identity of the run that is flown: `mission` is latched, so whoever comes late receives it, too."""
+        probe = self.stranger("probe", "/mission")
+        assert probe.stdout is not None
+        run: str = json.loads(json.loads(probe.stdout.readline())["data"])["run"]
+        probe.kill()
+        probe.communicate()
+        return run
+
     def run(self, module: str, *arguments: object, timeout_s: float = 90.0) -> tuple[int, str]:
         """Run it to its end; the exit status and what it printed."""
         process = self.start(module, *arguments)
@@ -193,6 +202,11 @@ def copy_repository(files: list[str], folder: Path) -> None:
 def each_once(told: list[Any]) -> list[Any]:
     """What was told, without repetitions: a lockstep that stood still for a moment says its step again."""
     return [message for i, message in enumerate(told) if i == 0 or message != told[i - 1]]
+
+
+def but_run(payload: dict[str, Any]) -> dict[str, Any]:
+    """A payload without the identity of its run: equal seeds give equal payloads but for that."""
+    return {name: value for name, value in payload.items() if name != "run"}
 
 
 def read_bag(folder: Path) -> list[tuple[str, Any]]:

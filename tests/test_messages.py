@@ -17,9 +17,19 @@ from uav_dc_ros.core.grid import ACTION_LABELS, ActionLabel
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import PAYLOADS, Mission, Move, Phase, Rates, Ready, Users
 
+RUN = "0123456789abcdef"
 EXAMPLES = {
-    "users": Users(mission=0, step=3, stamp_ns=45 * 10**9, cluster=[0, 1], x_m=[1.5, -2.0], y_m=[0.1, 1e-9]),
+    "users": Users(
+        run=RUN,
+        mission=0,
+        step=3,
+        stamp_ns=45 * 10**9,
+        cluster=[0, 1],
+        x_m=[1.5, -2.0],
+        y_m=[0.1, 1e-9],
+    ),
     "rates": Rates(
+        run=RUN,
         mission=0,
         step=3,
         sum_rate_bps=0.1 + 0.2,
@@ -30,6 +40,7 @@ EXAMPLES = {
         collected=[False, True],
     ),
     "mission": Mission(
+        run=RUN,
         mission=0,
         step=3,
         phase=Phase.READY,
@@ -40,10 +51,14 @@ EXAMPLES = {
         scenario="five_clusters",
         fingerprint="0123456789ab",
     ),
-    "move": Move(mission=0, step=3, action="upward"),
-    "ready": Ready(node="policy"),
+    "move": Move(run=RUN, mission=0, step=3, action="upward"),
+    "ready": Ready(run=RUN, node="policy"),
 }
-OPTIONAL = {("mission", "reason"), ("mission", "steps_not_reached")}  # older bags have none
+OPTIONAL = {  # older bags have none
+    ("mission", "reason"),
+    ("mission", "steps_not_reached"),
+    *((topic, "run") for topic in PAYLOADS),
+}
 
 
 @pytest.mark.parametrize("topic", PAYLOADS)

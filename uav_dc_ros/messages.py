@@ -8,6 +8,7 @@ with all their digits, so a float64 arrives as it was sent.
 """
 
 import json
+import secrets
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
@@ -28,6 +29,16 @@ Seed: TypeAlias = StampNs
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 # In Python, `$` also stands before a newline at the end; in other languages `(?!\n)` changes nothing.
 Name: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}(?!\n)$")]
+
+Run: TypeAlias = Annotated[
+    str,
+    Meta(
+        pattern=r"^([0-9a-f]{16})?(?!\n)$",
+        description="identity of the run of missions that this belongs to, drawn at random when the vehicle "
+        "starts; a node publishes the one that it received in `mission`; empty in bags that are older than "
+        "it, and in `ready` while the node has not received it yet",
+    ),
+]
 
 
 class Phase(StrEnum):
@@ -54,14 +65,26 @@ class Payload(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """What every payload has in common: no field missing unless it has a default, none unknown."""
 
 
-class Stepped(Payload, frozen=True):
+class OfRun(Payload, frozen=True, kw_only=True):
+    """A payload that belongs to one run of missions. Equal seeds give equal payloads but for this field."""
+
+    run: Run = ""
+
+
+class _AnyOfRun(msgspec.Struct):
+    """The run alone, of a payload whose other fields nobody looks at."""
+
+    run: str = ""
+
+
+class Stepped(OfRun, frozen=True, kw_only=True):
     """A payload that belongs to one step of one mission."""
 
     mission: Annotated[Index, Meta(description="index of the mission in this run, from 0")]
     step: Annotated[Index, Meta(description="steps flown in this mission")]
 
 
-class Users(Stepped, frozen=True):
+class Users(Stepped, frozen=True, kw_only=True):
     """Positions of the users, frame `map` (ENU). Columns are of one length, an entry per user."""
 
     stamp_ns: Annotated[
@@ -77,7 +100,7 @@ class Users(Stepped, frozen=True):
         _same_length(cluster=self.cluster, x_m=self.x_m, y_m=self.y_m)
 
 
-class Rates(Stepped, frozen=True):
+class Rates(Stepped, frozen=True, kw_only=True):
     """The channel during a step, and the data up to its end. Columns are of one length, an entry per user."""
 
     sum_rate_bps: Annotated[NotNegative, Meta(description="sum of the rates of the served users, bit/s")]
@@ -133,7 +156,7 @@ class Mission(Stepped, frozen=True, kw_only=True):
     ]
 
 
-class Move(Stepped, frozen=True):
+class Move(Stepped, frozen=True, kw_only=True):
     """The policy's decision for a step. A move for another step is ignored."""
 
     action: Annotated[
@@ -142,14 +165,14 @@ class Move(Stepped, frozen=True):
     ]
 
 
-class Ready(Payload, frozen=True):
+class Ready(OfRun, frozen=True, kw_only=True):
     """A node has found all its peers and can take part."""
 
     node: Annotated[Name, Meta(description="name of the node, as in the node table")]
 
 
 # Payload of each JSON topic. The topics themselves are in topics.py.
-PAYLOADS: dict[str, type[Payload]] = {
+PAYLOADS: dict[str, type[OfRun]] = {
     "users": Users,
     "rates": Rates,
     "mission": Mission,
@@ -158,6 +181,21 @@ PAYLOADS: dict[str, type[Payload]] = {
 }
 
 P = TypeVar("P", bound=Payload)
+
+
+def new_run() -> str:
+    """A random identity for a run of missions."""
+    return secrets.token_hex(8)
+
+
+def run_of(text: bytes) -> str | None:
+    """The run that a JSON text says it belongs to, whatever else it holds; None: it is no payload."""
+    if len(text) > MAX_BYTES:
+        return None
+    try:
+        return msgspec.json.decode(text, type=_AnyOfRun).run
+    except (msgspec.DecodeError, RecursionError, UnicodeError):
+        return None
 
 
 def encode(payload: Payload) -> bytes:

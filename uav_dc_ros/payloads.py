@@ -56,9 +56,12 @@ def text_in_cdr(data: bytes) -> bytes:
     return data[8 : 7 + length]
 
 
-def users(scenario: Scenario, users_m: Array, *, mission: int, step: int, time_ns: int) -> messages.Users:
+def users(
+    scenario: Scenario, users_m: Array, *, mission: int, step: int, time_ns: int, run: str = ""
+) -> messages.Users:
     """Users' positions, metres `[U, 2]`, as a payload."""
     return messages.Users(
+        run=run,
         mission=mission,
         step=step,
         stamp_ns=time_ns,
@@ -83,9 +86,12 @@ def users_m(payload: messages.Users, scenario: Scenario) -> Array:
     return np.asarray([payload.x_m, payload.y_m], dtype=np.float64).T
 
 
-def rates(link: Link, data_bits: Array, collected: Array, *, mission: int, step: int) -> messages.Rates:
+def rates(
+    link: Link, data_bits: Array, collected: Array, *, mission: int, step: int, run: str = ""
+) -> messages.Rates:
     """The channel of a step and the data after it, `[U]` each, as a payload."""
     return messages.Rates(
+        run=run,
         mission=mission,
         step=step,
         sum_rate_bps=float(link.sum_rate_bps),

@@ -35,6 +35,7 @@ class Topic:
             who asks for that (see `nodes.lease`); None: none is offered, and one that was killed is missed
             after tens of seconds.
         recorded: does the recorder write it?
+        exclusive: does a mission have one publisher of it, and none beside it?
     """
 
     name: str
@@ -45,6 +46,7 @@ class Topic:
     depth: int = 1000
     lease_s: float | None = None
     recorded: bool = True
+    exclusive: bool = False
 
 
 # What flies: the world node's own vehicle, or the way to a real one.
@@ -62,16 +64,24 @@ CLOCK = "rosgraph_msgs/msg/Clock"
 TOPICS: dict[str, Topic] = {
     topic.name: topic
     for topic in (
-        Topic(name="pose", type=POSE, asks_reliable=False),
-        Topic(name="users", type=JSON, latched=True, depth=500),
-        Topic(name="rates", type=JSON, latched=True, depth=500),
-        Topic(name="mission", type=JSON, latched=True),
-        Topic(name="move", type=JSON, lease_s=0.25),
-        Topic(name="target", type=POSE, latched=True),
+        Topic(name="pose", type=POSE, asks_reliable=False, exclusive=True),
+        Topic(name="users", type=JSON, latched=True, depth=500, exclusive=True),
+        Topic(name="rates", type=JSON, latched=True, depth=500, exclusive=True),
+        Topic(name="mission", type=JSON, latched=True, exclusive=True),
+        Topic(name="move", type=JSON, lease_s=0.25, exclusive=True),
+        Topic(name="target", type=POSE, latched=True, exclusive=True),
         Topic(name="ready", type=JSON, latched=True, depth=10, recorded=False),
         Topic(name="path", type=PATH, latched=True, depth=1),
         Topic(name="markers", type=MARKERS, latched=True, depth=1),
         Topic(name="diagnostics", type=DIAGNOSTICS, depth=10),
-        Topic(name="clock", type=CLOCK, reliable=False, asks_reliable=False, depth=1, recorded=False),
+        Topic(
+            name="clock",
+            type=CLOCK,
+            reliable=False,
+            asks_reliable=False,
+            depth=1,
+            recorded=False,
+            exclusive=True,
+        ),
     )
 }

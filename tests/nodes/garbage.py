@@ -28,6 +28,7 @@ from uav_dc_ros.errors import MessageError
 JSON_TOPICS = tuple(messages.PAYLOADS)
 TOPICS = (*JSON_TOPICS, "pose")
 NOBODY_S_MISSION = 1_000_000  # no test flies so many
+RUN = "0123456789abcdef"  # of the missions that are flown under fire
 UNDECODABLE = "undecodable"  # the middleware drops it, or the node refuses it as malformed
 COLUMNS = {
     "users": ("cluster", "x_m", "y_m"),
@@ -89,6 +90,7 @@ def honest(topic: str, scenario: Scenario, rng: random.Random) -> dict[str, Any]
     """A payload as a node might say it, of a mission that is not flown."""
     n_users = scenario.n_users
     stepped: dict[str, Any] = {
+        "run": RUN,
         "mission": NOBODY_S_MISSION + rng.randrange(1000),
         "step": rng.randrange(1, scenario.mission.max_steps),
     }
@@ -114,7 +116,7 @@ def honest(topic: str, scenario: Scenario, rng: random.Random) -> dict[str, Any]
         }
     if topic == "move":
         return stepped | {"action": rng.choice(ACTION_LABELS)}
-    return {"node": "policy"}
+    return {"run": RUN, "node": "policy"}
 
 
 class Maker:
@@ -132,7 +134,7 @@ class Maker:
         self._kinds: list[Callable[[], tuple[bytes, str | None]]] = [
             *(self.truncated, self.flipped, self.spliced, self.not_utf8, self.not_a_number, self.surplus),
             *(self.missing, self.unknown, self.wrong_type, self.out_of_range, self.nested, self.huge),
-            *(self.twice, self.other_top, self.noise, self.liar, self.other_bytes),
+            *(self.twice, self.other_top, self.noise, self.liar, self.other_bytes, self.another_run),
         ]
         if topic in COLUMNS:
             self._kinds += [self.uneven, self.layout]
@@ -220,7 +222,8 @@ class Maker:
 
     def missing(self) -> tuple[bytes, str | None]:
         payload = self.honest()
-        for name in self.rng.sample(list(payload), self.rng.randint(1, len(payload))):
+        needed = [name for name in payload if name != "run"]  # which is missing in older bags
+        for name in self.rng.sample(needed, self.rng.randint(1, len(needed))):
             del payload[name]
         return payloads.cdr_of_text(json.dumps(payload).encode()), "invalid"
 
@@ -289,6 +292,11 @@ class Maker:
 
     def other_world(self) -> tuple[bytes, str | None]:
         return self.changed(fingerprint=f"{self.rng.randrange(2**48):012x}"), "scenario"
+
+    def another_run(self) -> tuple[bytes, str | None]:
+        """Of another mission, or of a bag that is older than runs; `ready` may come before a run."""
+        runs = ("f" * 16, f"{self.rng.randrange(2**64):016x}", *(("",) if self.topic != "ready" else ()))
+        return self.changed(run=self.rng.choice(runs)), "another_run"
 
     def wrong_step(self) -> tuple[bytes, str | None]:
         """A move for another mission, one that is over, or no step of this one."""

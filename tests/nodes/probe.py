@@ -1,7 +1,9 @@
 """A stranger on the network: publishes what it is told to, and prints what it hears.
 
+An argument name=NAME is the name of its node, the others are topics.
+
 Commands come as JSON lines on standard input: {"topic", "type", "latched", "data"}; with a number in
-"pose" the message is a PoseStamped. Each message on a topic in argv is printed as a JSON line.
+"pose" the message is a PoseStamped. Each message on one of the topics is printed as a JSON line.
 """
 
 import contextlib
@@ -23,8 +25,9 @@ SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of 
 
 def main() -> None:
     rclpy.init()
-    node = rclpy.create_node("probe")
-    for name in sys.argv[1:]:
+    named = [argument.removeprefix("name=") for argument in sys.argv[1:] if argument.startswith("name=")]
+    node = rclpy.create_node(*named or ["probe"])
+    for name in [argument for argument in sys.argv[1:] if not argument.startswith("name=")]:
         topic = TOPICS[name.rsplit("/", 1)[-1]]
 
         def hear(message: object, name: str = name) -> None:

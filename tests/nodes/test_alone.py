@@ -11,6 +11,7 @@ from tests.conftest import Ros, finish, wait_for
 from uav_dc_ros.nodes.parameters import EVERY
 from uav_dc_ros.nodes.table import NODES
 
+RUN = "fedcba9876543210"
 NAMESPACE = ("-r", "__ns:=/uav1")
 
 
@@ -42,12 +43,12 @@ def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path
 def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario: Path) -> None:
     """A stranger plays the policy, and lets the vehicle wait: nothing is flown or booked twice."""
     heard = [f"/{topic}" for topic in ("mission", "rates")]
-    stranger = ros.stranger("probe", *heard)
+    stranger = ros.stranger("probe", "name=policy", *heard)
     assert stranger.stdin is not None
     assert stranger.stdout is not None
 
     def say(topic: str, payload: dict[str, object], hearing: int = 1) -> None:
-        command = {"topic": f"/{topic}", "data": json.dumps(payload), "hearing": hearing}
+        command = {"topic": f"/{topic}", "data": json.dumps({"run": RUN} | payload), "hearing": hearing}
         stranger.stdin.write(json.dumps(command) + "\n")
         stranger.stdin.flush()
 
@@ -61,6 +62,8 @@ def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario:
         f"scenario:={small_scenario}",
         "-p",
         'peers:=["world", "channel_monitor", "policy"]',
+        "-p",
+        f"run:={RUN}",
     ]
     nodes = [ros.start(f"uav_dc_ros.nodes.{node}", *given) for node in ("world", "channel_monitor")]
     say("move", {"mission": 9, "step": 9, "action": "hover"})  # makes the publisher that the world waits for

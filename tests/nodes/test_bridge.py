@@ -286,10 +286,10 @@ def test_broken_moves_and_moves_out_of_turn_change_nothing(ros: Ros, low: tuple[
     with fake("ardupilot", speed=4.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 1), process)
-        probe = ros.stranger("probe")
+        probe, run = ros.stranger("probe"), ros.run_id()
         assert probe.stdin is not None
         for data in broken:
-            command = {"topic": "move", "data": data, "hearing": 2}
+            command = {"topic": "move", "data": data.replace("{", f'{{"run":"{run}",'), "hearing": 2}
             probe.stdin.write((json.dumps(command) + "\n") * 5)
         probe.stdin.close()
         status, output = finish(process)

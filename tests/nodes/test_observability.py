@@ -101,7 +101,14 @@ def test_every_node_tells_of_itself_once_a_second(ros: Ros, options: list[object
     assert world["phase"] == "ready"
     assert float(world["pose said [Hz]"]) == pytest.approx(10.0, rel=0.3)
     assert float(world["move heard [Hz]"]) == pytest.approx(10.0, rel=0.3)
-    assert 0.0 < float(world["move latency p50 [ms]"]) <= float(world["move latency p99 [ms]"]) < 100.0
+    transport, handling = (
+        [float(world[f"move {kind} latency {percentile} [ms]"]) for percentile in ("p50", "p99")]
+        for kind in ("transport", "handling")
+    )
+    assert 0.0 < transport[0] <= transport[1] < 100.0
+    assert transport[0] <= handling[0] <= handling[1] < 100.0
+    recorder = told["recorder"][-1][1]
+    assert {f"move {kind} latency p50 [ms]" for kind in ("transport", "handling")} <= set(recorder)
     assert float(world["step lateness p99 [ms]"]) < 100.0
     assert {"step overruns", "hovered steps"} <= set(world)
     assert float(told["channel_monitor"][-1][1]["users heard [Hz]"]) == pytest.approx(10.0, rel=0.3)

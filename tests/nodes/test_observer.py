@@ -1,23 +1,31 @@
-"""What run_all sees of a mission whose end is heard before its rates: a stranger tells it in that order."""
+"""What run_all sees of missions: its own, whose end may come before its rates, and those of others."""
 
 import json
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
+import rclpy
 
-from tests.conftest import Ros, finish
-from uav_dc_ros import messages, scenarios
+from tests.conftest import Ros
+from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.nodes import observer, rivals
+from uav_dc_ros.nodes.observer import ALONE_S, TELL_S, MissionSoFar, Observer
+from uav_dc_ros.nodes.rivals import AnotherMissionError
 
 STEPS = 3
 MBIT = 1e6
+RUN, OTHER = "0123456789abcdef", "fedcba9876543210"
 
 
 def mission(scenario: Scenario, step: int) -> messages.Mission:
     """The vehicle's word for a step of a mission that goes east, and is aborted after a few."""
     return messages.Mission(
+        run=RUN,
         mission=0,
         step=step,
         phase=Phase.READY if step < STEPS else Phase.ABORTED,
@@ -33,6 +41,7 @@ def rates(scenario: Scenario, step: int) -> messages.Rates:
     """A megabit of the first user in each step."""
     nothing = [0.0] * scenario.n_users
     return messages.Rates(
+        run=RUN,
         mission=0,
         step=step,
         sum_rate_bps=MBIT if step else 0.0,
@@ -44,36 +53,153 @@ def rates(scenario: Scenario, step: int) -> messages.Rates:
     )
 
 
-@pytest.mark.parametrize("heard", [STEPS + 1, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 0))])
-def test_the_end_is_heard_before_the_rates(
-    ros: Ros, small_scenario: Path, small_policy: Path, heard: int
-) -> None:
+class Bench:
+    """Observers in this process, a graph that a test makes, and the time."""
+
+    def __init__(self, scenario: Scenario, patch: pytest.MonkeyPatch) -> None:
+        self.scenario = scenario
+        self.now_s = 1000.0
+        self.ends: list[tuple[MissionSoFar, Phase]] = []
+        self.notes: list[str] = []
+        self.publishers: dict[str, list[str]] = {}  # by topic
+        self.nodes: list[Observer] = []
+        patch.setattr(observer.time, "monotonic", lambda: self.now_s)
+        patch.setattr(rivals, "publishers", lambda node: self.publishers)
+
+    def observer(self, run: str = RUN) -> Observer:
+        """One of run_all's, with a vehicle of its own if it was given a run."""
+        node = Observer(
+            *(self.scenario, 0 if run else None, run, ["world", "policy"]),
+            ["world", "policy"] if run else ["policy"],
+            *(lambda _: None, lambda _: None, lambda now, phase: self.ends.append((now, phase))),
+            self.notes.append,
+        )
+        self.nodes.append(node)
+        node.trigger_configure()
+        node.trigger_activate()
+        return node
+
+    def looks(self, node: Observer, seconds: float) -> None:
+        """Look for others as often as run_all does."""
+        until_s = self.now_s + seconds
+        while self.now_s < until_s:
+            self.now_s += 0.05
+            node.look()
+
+
+@pytest.fixture
+def bench(ros: Ros, small_scenario: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    """Observers of small missions."""
+    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOG_DIR"):
+        monkeypatch.setenv(name, ros.environment[name])
+    rclpy.init()
+    bench = Bench(scenarios.load(small_scenario), monkeypatch)
+    yield bench
+    for node in bench.nodes:
+        node.trigger_shutdown()
+        node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.mark.parametrize("heard", [STEPS + 1, 2, 0])
+def test_the_end_is_heard_before_the_rates(bench: Bench, heard: int) -> None:
     """An observer hears topic by topic, and a lockstep may fly a mission before it looks again."""
-    scenario = scenarios.load(small_scenario)
-    options = ("--scenario", small_scenario, "--policy", small_policy, "--pace", "lockstep")
-    run = ros.start(
-        "uav_dc_ros.run_all", *options, "--nodes", "policy", "--no-record", "--summary", "summary.json"
-    )
-    stranger = ros.stranger("probe")
-    assert stranger.stdin is not None
-
-    def say(topic: str, payload: messages.Payload) -> None:
-        command = {"topic": topic, "hearing": 2, "data": messages.encode(payload).decode()}
-        assert stranger.stdin is not None
-        stranger.stdin.write(json.dumps(command) + "\n")
-        stranger.stdin.flush()
-
+    node = bench.observer()
     for step in range(STEPS + 1):
-        say("mission", mission(scenario, step))
-    time.sleep(0.5)  # of which run_all takes a few looks
+        node.on_mission(mission(bench.scenario, step))
     for step in range(heard):
-        say("rates", rates(scenario, step))
-    status, output = finish(run)
-    stranger.stdin.close()
-    stranger.wait(10)
-    assert "Traceback" not in output
-    assert status == 1, output  # it was aborted
-    told = json.loads((ros.folder / "summary.json").read_text())
+        node.on_rates(rates(bench.scenario, step))
+    bench.now_s += 10.0
+    node.close(waited_s=5.0)
+    ((now, phase),) = bench.ends
     last = max(heard - 1, 0)
-    assert (told["outcome"], told["steps"], told["data_bits"]) == ("aborted", last, last * MBIT)
-    assert told["distance_m"] == 100.0 * min(last, 2)
+    assert (phase, now.step, now.data_bits) == (Phase.ABORTED, last, last * MBIT)
+    assert now.distance_m == 100.0 * min(last, 2)
+
+
+def test_nodes_begin_once_nobody_else_was_found_for_a_while(bench: Bench) -> None:
+    node = bench.observer()
+    bench.looks(node, ALONE_S / 2)
+    assert not node.is_alone
+    bench.looks(node, ALONE_S)
+    assert node.is_alone
+
+
+def test_another_mission_is_refused_by_the_names_of_its_nodes_and_its_run(bench: Bench) -> None:
+    node = bench.observer()
+    bench.publishers = {"mission": ["/world"], "move": ["/policy"]}
+    bench.looks(node, TELL_S / 2)
+    with pytest.raises(MessageError, match="belongs to run"):
+        node.check_run("mission", OTHER)
+    with pytest.raises(AnotherMissionError, match=rf"flown here by /world, /policy \(run {OTHER}\): give"):
+        bench.looks(node, 0.2)
+
+
+@pytest.mark.parametrize("silent", [True, False])
+def test_another_mission_is_refused_when_only_half_of_that_is_known(bench: Bench, silent: bool) -> None:
+    node = bench.observer()
+    if silent:
+        bench.publishers = {"mission": ["/world"]}
+    else:
+        with pytest.raises(MessageError):
+            node.check_run("rates", OTHER)
+    who = " by /world" if silent else rf" \(run {OTHER}\)"
+    with pytest.raises(AnotherMissionError, match=f"another mission is being flown here{who}: give"):
+        bench.looks(node, TELL_S + 0.2)
+
+
+def test_a_mission_that_has_begun_is_not_ended_by_a_player(bench: Bench) -> None:
+    node = bench.observer()
+    bench.looks(node, ALONE_S + 0.1)
+    node.on_mission(mission(bench.scenario, 0))
+    bench.publishers = {"mission": ["/world", "/player"], "pose": ["/world", "/player"]}
+    for topic in ("mission", "rates"):
+        with pytest.raises(MessageError):
+            node.check_run(topic, OTHER)
+    bench.looks(node, 5.0)
+    assert [note.partition(" here")[0] for note in bench.notes] == ["/player publishes mission, pose"]
+
+
+def test_a_host_without_the_vehicle_adopts_its_run(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = bench.observer(run="")
+    monkeypatch.setattr(node, "count_publishers", lambda topic: 1)
+    node.check_run("mission", RUN)
+    assert node.run == RUN
+    monkeypatch.setattr(node, "count_publishers", lambda topic: 2)
+    with pytest.raises(MessageError):
+        node.check_run("mission", OTHER)
+    monkeypatch.setattr(node, "count_publishers", lambda topic: 1)
+    node.check_run("mission", OTHER)  # the vehicle was started anew: it is the only one
+    assert node.run == OTHER
+
+
+def test_a_host_without_the_vehicle_adopts_no_player_s(bench: Bench) -> None:
+    node = bench.observer(run="")
+    node.check_run("mission", OTHER)
+    bench.publishers = {"mission": ["/player"]}
+    with pytest.raises(AnotherMissionError, match="/player publishes mission here, and is no node of"):
+        bench.looks(node, ALONE_S)
+
+
+def test_who_keeps_messages_as_bytes_knows_those_of_another_run(bench: Bench) -> None:
+    """What is no payload is not another run's: who decodes it refuses it, and a recorder keeps it."""
+    node = bench.observer()
+    ours = json.loads(messages.encode(mission(bench.scenario, 0)))
+    reordered = dict(reversed(ours.items()))
+    for text, expected in (
+        (messages.encode(mission(bench.scenario, 0)).decode(), False),
+        (json.dumps(reordered), False),
+        (json.dumps(ours | {"run": OTHER}), True),
+        (json.dumps({name: value for name, value in ours.items() if name != "run"}), True),
+        ('{"run": 7}', False),
+        ('{"run":', False),
+    ):
+        assert node.is_of_another_run("mission", payloads.cdr_of_text(text.encode())) is expected, text
+    assert node.meter.rejected["mission", "another_run"] == 2
+    assert not node.is_of_another_run("path", b"")
+
+
+def test_a_lie_about_the_seed_ends_no_mission(bench: Bench) -> None:
+    node = bench.observer()
+    with pytest.raises(MessageError, match="mission 0 has seed 7; expected 0"):
+        node.on_mission(msgspec.structs.replace(mission(bench.scenario, 1), seed=7))

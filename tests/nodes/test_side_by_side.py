@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.conftest import Ros, but_run, finish, read_bag, wait_for
 from uav_dc_ros.topics import TOPICS
 
 COMPARED = ("users", "rates", "mission", "move")
@@ -22,7 +22,9 @@ def options(small_scenario: Path, small_policy: Path) -> list[object]:
 def payloads(bag: Path, namespace: str = "") -> dict[str, list[Any]]:
     """Payloads of a bag by topic."""
     messages = read_bag(bag)
-    return {topic: [m for name, m in messages if name == f"{namespace}/{topic}"] for topic in COMPARED}
+    return {
+        topic: [but_run(m) for name, m in messages if name == f"{namespace}/{topic}"] for topic in COMPARED
+    }
 
 
 def test_two_missions_in_two_namespaces_do_not_touch(ros: Ros, options: list[object]) -> None:

@@ -65,6 +65,7 @@ def lies(scenario: Scenario) -> dict[str, tuple[str, dict[str, Any]]]:
         "the end of a later mission": ("mission", mission | {"phase": "aborted"}),
         "a mission with another seed": ("mission", mission | {"seed": 7}),
         "a move for a later step": ("move", {"mission": LATER, "step": 3, "action": "left"}),
+        "of another run": ("mission", mission | {"run": "f" * 16, "phase": "landed"}),
         "ready, of nobody": ("ready", {"node": "nobody"}),
         "ready, of the policy": ("ready", {"node": "policy"}),
         "a pose of the past": ("pose", {"x": 1e3, "stamp_ns": -(10**9)}),
@@ -107,6 +108,7 @@ HARMLESS = (
     "a pose of the far future",
     "a step in a cell of no grid",
     "a step with more steps left than there are",
+    "of another run",
 )
 # These may change a move or a summary, or end the run: they say what only the true node should say.
 HARMFUL = (
@@ -115,7 +117,7 @@ HARMFUL = (
     "rates of a later step, without bounds",
     "a later step",  # the policy decides by the lie, if the rates come before the true word
     "the end of a later mission",
-    "a mission with another seed",  # run_all takes it for somebody else's mission, and ends
+    "a mission with another seed",  # the policy decides by the lie, if the rates come before the true word
 )
 
 
@@ -126,9 +128,10 @@ def test_a_lie_ends_no_node_and_no_run_hangs(ros: Ros, truth: dict[str, list[Any
     topic, payload = lies(scenarios.load(ros.folder / "small.toml"))[lie]
     flight = ros.start("uav_dc_ros.run_all", *given, "--bag", ros.folder / "bag")
     assert flight.stdout is not None
+    output = wait_for(flight.stdout, "mission 2 of")
     probe = ros.stranger("probe")
     assert probe.stdin is not None
-    output = wait_for(flight.stdout, "mission 2 of")
+    payload = payload if topic == "pose" else {"run": ros.run_id(), **payload}
     hearing = sum(topic in NODES[peer].subscribes for peer in PEERS)
     command = {"pose": payload["x"], "frame": "map", **payload} if topic == "pose" else {}
     command |= {"topic": topic, "hearing": hearing, "data": json.dumps(payload)}

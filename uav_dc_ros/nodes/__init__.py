@@ -12,6 +12,7 @@ What all nodes are made of, the lower ones first:
 managed_node     the life cycle, and the parameters
 mission_node     topics from the tables, peers, diagnostics
 diagnostics      what a node counts, once a second
+rivals           who else publishes what a mission has one publisher of
 journal          what a node that was killed must know again
 executor         one thread that handles what is ready
 fastdds          the middleware's settings

@@ -25,7 +25,7 @@ from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import cdr, datums, runtime, vehicles
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.lease import Lease
-from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
+from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.02  # vehicle time
@@ -39,6 +39,7 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
 
     fingerprint: str
     seed: int
+    run: str
     standing: Standing
     anchor: str
 
@@ -69,6 +70,7 @@ class AutopilotBridge(MissionNode):
         kept = self._restore()
         standing, anchor = (None, "") if kept is None else (kept.standing, kept.anchor)
         datum = self._datum()
+        self.run = self.values["run"] or (self.run if kept is None else kept.run)
         self.bridge = Bridge(self.scenario, self.settings, self._on_change, standing, self.fence)
         self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, datum, anchor)
         self._ready_peers: set[str] = set()
@@ -132,8 +134,7 @@ class AutopilotBridge(MissionNode):
     def _begin_if_all_ready(self) -> None:
         if not self._peers_seen or not self._ready_peers.issuperset(self.peers):
             return
-        if self.count_publishers("mission") > 1:
-            raise NodeError(ANOTHER_MISSION)
+        self.check_alone()
         self._begun = True
 
     def _datum(self) -> Geodetic | None:
@@ -255,6 +256,7 @@ class AutopilotBridge(MissionNode):
         kept = Kept(
             fingerprint=self.scenario.fingerprint,
             seed=self.values["seed"],
+            run=self.run,
             standing=self.bridge.standing,
             anchor=self.vehicle.anchor,
         )
@@ -271,6 +273,7 @@ class AutopilotBridge(MissionNode):
         bridge = self.bridge
         waits = "" if self._begun else f"waits for {', '.join(self.peers)}"
         status = messages.Mission(
+            run=self.run,
             mission=0,
             step=bridge.step,
             phase=bridge.phase,

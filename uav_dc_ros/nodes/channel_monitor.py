@@ -5,7 +5,6 @@ has been collected; a monitor that was killed finds them in its journal.
 """
 
 from collections import deque
-from operator import attrgetter
 
 import numpy as np
 
@@ -95,14 +94,15 @@ class ChannelMonitor(MissionNode):
         for waiting in tuple(self._users):
             users, users_m, published_ns = waiting
             begun_ns = users.stamp_ns
-            poses = [pose for pose, _ in self._poses if 0 <= pose.stamp_ns - begun_ns < self._step_ns]
+            poses = [heard for heard in self._poses if 0 <= heard[0].stamp_ns - begun_ns < self._step_ns]
             if not poses:
                 continue
             while (passed := self._users.popleft()) is not waiting:
                 self.reject("users", self._no_pose(passed[0]))
             for heard in [heard for heard in self._poses if heard[0].stamp_ns < begun_ns]:
                 self._poses.remove(heard)  # older than any users to come
-            found = min(poses, key=attrgetter("stamp_ns"))
+            # A pose names no run. Of several with one stamp, our vehicle's was published with the users.
+            found, _ = min(poses, key=lambda heard: (heard[0].stamp_ns, abs(heard[1] - published_ns)))
             try:
                 self._measure(users, users_m, np.asarray(found.position_m), published_ns)
             except MessageError as error:
@@ -116,7 +116,7 @@ class ChannelMonitor(MissionNode):
         )
 
     def _measure(self, users: messages.Users, users_m: Array, uav_m: Array, published_ns: int) -> None:
-        said = self._said
+        said = self._said if self._said is not None and self._said.run == users.run else None
         now, before = (users.mission, users.step), (said.mission, said.step) if said else (-1, 0)
         if said is not None and now == before:
             self.say("rates", said)  # a repeated step is measured, and booked, once
@@ -136,7 +136,7 @@ class ChannelMonitor(MissionNode):
                     "collected before is not known; expected a mission from its step 0",
                 )
             self._forget()
-            if now < before:  # another flight: its time begins again, and meets stamps of the one before
+            if said is None or now < before:  # another run: its time begins again, and meets earlier stamps
                 of_this_flight = (heard for heard in self._poses if heard[1] > heard_ns)
                 self._poses = deque(of_this_flight, maxlen=WAITING_MAX)
         elif users.step != before[1] + 1:
@@ -152,7 +152,9 @@ class ChannelMonitor(MissionNode):
         link = core.measure(self.scenario, uav_m, users_m, collected)
         if users.step > 0:  # step 0 is the moment of the start: no time has passed to collect in
             data_bits, collected = core.collect(self.scenario, link, data_bits, collected)
-        rates = payloads.rates(link, data_bits, collected, mission=users.mission, step=users.step)
+        rates = payloads.rates(
+            link, data_bits, collected, mission=users.mission, step=users.step, run=users.run
+        )
         text = messages.encode(rates)  # refuses what is no number, before it comes into the books
         self._said, self._data_bits, self._collected = rates, data_bits, collected
         keep = self.journal.append if users.step else self.journal.begin

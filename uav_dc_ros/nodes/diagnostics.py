@@ -1,4 +1,21 @@
-"""What a node tells about itself once a second: rates, latencies, what it rejected, restarts."""
+"""What a node reports about itself once a second: rates, latencies, what it rejected, restarts.
+
+Values of a node's status, beside those of its own (`MissionNode.diagnose`), by key; TOPIC is a topic's name:
+
+state                                   of the life cycle
+restarts                                how often run_all has started it again
+process id                              of its process, which others may share
+cpu [%]                                 of one core, over the last period, the whole process
+TOPIC said [Hz]                         messages published
+TOPIC heard [Hz]                        messages handled
+TOPIC transport latency p50, p99 [ms]   from publishing a message to its receipt by this node's middleware
+TOPIC handling latency p50, p99 [ms]    from publishing a message to the end of its handling in this node
+TOPIC rejected: REASON                  messages refused since the start
+
+Latencies are those of the last period; between hosts they hold as far as their clocks agree. Older bags have
+one `TOPIC latency p50 [ms]`: until the end of the handling, but until the receipt where a node keeps messages
+as bytes (recorder, visualizer, live view).
+"""
 
 import os
 import time
@@ -9,6 +26,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 PERIOD_S = 1.0
+LATENCIES = ("transport", "handling")  # from publishing to the receipt, and to the end of the handling
 LATENCIES_KEPT = 4096  # of one topic and period: the last ones
 
 
@@ -23,17 +41,19 @@ class Meter:
         self.rejected: Counter[tuple[str, str]] = Counter()
         self._heard: Counter[str] = Counter()
         self._said: Counter[str] = Counter()
-        self._latencies_ns: dict[str, deque[int]] = {}
+        self._latencies_ns: dict[str, deque[tuple[int, int]]] = {}  # in the order of LATENCIES
         self._since_s = time.monotonic()
         self._cpu_s = time.process_time()
         self._rejected_before = 0
 
-    def heard(self, topic: str, latency_ns: int) -> None:
-        """Note a message that was handled, and the time since it was published, nanoseconds."""
+    def heard(self, topic: str, info: Mapping[str, int]) -> None:
+        """Note a message that was handled just now; `info` came with it."""
         self._heard[topic] += 1
         if topic not in self._latencies_ns:
             self._latencies_ns[topic] = deque(maxlen=LATENCIES_KEPT)
-        self._latencies_ns[topic].append(latency_ns)
+        published_ns = info["source_timestamp"]
+        latencies_ns = info["received_timestamp"] - published_ns, time.time_ns() - published_ns
+        self._latencies_ns[topic].append(latencies_ns)
 
     def said(self, topic: str) -> None:
         """Note a message that was published."""
@@ -50,9 +70,10 @@ class Meter:
         for topic, count in self._heard.items():
             values[f"{topic} heard [Hz]"] = f"{count / period_s:.1f}"
             if latencies_ns := self._latencies_ns[topic]:
-                p50, p99 = np.percentile(np.asarray(latencies_ns), (50, 99)) * 1e-6
-                values[f"{topic} latency p50 [ms]"] = f"{p50:.3f}"
-                values[f"{topic} latency p99 [ms]"] = f"{p99:.3f}"
+                percentiles_ms = np.percentile(np.asarray(latencies_ns), (50, 99), axis=0) * 1e-6
+                for name, (p50, p99) in zip(LATENCIES, percentiles_ms.T, strict=True):
+                    values[f"{topic} {name} latency p50 [ms]"] = f"{p50:.3f}"
+                    values[f"{topic} {name} latency p99 [ms]"] = f"{p99:.3f}"
                 latencies_ns.clear()
         for (topic, reason), count in self.rejected.items():
             values[f"{topic} rejected: {reason}"] = str(count)

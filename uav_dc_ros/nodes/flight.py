@@ -15,13 +15,14 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError
-from uav_dc_ros.messages import Mission, Phase
+from uav_dc_ros.messages import Mission, Phase, new_run
 from uav_dc_ros.nodes import foxglove_server, runtime
 from uav_dc_ros.nodes import options as run_options
 from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.observer import MissionSoFar, Observer, Summary, summary
 from uav_dc_ros.nodes.parameters import ADDRESS, EXTERNAL
+from uav_dc_ros.nodes.rivals import AnotherMissionError
 from uav_dc_ros.nodes.supervisor import Supervisor
 from uav_dc_ros.nodes.table import rows
 from uav_dc_ros.topics import SIMULATED
@@ -49,6 +50,8 @@ class Flight:
             pace.check(self.scenario, options.pace, options.missions)
         self.rows = rows(() if self.is_simulated else ("bridge",))
         self.nodes = run_options.nodes(options)
+        # Whoever starts the vehicle draws the run's identity; a run_all on another host adopts it.
+        self.run_id = new_run() if ("world" if self.is_simulated else "bridge") in self.nodes else ""
         self.together = run_options.together(options, self.nodes)
         self._settings = run_options.settings(options, self.nodes)
         run_options.check_vehicle(options, self.nodes, self.scenario)
@@ -66,6 +69,7 @@ class Flight:
             )
         self.summaries: list[Summary] = []
         self._interrupted = self._aborted = False
+        self._why = ""  # this run ended before its missions
         self._step_s = 0.0  # when the last step came, monotonic clock
         self._status: Mission | None = None  # of the vehicle, its last word
 
@@ -80,7 +84,10 @@ class Flight:
             rclpy.init(args=remapped, signal_handler_options=SignalHandlerOptions.NO)
             parameters = self._parameters(folder)
             seed = self.options.seed if "world" in self.nodes else None
-            node = Observer(self.scenario, seed, self._peers(), self._on_status, self._on_step, self._on_end)
+            node = Observer(
+                *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
+                *(self._on_status, self._on_step, self._on_end, self.display.note),
+            )
             executor = DirectExecutor(node.rest_s)
             executor.add_node(node)
             with Supervisor(
@@ -89,8 +96,12 @@ class Flight:
                 try:
                     self._follow(supervisor, node, executor)
                 except NodeError as error:
-                    self.display.error(str(error))
+                    self._why = str(error)
+                    self.display.error(self._why)
                     status = 1
+                    if isinstance(error, AnotherMissionError):  # what was received may be its
+                        self.summaries.clear()
+                        node.mission = self._status = None
                 status = max(status, self._stopped(supervisor.stop()))
                 self._hear_the_rest(executor)
             self._account_for_all(node)
@@ -104,19 +115,22 @@ class Flight:
         """Spin until all missions are over, or Ctrl-C.
 
         Raises:
-            NodeError: a node gave up, or no step came for too long.
+            NodeError: a node gave up, no step came for too long, or somebody else's mission is flown here.
         """
         node.trigger_configure()
         node.trigger_activate()
         self._step_s = time.monotonic()
         check_s = 0.0
-        while len(self.summaries) < self.options.missions and not self._interrupted:
+        while not (self._interrupted or (node.is_alone and len(self.summaries) >= self.options.missions)):
             executor.spin_once(TICK_S)
             now_s = time.monotonic()
             if now_s >= check_s:
                 check_s = now_s + TICK_S
-                supervisor.tick()
-                node.restarts_of = supervisor.restarts
+                node.look()
+                if node.is_alone:  # until then it asks nothing of nodes, which may be another mission's
+                    supervisor.tick()
+                if node.restarts_of != supervisor.restarts:  # the mission waits for a node that starts again
+                    node.restarts_of, self._step_s = supervisor.restarts, now_s
                 node.close(LAST_RATES_S)
                 self._check_patience(node, now_s)
             time.sleep(node.rest_s)
@@ -160,8 +174,11 @@ class Flight:
             not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.options.seed + flown)
             now = node.mission or not_begun
             now = now if now.mission == flown else not_begun
-            if self._status is not None and self._status.mission == flown:
-                now.hear(self._status)
+            status = self._status
+            if status is not None and status.mission == flown:
+                now.hear(status)
+            if self._why or status is None or not status.phase.is_over:
+                now.reason = self._why or "run_all was interrupted"
             self._on_end(now, Phase.ABORTED)
 
     def _mend_bag(self) -> int:
@@ -213,6 +230,7 @@ class Flight:
                 values["vehicle"] = EXTERNAL
             started[name] = {
                 "peers": self._peers(),
+                "run": self.run_id,
                 # A real vehicle's time is that of this machine: nobody publishes another.
                 "use_sim_time": self.is_simulated and "clock" not in row.publishes,
                 **{one.name: values[one.name] for one in row.parameters if one.name in values},
@@ -234,6 +252,9 @@ class Flight:
     def _on_end(self, mission: MissionSoFar, outcome: Phase) -> None:
         bag = None if self.bag is None else str(self.bag)
         self._aborted |= outcome is Phase.ABORTED
+        if outcome is Phase.ABORTED and not (self._why or self._interrupted):
+            why = mission.reason or "the vehicle gave no reason"
+            self.display.error(f"mission {mission.mission} was aborted at step {mission.step}: {why}")
         self.summaries.append(summary(mission, outcome, self.scenario, self.policy.name, bag))
 
     def _tell(self) -> None:

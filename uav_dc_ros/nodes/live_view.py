@@ -62,9 +62,10 @@ class LiveView(MissionNode):
         view, full_name = self._view, self.resolve_topic_name(topic.name)
 
         def hear(data: bytes, info: Any) -> None:
-            received_ns = info["received_timestamp"]
-            self.meter.heard(topic.name, received_ns - info["source_timestamp"])
-            view.send(full_name, data, received_ns)
+            if self.is_of_another_run(topic.name, data):
+                return
+            view.send(full_name, data, info["received_timestamp"])
+            self.meter.heard(topic.name, info)
 
         return self.create_raw_subscription(topic, hear)
 

@@ -12,23 +12,22 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from uav_dc_ros import messages, payloads, topics
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import cdr, diagnostics, qos
+from uav_dc_ros.nodes import cdr, diagnostics, qos, rivals
 from uav_dc_ros.nodes.diagnostics import Meter
 from uav_dc_ros.nodes.managed_node import ManagedNode
 from uav_dc_ros.nodes.table import rows
 from uav_dc_ros.topics import TOPICS, Topic
 
+CDR_HEAD = 8  # bytes before the text of a serialised std_msgs/String
+HEARTBEAT = "UAV_DC_ROS_HEARTBEAT"  # set by run_all: the file descriptor that takes the heartbeat
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this node has been started again
 PEERS_PERIOD_S = 0.02
 # For the last words to be acknowledged: a bad link takes a while, and a peer that was killed never does.
 ACKNOWLEDGE_S = 1.5
-ANOTHER_MISSION = (
-    "another mission is being flown here: somebody else publishes `mission`. Give this one a namespace of "
-    "its own (--namespace uav2), or a network (export ROS_DOMAIN_ID=1, or any number up to 101)"
-)
 
 
 class MissionNode(ManagedNode):
@@ -42,7 +41,11 @@ class MissionNode(ManagedNode):
         name: of its row.
         overrides: values of parameters, over those of the command line.
 
+    Messages of another run of missions are counted and dropped. A node that was given no run has, as the
+    vehicle, one of its own, and otherwise that of the only publisher which it receives from.
+
     Attributes:
+        run: identity of the run that is flown; empty while it is not known.
         drains: does the node still handle, when asked to stop, what has arrived by then?
         rest_s: pause after each turn of its executor: see there.
         meter: what it counts for its diagnostics.
@@ -71,6 +74,8 @@ class MissionNode(ManagedNode):
         self.serve: Callable[[float], None] = time.sleep
         self.publishers_of: dict[str, Publisher] = {}
         self.subscriptions_of: dict[str, Any] = {}
+        self.run: str = self.values["run"]
+        self._given_run = f'{{"run":"{self.run}"'.encode() if self.run else b""  # as our own payloads begin
         self.peers = [peer for peer in self.values["peers"] if peer != name]
         self.rows = rows([name, *self.peers])
         self._timers_active: list[Any] = []
@@ -96,7 +101,13 @@ class MissionNode(ManagedNode):
             diagnostics.PERIOD_S, self._tell_diagnostics, clock=self.steady
         )
 
+    @property
+    def is_vehicle(self) -> bool:
+        """Is it this node that says where the mission stands."""
+        return "mission" in self.row.publishes
+
     def _activate(self) -> None:
+        self.run = self.values["run"] or (messages.new_run() if self.is_vehicle else "")
         super()._activate()
         for name in self.row.subscribes:
             self.subscriptions_of[name] = self.subscribe(TOPICS[name])
@@ -148,12 +159,47 @@ class MissionNode(ManagedNode):
                 if payload is None:
                     handle(cdr.Pose(data))
                 else:
-                    handle(messages.decode(payloads.text_in_cdr(data), payload))
+                    decoded = messages.decode(payloads.text_in_cdr(data), payload)
+                    self.check_run(topic.name, decoded.run)
+                    handle(decoded)
             except MessageError as error:
                 self.reject(topic.name, error)
-            self.meter.heard(topic.name, time.time_ns() - self.published_ns)
+            self.meter.heard(topic.name, info)
 
         return self.create_raw_subscription(topic, hear)
+
+    def check_run(self, topic: str, run: str) -> None:
+        """Refuse a message of another run; adopt the run of the only publisher, where none was given.
+
+        Raises:
+            MessageError: the message belongs to another run.
+        """
+        if run == self.run or (topic == "ready" and not run):
+            return
+        if self.is_vehicle or self.values["run"] or self.count_publishers(topic) > 1:
+            raise MessageError(
+                "another_run", f"it belongs to run {run!r}; expected {self.run!r}, the run of this mission"
+            )
+        self.run = run
+
+    def is_of_another_run(self, topic: str, data: bytes) -> bool:
+        """Belongs a serialised message to another run than the one that was given? Such a one is counted.
+
+        For nodes that handle messages as bytes. Without a given run they take whatever is published.
+        """
+        if not self._given_run or topic not in messages.PAYLOADS:
+            return False
+        if data.startswith(self._given_run, CDR_HEAD):
+            return False
+        other = messages.run_of(data[CDR_HEAD:].rstrip(b"\0"))
+        if other is None:
+            return False  # whoever decodes it refuses it
+        try:
+            self.check_run(topic, other)
+        except MessageError as error:
+            self.reject(topic, error)
+            return True
+        return False
 
     def create_raw_subscription(self, topic: Topic, callback: Callable[[bytes, Any], None]) -> Any:
         """A subscription with the table's QoS, as overridden, for the bytes of messages and their info."""
@@ -193,15 +239,37 @@ class MissionNode(ManagedNode):
 
     def _look_for_peers(self) -> None:
         for topic, publisher in self.publishers_of.items():
-            hearing = sum(topic in self.rows[peer].subscribes for peer in self.peers)
-            if publisher.get_subscription_count() < hearing:
+            hearing = [peer for peer in self.peers if topic in self.rows[peer].subscribes]
+            if publisher.get_subscription_count() < len(hearing):
+                return
+            if hearing and not self._are_all_in(hearing, self.get_subscriptions_info_by_topic(topic)):
                 return
         for topic, subscription in self.subscriptions_of.items():
-            saying = sum(topic in self.rows[peer].publishes for peer in self.peers)
-            if subscription.get_publisher_count() < saying:
+            saying = [peer for peer in self.peers if topic in self.rows[peer].publishes]
+            if subscription.get_publisher_count() < len(saying):
+                return
+            if saying and not self._are_all_in(saying, self.get_publishers_info_by_topic(topic)):
                 return
         self._peers_timer.cancel()
         self.on_peers()
+
+    def _are_all_in(self, peers: Sequence[str], ends: Sequence[TopicEndpointInfo]) -> bool:
+        """Are these peers among the nodes behind the ends of a topic: any stranger adds to their count."""
+        inside = self.get_namespace().rstrip("/")
+        return {f"{inside}/{peer}" for peer in peers} <= {qos.full_name(end) for end in ends}
+
+    def check_alone(self) -> None:
+        """Refuse to begin a mission where somebody else publishes what it has one publisher of.
+
+        Only of this node itself two are one too many: the graph may still tell of another that was killed.
+
+        Raises:
+            AnotherMissionError: who does.
+        """
+        others = [name for name in self.rows if name != self.row.name]
+        found = rivals.find(rivals.publishers(self), self.get_namespace(), self.rows, restarted=others)
+        if found:
+            raise rivals.AnotherMissionError(found.told())
 
     def check_peer(self, payload: messages.Ready) -> None:
         """Refuse what nobody of the table says.
@@ -216,7 +284,7 @@ class MissionNode(ManagedNode):
     def on_peers(self) -> None:
         """All peers are there."""
         if "ready" in self.row.publishes:
-            self.say("ready", messages.Ready(node=self.row.name))
+            self.say("ready", messages.Ready(run=self.run, node=self.row.name))
 
     # Diagnostics.
 

@@ -12,9 +12,15 @@ import rclpy
 from uav_dc_ros import messages, payloads
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
+from uav_dc_ros.errors import MessageError
+from uav_dc_ros.nodes import rivals
+from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.pairs import StepPairs
+
+ALONE_S = 1.0  # nobody else was found for so long, before any node of this mission may begin
+LOOK_S = 0.1  # for others, until this mission has begun
+LOOK_LATER_S = 1.0  # for others, afterwards
+TELL_S = 0.5  # both who publishes and for which run are told, if they are known within this time
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,7 +37,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
         distance_m: length of the path flown, metres.
         reward: r^t at the end (eq. 7), as `evaluate` and the policies' cards have it.
-        reason: how a real vehicle came to its end, in words; empty in simulation.
+        reason: how a real vehicle came to its end, or why a mission was aborted, in words; else empty.
         bag: folder of the bag, or null.
     """
 
@@ -120,12 +126,16 @@ class Observer(MissionNode):
     Args:
         scenario: the world that is flown.
         seed: seed of the first mission; none: whatever the vehicle says.
+        run: identity of the run that is flown; empty: that of the vehicle, which is started elsewhere.
         peers: nodes of the mission.
+        here: those of the nodes that this run_all starts; they publish only once it is alone.
         on_status: called with each word of the vehicle.
         on_step: called after each step.
         on_end: called when a mission has come to its end, with how.
+        on_note: called with what the user should know.
 
     Attributes:
+        is_alone: was nobody found who publishes for another mission, for long enough to begin this one.
         restarts_of: how often each node was started again, for the diagnostics.
     """
 
@@ -135,35 +145,93 @@ class Observer(MissionNode):
         self,
         scenario: Scenario,
         seed: int | None,
+        run: str,
         peers: list[str],
+        here: list[str],
         on_status: Callable[[messages.Mission], None],
         on_step: Callable[[MissionSoFar], None],
         on_end: Callable[[MissionSoFar, messages.Phase], None],
+        on_note: Callable[[str], None],
     ) -> None:
-        super().__init__("observer", [rclpy.Parameter("peers", value=peers)])
+        given = {"peers": peers, "run": run}
+        super().__init__("observer", [rclpy.Parameter(name, value=value) for name, value in given.items()])
         self.scenario = scenario
         self.seed = seed
         self.mission: MissionSoFar | None = None
         self.restarts_of: dict[str, int] = {}
+        self.is_alone = False
         self._on_status, self._on_step, self._on_end = on_status, on_step, on_end
+        self._here, self._on_note = here, on_note
 
     def activate(self) -> None:
         """Follow from here on."""
+        self.is_alone = False
+        self._has_begun = False  # a mission of this run
+        self._other_run: str | None = None  # of which a message came before that
+        self._since_s = self._look_s = time.monotonic()
+        self._found_s: float | None = None  # when another mission was noticed
+        self._noted: set[str] = set()  # nodes that publish for nobody of this mission
         self._steps = StepPairs()
         self._position_m: list[float] = []  # before the first step
         self._ended: dict[int, messages.Mission] = {}  # missions that are over, and how, until it is told
         self._ended_s = 0.0  # when the last one was
         self._told = -1  # the last mission whose end was told
 
-    def on_mission(self, payload: messages.Mission) -> None:
-        """Follow the vehicle.
+    def look(self) -> None:
+        """Look for others who publish this mission's topics. Once it has begun they are told, and ignored.
 
         Raises:
-            NodeError: it flies for somebody else.
+            AnotherMissionError: this mission has not begun, and must not.
         """
+        now_s = time.monotonic()
+        if now_s < self._look_s:
+            return
+        begun = self.is_alone and self._has_begun
+        self._look_s = now_s + (LOOK_LATER_S if begun else LOOK_S)
+        # The graph still tells of a node that was killed, for a while.
+        again = self.rows if begun else [name for name, n in self.restarts_of.items() if n]
+        absent = () if self.is_alone else self._here
+        found = rivals.find(rivals.publishers(self), self.get_namespace(), self.rows, again, absent)
+        if not begun and (found or self._other_run is not None):
+            self._found_s = self._found_s or now_s
+            if (found and self._other_run is not None) or now_s - self._found_s >= TELL_S:
+                raise rivals.AnotherMissionError(found.told(self._other_run or ""))
+            return
+        if found.foreign.keys() - self._noted:
+            self._noted |= found.foreign.keys()
+            self._on_note(f"{found.told()}; its payloads are ignored, its poses may be recorded")
+        self.is_alone |= now_s - self._since_s >= ALONE_S
+
+    def _look_for_peers(self) -> None:
+        if self.is_alone:  # otherwise another mission's nodes of these names would do
+            super()._look_for_peers()
+
+    def _tell_diagnostics(self) -> None:
+        if self.is_alone:
+            super()._tell_diagnostics()
+
+    def check_run(self, topic: str, run: str) -> None:
+        """Note another run whose messages come before this mission has begun.
+
+        Raises:
+            MessageError: the message belongs to another run.
+        """
+        try:
+            super().check_run(topic, run)
+        except MessageError:
+            if not self._has_begun:
+                self._other_run = run
+            raise
+
+    def on_mission(self, payload: messages.Mission) -> None:
+        """Follow the vehicle."""
         payloads.check_world(payload, self.scenario)
         if self.seed is not None and payload.seed != self.seed + payload.mission:
-            raise NodeError(ANOTHER_MISSION)
+            raise MessageError(
+                "seed",
+                f"mission {payload.mission} has seed {payload.seed}; expected {self.seed + payload.mission}",
+            )
+        self._has_begun = True
         self._on_status(payload)
         if payload.phase.is_over and payload.mission > self._told and payload.mission not in self._ended:
             self._ended[payload.mission] = payload

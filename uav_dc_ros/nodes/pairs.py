@@ -13,12 +13,12 @@ class StepPairs:
     """Brings together the `mission` and the `rates` of a step, which arrive in any order."""
 
     def __init__(self) -> None:
-        self._missions: dict[tuple[int, int], Mission] = {}
-        self._rates: dict[tuple[int, int], Rates] = {}
+        self._missions: dict[tuple[str, int, int], Mission] = {}
+        self._rates: dict[tuple[str, int, int], Rates] = {}
 
     def add(self, payload: Mission | Rates) -> tuple[Mission, Rates] | None:
         """Add one half; both, once the other half of its step is there."""
-        step = (payload.mission, payload.step)
+        step = (payload.run, payload.mission, payload.step)
         if isinstance(payload, Mission):
             _keep(self._missions, step, payload)
         else:
@@ -28,7 +28,7 @@ class StepPairs:
         return self._missions.pop(step), self._rates.pop(step)
 
 
-def _keep(waiting: dict[tuple[int, int], V], step: tuple[int, int], payload: V) -> None:
+def _keep(waiting: dict[tuple[str, int, int], V], step: tuple[str, int, int], payload: V) -> None:
     waiting[step] = payload
     if len(waiting) > WAITING_MAX:
         del waiting[next(iter(waiting))]

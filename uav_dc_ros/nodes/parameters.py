@@ -5,9 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from uav_dc_ros.bags.compression import COMPRESSIONS
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.messages import Run
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
 EXTERNAL = "external"  # what the world calls a vehicle that is not its own
@@ -100,6 +103,13 @@ def one_of(*choices: str) -> Callable[[str], str]:
     return check
 
 
+def _run(text: str) -> str:
+    try:
+        return msgspec.convert(text, Run)
+    except msgspec.ValidationError:
+        raise ParameterError(f"{text!r}; expected 16 hexadecimal digits in lower case, as a text") from None
+
+
 AUTOSTART = Parameter(
     name="autostart",
     default=True,
@@ -111,6 +121,14 @@ PEERS = Parameter(
     default=["world", "channel_monitor", "policy"],
     description="nodes of this mission, by name; it starts when all of them are there",
     read_only=True,
+)
+RUN = Parameter(
+    name="run",
+    default="",
+    description="identity of this run of missions, 16 hexadecimal digits: the node ignores messages of every "
+    "other run; empty: the vehicle draws one, the others adopt the vehicle's",
+    read_only=True,
+    parse=_run,
 )
 SCENARIO = Parameter(
     name="scenario", default="five_clusters", description="name of a shipped scenario, or path of a TOML file"
@@ -223,4 +241,4 @@ VEHICLE_FLOWN = Parameter(
     parse=one_of(SIMULATED, *VEHICLES),
 )
 BAG_FILES = (RECORDED_TOPICS, SPLIT_BYTES, SPLIT_S, COMPRESSION, MIN_FREE_BYTES)  # of who writes a bag
-EVERY = (AUTOSTART, PEERS)  # that every node has
+EVERY = (AUTOSTART, PEERS, RUN)  # that every node has

@@ -52,7 +52,10 @@ class Policy(MissionNode):
         data_bits, collected = payloads.collection(rates, self.scenario)
         steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
         action = self._decide(mission.cell, steps_flown, data_bits, collected)
-        self.say("move", messages.Move(mission=mission.mission, step=mission.step, action=action.label))
+        self.say(
+            "move",
+            messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label),
+        )
 
     def _decide(
         self, cell: tuple[int, int, int], steps_flown: int, data_bits: Array, collected: Array

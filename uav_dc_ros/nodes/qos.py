@@ -109,6 +109,11 @@ def incompatible(
                 yield from _mismatch(subscription, end, end.qos_profile, _told(subscription.qos_profile))
 
 
+def full_name(end: TopicEndpointInfo) -> str:
+    """Full name of the node behind a publisher or subscription."""
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+
+
 def _told(profile: QoSProfile) -> QoSProfile:
     """A profile as the graph tells it: a duration of zero, which stands for none, is infinite there."""
     told = copy.copy(profile)
@@ -121,7 +126,7 @@ def _told(profile: QoSProfile) -> QoSProfile:
 def _mismatch(
     ours: Publisher | Subscription, end: TopicEndpointInfo, offer: QoSProfile, request: QoSProfile
 ) -> Iterator[tuple[str, str, str]]:
-    peer = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+    peer = full_name(end)
     if UNKNOWN in peer:
         return  # found so lately that nobody knows its name yet
     kind = type_name(ours.msg_type)

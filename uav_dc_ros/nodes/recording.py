@@ -155,14 +155,17 @@ class BagNode(MissionNode):
             return lambda data, info: None  # a mission's peers count on the subscription
         already_ns = writer.already_written.get(name, -1)
         heard, write, announced = self.meter.heard, writer.write, self._announced
+        other_run = self.is_of_another_run
 
         def hear(data: bytes, info: Any) -> None:
+            if topic is not None and other_run(topic.name, data):
+                return
             published_ns, received_ns = info["source_timestamp"], info["received_timestamp"]
-            heard(label, received_ns - published_ns)
             if name not in announced and topic is not None:
                 self.announce(name, topic)
             if published_ns > already_ns:
                 write(name, data, log_time_ns=received_ns, publish_time_ns=published_ns)
+            heard(label, info)
 
         return hear
 

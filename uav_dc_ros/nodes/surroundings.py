@@ -51,7 +51,7 @@ class Surroundings:
         if payload.phase is Phase.READY or (payload.phase in ARRIVED and is_new and payload.step > 0):
             self._is_due = True
 
-    def users(self, stamp_ns: int) -> messages.Users | None:
+    def users(self, stamp_ns: int, run: str = "") -> messages.Users | None:
         """The users to be published with the time of a pose, nanoseconds; None: nobody waits for any."""
         if not self._is_due or self.status is None:
             return None
@@ -61,5 +61,5 @@ class Surroundings:
             self._crowd, self._crowd_of = Crowd(self._scenario, self._seed + mission), mission
         self._crowd.walk(step - self._crowd.step)
         return payloads.users(
-            self._scenario, self._crowd.positions_m, mission=mission, step=step, time_ns=stamp_ns
+            self._scenario, self._crowd.positions_m, mission=mission, step=step, time_ns=stamp_ns, run=run
         )

@@ -59,6 +59,8 @@ class Visualizer(MissionNode):
         )
 
         def hear(data: bytes, info: Any) -> None:
+            if self.is_of_another_run(topic.name, data):
+                return
             published_ns = info["source_timestamp"]
             try:
                 take(topic.name, data, published_ns)
@@ -66,7 +68,7 @@ class Visualizer(MissionNode):
                 self.reject(topic.name, error)
             else:
                 self._changed = True
-            self.meter.heard(topic.name, info["received_timestamp"] - published_ns)
+            self.meter.heard(topic.name, info)
 
         return self.create_raw_subscription(topic, hear)
 

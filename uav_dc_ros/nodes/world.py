@@ -30,7 +30,7 @@ from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import cdr, convert, runtime
 from uav_dc_ros.nodes.journal import Journal
-from uav_dc_ros.nodes.mission_node import ANOTHER_MISSION, MissionNode
+from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.parameters import EXTERNAL
 from uav_dc_ros.nodes.surroundings import Surroundings
 from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
@@ -39,6 +39,7 @@ STALL_S = 1.0  # a lockstep that stands still for so long repeats its last messa
 CONFIRM_S = 1.0  # a lockstep waits for who hears of it no longer than so
 UNCONFIRMED_S = 0.02  # and than so, as long as one does not answer: it may have been killed
 CLOCK_PERIOD_S = 0.05
+POSE_AGE_MAX_S = 10.0  # of a vehicle from outside: what is older was not measured now
 USER_BYTES = 40  # of `users`, for each of them
 OVERRUN_S = 0.005  # a step at a pace that starts later than this after its time
 
@@ -49,6 +50,7 @@ class Flown(msgspec.Struct, frozen=True):
     mission: int
     seed: int
     fingerprint: str
+    run: str
 
 
 class World(MissionNode):
@@ -98,7 +100,7 @@ class World(MissionNode):
             self.get_logger().warning(f"{self._hovered} steps were hovered: no move came in time")
         if self._flying and self._phase is Phase.READY:
             self._phase = Phase.ABORTED
-            self.say("mission", self._status())
+            self.say("mission", self._status("the vehicle was stopped before the end of the mission"))
 
     # Before the first mission.
 
@@ -121,8 +123,8 @@ class World(MissionNode):
     def _start_if_all_ready(self) -> None:
         if self._flying or not self._peers_seen or not self._ready_peers.issuperset(self.peers):
             return
-        if self.count_publishers("mission") > 1:
-            raise NodeError(ANOTHER_MISSION)
+        if self._phase is None:
+            self.check_alone()
         self._flying = True
         if self._phase is None:
             self._begin(0)
@@ -143,7 +145,7 @@ class World(MissionNode):
     # Missions.
 
     def _begin(self, mission: int) -> None:
-        flown = Flown(mission, self.values["seed"], self.scenario.fingerprint)
+        flown = Flown(mission, self.values["seed"], self.scenario.fingerprint, self.run)
         self.journal.begin(msgspec.json.encode(flown))
         self._place(mission)
         self._tell()
@@ -176,6 +178,7 @@ class World(MissionNode):
                 f"{flown.fingerprint}); expected seed {self.values['seed']}, scenario "
                 f"{self.scenario.fingerprint}, or a new file"
             )
+        self.run = self.values["run"] or flown.run
         self._place(flown.mission)
         for action in actions:
             self._move(action)
@@ -255,7 +258,14 @@ class World(MissionNode):
     def on_pose(self, pose: cdr.Pose) -> None:
         """Publish the users of a step that the vehicle has come to."""
         assert self.surroundings is not None, "otherwise it is this node that says it"
-        if (users := self.surroundings.users(pose.stamp_ns)) is not None:
+        age_s = (self.published_ns - pose.stamp_ns) * 1e-9
+        if self.values["run"] and abs(age_s) > POSE_AGE_MAX_S:
+            raise MessageError(
+                "stale",
+                f"its stamp is {age_s:.0f} s older than its publication; expected at most "
+                f"{POSE_AGE_MAX_S:g} s: it was recorded, and is played",
+            )
+        if (users := self.surroundings.users(pose.stamp_ns, self.run)) is not None:
             self.say("users", users)
 
     # What the others hear.
@@ -278,16 +288,20 @@ class World(MissionNode):
         """The users of a step, metres `[U, 2]`, as they are said."""
         time_ns = self._time_ns(step)
         return messages.encode(
-            payloads.users(self.scenario, users_m, mission=self._mission, step=step, time_ns=time_ns)
+            payloads.users(
+                self.scenario, users_m, mission=self._mission, step=step, time_ns=time_ns, run=self.run
+            )
         )
 
-    def _status(self) -> messages.Mission:
+    def _status(self, reason: str = "") -> messages.Mission:
         assert self._phase is not None, "a mission has begun"
         east, north, up = self._cell.tolist()
         return messages.Mission(
+            run=self.run,
             mission=self._mission,
             step=self._step,
             phase=self._phase,
+            reason=reason,
             cell=(east, north, up),
             remaining_steps=self.scenario.mission.max_steps - self._step,
             seed=self.values["seed"] + self._mission,

@@ -1,12 +1,15 @@
 """What a node tells about itself once a second, followed over a whole recording in bounded memory."""
 
 import math
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
 
 SERIES_MAX = 400  # points of a curve, and values of which a median is taken
 COUNTERS = ("restarts", "rejected", "step overruns", "hovered steps")  # values that only ever rise
+# Until the end of the handling; without a word, as older bags have it, of some nodes until the receipt only.
+LATENCY = re.compile(r"(?P<topic>\S+)(?: handling)? latency (?P<percentile>p50|p99) \[ms\]")
 LATENCIES_MAX = 50  # topics of a node: more has none of ours
 
 
@@ -69,13 +72,14 @@ class Node:
         self._last_s, self._last = at_s, report
         for key, text in report.values.items():
             value = _number(text)
-            topic, told, percentile = key.removesuffix(" [ms]").partition(" latency ")
+            latency = LATENCY.fullmatch(key)
             if value is None:
                 continue
             if key == "cpu [%]":
                 self._cpu.add(at_s, value)
-            elif told and percentile in ("p50", "p99") and self._may_be_new(topic):
-                self._latencies.setdefault(topic, {}).setdefault(percentile, Series()).add(at_s, value)
+            elif latency is not None and self._may_be_new(latency["topic"]):
+                percentiles = self._latencies.setdefault(latency["topic"], {})
+                percentiles.setdefault(latency["percentile"], Series()).add(at_s, value)
         return news
 
     def page(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ function system(health) {
         { name: "warnings", text: (row) => fixed(row.warnings), value: by("warnings") },
         { name: "CPU, %", text: (row) => fixed(row.cpu_median, 0), value: by("cpu_median"), help: "median, of its process: nodes that share one tell the same" },
         { name: "max", text: (row) => fixed(row.cpu_max, 0), value: by("cpu_max") },
-        { name: "hears: p50 (worst p99), ms", cls: "text", text: (row) => row.heard.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
+        { name: "until handled: p50 (worst p99), ms", cls: "text", text: (row) => row.heard.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
         { name: "counted", cls: "text", text: (row) => Object.entries(row.counters).map(([name, value]) => `${name} ${value}`).join(", ") || NONE },
       ], nodes, { label: "Nodes" }) : make("p", { class: "note" }, "No node told diagnostics in this bag."))),
     make("div", { class: "grid halves" },

@@ -1,0 +1,121 @@
+"""One mission beside another, and beside a player of bags: never the other's summary, always a reason."""
+
+import json
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Ros, but_run, finish, read_bag, wait_for
+
+TRIES = [1, pytest.param(20, marks=pytest.mark.long)]
+COMPARED = ("/users", "/rates", "/mission", "/move")
+
+
+@pytest.fixture
+def options(small_scenario: Path, small_policy: Path) -> list[object]:
+    """A small mission with seed 0."""
+    return ["--scenario", small_scenario, "--policy", small_policy]
+
+
+@pytest.fixture
+def bag(ros: Ros, options: list[object]) -> Path:
+    """A bag of that mission, flown alone."""
+    status, output = ros.run_all(*options, "--pace", "lockstep", "--bag", "alone", "--summary", "alone.json")
+    assert status == 0, output
+    return ros.folder / "alone"
+
+
+def payloads(bag: Path) -> dict[tuple[str, int], list[Any]]:
+    """What was said of each step of mission 0, without runs and repetitions, by topic and step."""
+    found: dict[tuple[str, int], list[Any]] = {}
+    for topic, payload in read_bag(bag):
+        if topic in COMPARED and payload["mission"] == 0:
+            said = found.setdefault((topic, payload["step"]), [])
+            if but_run(payload) not in said:
+                said.append(but_run(payload))
+    return found
+
+
+def refused(ros: Ros, options: list[object], name: str) -> tuple[str, dict[str, Any]]:
+    """A run_all that must not fly: what it printed, and its summary."""
+    given = ("--pace", "lockstep", "--bag", name, "--summary", f"{name}.json")
+    status, output = ros.run_all(*options, *given)
+    assert status == 1, output
+    assert "Traceback" not in output
+    summary = json.loads((ros.folder / f"{name}.json").read_text())
+    assert (summary["outcome"], summary["steps"], summary["bag"]) == ("aborted", 0, None), output
+    assert f"error: {summary['reason']}" in output
+    assert not (ros.folder / name).exists()
+    return output, summary
+
+
+def stopped(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """End a process as Ctrl-C does."""
+    process.send_signal(signal.SIGINT)
+    return finish(process)
+
+
+@pytest.mark.parametrize("tries", TRIES)
+def test_a_mission_beside_a_looping_player_is_refused_by_the_player_s_name(
+    ros: Ros, options: list[object], bag: Path, tries: int
+) -> None:
+    """The bag's mission has the same seed: only its run tells it from the one that was to be flown."""
+    (run,) = {payload["run"] for topic, payload in read_bag(bag) if topic == "/mission"}
+    player = ros.start("uav_dc_ros.bag", "play", bag, "--loop", "--rate", 5)
+    assert player.stdout is not None
+    wait_for(player.stdout, "messages")
+    for i in range(tries):
+        _, summary = refused(ros, options, f"try{i}")
+        assert summary["reason"].startswith("/player publishes "), summary
+        assert f"here (run {run}), and is no node of this mission: give this one" in summary["reason"]
+    assert "Traceback" not in stopped(player)[1]
+
+
+@pytest.mark.parametrize("tries", TRIES)
+def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
+    ros: Ros, options: list[object], bag: Path, tries: int
+) -> None:
+    given = ("--pace", "lockstep", "--bag", "first", "--summary", "first.json", "--missions", 100_000)
+    first = ros.start("uav_dc_ros.run_all", *options, *given)
+    assert first.stdout is not None
+    printed = wait_for(first.stdout, "mission 2 of")
+    run = ros.run_id()
+    for i in range(tries):
+        _, summary = refused(ros, options, f"try{i}")
+        told = summary["reason"]
+        assert told.startswith("another mission is being flown here by /world"), told
+        assert f"(run {run}): give this one" in told
+    status, rest = stopped(first)
+    assert status == 130, rest
+    assert "WARN" not in printed + rest, "it was touched"
+    assert payloads(ros.folder / "first") == payloads(bag)
+    assert {m["run"] for topic, m in read_bag(ros.folder / "first") if topic in COMPARED} == {run}
+    summaries = json.loads((ros.folder / "first.json").read_text())
+    expected = json.loads((ros.folder / "alone.json").read_text())
+    assert summaries[0] == expected | {"bag": str(ros.folder / "first")}
+    assert summaries[-1]["reason"] == "run_all was interrupted"
+
+
+def test_a_player_that_comes_later_changes_nothing(ros: Ros, options: list[object], bag: Path) -> None:
+    """The bag has another seed, so that every payload and, but for the first, every pose is another."""
+    given = (*options, "--seed", 7, "--pace", "lockstep")
+    status, output = ros.run_all(*given, "--bag", "seven", "--summary", "seven.json")
+    assert status == 0, output
+    paced = (*options, "--seed", 7, "--pace", 30, "--bag", "beside", "--summary", "beside.json")
+    flight = ros.start("uav_dc_ros.run_all", *paced)
+    assert flight.stdout is not None
+    printed = wait_for(flight.stdout, "mission: step 0/30")
+    player = ros.start("uav_dc_ros.bag", "play", bag, "--loop", "--rate", 2)
+    status, output = finish(flight)
+    stopped(player)
+    assert status == 0, output
+    assert "note: /player publishes " in output, output
+    assert "mission: another_run: it belongs to run" in printed + output
+    alone, beside = payloads(ros.folder / "seven"), payloads(ros.folder / "beside")
+    if "hovered" not in output:  # otherwise this machine was too busy to fly it as it was flown alone
+        assert beside == alone
+        told = [json.loads((ros.folder / f"{name}.json").read_text()) for name in ("seven", "beside")]
+        assert told[1] == told[0] | {"bag": str(ros.folder / "beside")}

@@ -1,0 +1,66 @@
+"""Who else publishes what a mission has one publisher of."""
+
+import pytest
+
+from uav_dc_ros.nodes import rivals
+from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
+from uav_dc_ros.topics import TOPICS
+
+OURS = {
+    "pose": ["/uav1/world"],
+    "users": ["/uav1/world"],
+    "rates": ["/uav1/channel_monitor"],
+    "mission": ["/uav1/world"],
+    "move": ["/uav1/policy"],
+}
+
+
+def test_the_topics_that_a_mission_trusts_have_one_publisher() -> None:
+    exclusive = [topic.name for topic in TOPICS.values() if topic.exclusive]
+    assert exclusive == ["pose", "users", "rates", "mission", "move", "target", "clock"]
+    for name in exclusive:
+        others = [row.name for row in NODES.values() if name in row.publishes and row.name != "bridge"]
+        assert len(others) == 1, name
+
+
+def test_a_mission_alone_has_no_rivals() -> None:
+    assert not rivals.find(OURS, "/uav1", NODES)
+    assert not rivals.find({}, "/", NODES)
+
+
+def test_a_player_is_named_with_what_it_publishes() -> None:
+    found = rivals.find(OURS | {"pose": ["/uav1/world", "/player"], "rates": ["/player"]}, "/uav1", NODES)
+    assert found.foreign == {"/player": ["pose", "rates"]}
+    assert found.told("0123456789abcdef") == (
+        "/player publishes pose, rates here (run 0123456789abcdef), and is no node of this mission"
+    )
+
+
+def test_a_node_of_our_names_in_another_namespace_is_foreign() -> None:
+    assert rivals.find({"mission": ["/world"]}, "/uav1", NODES).foreign == {"/world": ["mission"]}
+
+
+def test_a_node_that_is_there_twice_is_another_mission() -> None:
+    found = rivals.find(OURS | {"mission": ["/uav1/world"] * 2}, "/uav1", NODES)
+    assert found.told("0123456789abcdef") == (
+        "another mission is being flown here by /uav1/world (run 0123456789abcdef)"
+    )
+
+
+def test_a_node_that_we_have_not_begun_is_another_mission() -> None:
+    found = rivals.find(OURS, "/uav1", NODES, absent=["world", "policy"])
+    assert found.told() == "another mission is being flown here by /uav1/world, /uav1/policy"
+
+
+@pytest.mark.parametrize("twice", ["world", "policy"])
+def test_the_graph_may_still_tell_of_a_node_that_was_killed(twice: str) -> None:
+    publishers = {topic: names * (1 + names[0].endswith(twice)) for topic, names in OURS.items()}
+    assert rivals.find(publishers, "/uav1", NODES)
+    assert not rivals.find(publishers, "/uav1", NODES, restarted=[twice])
+
+
+def test_nobody_is_a_rival_on_a_topic_that_this_mission_does_not_have() -> None:
+    """Beside a real vehicle nobody of ours makes a clock: a simulator may."""
+    around = {**NODES, "world": WORLD_AROUND}
+    assert not rivals.find({"clock": ["/gazebo"]}, "/", around)
+    assert rivals.find({"clock": ["/gazebo"]}, "/", NODES)
