@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context
 
-TURN_MAX = 100  # messages of one topic before the others get their turn
+TURN_MAX, TURN_MAX_S = 100, 0.2  # messages of one topic, and their time, before the others get their turn
 # Quiet is what was so in as many turns: on a busy computer the middleware's thread may have had no time yet.
 QUIET_TURNS = 10
 BUSY_S = 0.003  # while messages keep coming, timers and services are looked at this often
@@ -149,6 +149,7 @@ class DirectExecutor:
     def _take_messages(self, subscription: Any) -> None:
         handle = subscription.handle
         with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
+        until_s = time.monotonic() + TURN_MAX_S
         with handle:  # raises InvalidHandle, if it was destroyed since it became ready
             for _ in range(self._at_once):
                 taken = handle.take_message(subscription.msg_type, subscription.raw)
@@ -159,6 +160,8 @@ class DirectExecutor:
                     subscription.callback(*taken)
                 else:
                     subscription.callback(taken[0])
+                if self._heard_s > until_s:
+                    break
         self._behind = True
 
     def _emptied(self, *capacity: int) -> Any:

@@ -1,7 +1,8 @@
 """Runs a node of the node table as a process, or several in one.
 
 Such a process ends when its standard input ends, so none outlives a run_all that was killed. What it prints
-is passed on with its name in front.
+is passed on with its name in front. The thread that runs its callbacks sends a heartbeat through a pipe, so
+that one that hangs is told from one that has nothing to do.
 """
 
 import json
@@ -16,7 +17,9 @@ from pathlib import Path
 
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes import environment
-from uav_dc_ros.nodes.mission_node import SUPERVISED
+from uav_dc_ros.nodes.mission_node import HEARTBEAT, SUPERVISED
+
+HEARTBEATS_MAX = 4096  # that are read at a time
 
 
 class NodeProcess:
@@ -35,6 +38,8 @@ class NodeProcess:
     Attributes:
         name: of the module that it runs.
         who: it, in words.
+        failure: why it was killed; empty if it was not.
+        silent_s: time since its last heartbeat, or its start.
     """
 
     def __init__(
@@ -55,7 +60,9 @@ class NodeProcess:
             file.write_text(json.dumps(of_nodes, ensure_ascii=False), "utf-8")
         except (OSError, UnicodeEncodeError) as error:
             raise NodeError(f"parameters of {self.who} cannot be written to {file}: {error}") from None
-        own = {SUPERVISED: str(restarts)}
+        self._heartbeat, theirs = os.pipe()
+        os.set_blocking(self._heartbeat, False)
+        own = {SUPERVISED: str(restarts), HEARTBEAT: str(theirs)}
         if not alone and os.environ.get(environment.LINES) == environment.LINE_OF_NODE:
             own[environment.LINES] = environment.LINE_OF_ONE_OF_MANY
         self.process = subprocess.Popen(
@@ -68,8 +75,12 @@ class NodeProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env={**os.environ, **own},
+            pass_fds=(theirs,),
             start_new_session=True,  # Ctrl-C reaches the launcher alone, which stops nodes in order
         )
+        os.close(theirs)
+        self.failure = ""
+        self.silent_s = 0.0
         self._on_line = on_line
         self.last_line = ""
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -81,11 +92,25 @@ class NodeProcess:
             self.last_line = raw.decode(errors="replace").rstrip()
             self._on_line(self.name, self.last_line)
 
+    def watch(self, passed_s: float) -> None:
+        """Look for heartbeats; `passed_s` seconds have passed since this was done last."""
+        try:
+            beaten = bool(os.read(self._heartbeat, HEARTBEATS_MAX))
+        except BlockingIOError:
+            beaten = False
+        self.silent_s = 0.0 if beaten else self.silent_s + passed_s
+
+    def kill(self, why: str) -> None:
+        """End a process that hangs."""
+        self.failure = why
+        self.process.kill()
+
     def how_it_ended(self) -> str:
         """How the process ended, and its last line, in words."""
         self._reader.join(1.0)
         status = self.process.returncode
         how = f"was killed by {signal.Signals(-status).name}" if status < 0 else f"ended with {status}"
+        how = f"{self.failure}, and {how}" if self.failure else how
         return f"{how}: {self.last_line or 'it printed nothing'}"
 
     @property
@@ -111,6 +136,9 @@ class NodeProcess:
     def close(self) -> None:
         """Let go of the pipes of a process that has ended."""
         self._reader.join(1.0)
+        if self._heartbeat >= 0:
+            os.close(self._heartbeat)
+            self._heartbeat = -1
         for pipe in (self.process.stdin, self.process.stdout):
             assert pipe is not None
             pipe.close()

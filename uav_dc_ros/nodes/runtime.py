@@ -20,11 +20,12 @@ from uav_dc_ros import cli
 from uav_dc_ros.errors import ParameterError, UavDcError
 from uav_dc_ros.nodes import environment, fastdds, usage
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.mission_node import SUPERVISED, MissionNode
+from uav_dc_ros.nodes.mission_node import HEARTBEAT, SUPERVISED, MissionNode
 
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.2  # a message that was lost on the way is sent again within a tenth
 LEAVE_S = 3.0  # for the middleware to close
+HEARTBEAT_S = 0.25  # from one heartbeat to the next
 BACKGROUND = 5  # niceness of a node that nobody waits for
 # Exit statuses. Python's own 1 is left to what nobody thought of: only that is worth another try.
 NOT_BEGUN = 2
@@ -119,6 +120,7 @@ def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> 
             executor.add_node(node)
             node.serve = executor.spin_once
         stopper = Stopper(executor.wake)
+        _send_heartbeats(nodes[0])
         if _begin([node for node in nodes if node.values["autostart"]]):
             gc.freeze()  # what is there by now stays: no need to look at it again and again
             if rest_s:
@@ -145,6 +147,23 @@ def _made(makes: Iterable[Callable[[], MissionNode]], arguments: list[str]) -> l
         return [make() for make in makes]
     except (_rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError, _rclpy.RCLError) as error:
         raise ParameterError(f"{error}; expected ROS arguments after --ros-args") from None
+
+
+def _send_heartbeats(node: MissionNode) -> None:
+    """Under run_all, show it that the executor's thread turns, by a timer: a callback that hangs stops it."""
+    if HEARTBEAT not in os.environ:
+        return
+    pipe = int(os.environ[HEARTBEAT])
+    os.set_blocking(pipe, False)
+
+    def beat() -> None:
+        with contextlib.suppress(
+            OSError
+        ):  # full: run_all itself hangs; closed: it is gone, which Stopper sees
+            os.write(pipe, b".")
+
+    beat()
+    node.create_timer(HEARTBEAT_S, beat, clock=node.steady)
 
 
 def _begin(nodes: Sequence[MissionNode]) -> bool:

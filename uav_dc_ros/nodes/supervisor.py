@@ -19,6 +19,8 @@ from uav_dc_ros.nodes.table import NODES
 RESTART_WINDOW_S = 60.0  # deaths longer ago are forgiven
 BACK_OFF_S = 0.2  # before the first restart; twice as long before each further one
 ANSWER_S = 1.0  # for an answer of a node; a dead one's service may stand in the graph for a while
+BEGIN_S = 25.0  # a process may be silent for so long while it starts, or its nodes configure and activate
+PASSED_MAX_S = 0.5  # from one look at heartbeats to the next: more was a pause of this process itself
 STOP_S = 10.0  # for a node to end after it was asked to: a bridge waits for its vehicle to obey
 UP = ("unconfigured", "inactive", "active")  # the way up; each transition leads to the next
 TRANSITIONS = {"unconfigured": Transition.TRANSITION_CONFIGURE, "inactive": Transition.TRANSITION_ACTIVATE}
@@ -42,48 +44,75 @@ class Supervised:
         self.deaths_s: deque[float] = deque()
         self._get = asker.create_client(GetState, f"{name}/get_state")
         self._change = asker.create_client(ChangeState, f"{name}/change_state")
-        self._answer: Any = None  # to come: the state
-        self._done: Any = None  # to come: did a transition succeed
-        self._asked_s = 0.0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._state_reply: Any = None  # that is awaited
+        self._change_reply: Any = None  # that is awaited
+        self._asked_s = 0.0  # when the last request was sent
+        self._refused_in: str | None = None  # state in which the node refused a transition
+        self._unmoved = 0  # replies with the state from which the transition was requested
 
     def begin(self, process: NodeProcess) -> None:
         """Take charge of a new process."""
         self.process, self.state = process, None
-        self._answer = self._done = None
+        self._forget()
 
     def climb(self, may_activate: bool) -> None:
         """Go on with the way up.
+
+        What counts is the state that the node reports, not the reply to a transition: that one may be lost or
+        late, and a request may be served twice.
 
         Raises:
             NodeError: the node refuses a transition.
         """
         now_s = time.monotonic()
-        if self._done is not None and self._done.done():
-            self._finish(self._done.result().success)
-        elif self._answer is not None and self._answer.done():
-            self.state, self._answer = self._answer.result().current_state.label, None
-        elif now_s - self._asked_s > ANSWER_S or (self._answer is None and self._done is None):
-            self._ask(now_s, may_activate)
+        if self._change_reply is not None and self._change_reply.done():
+            refused = not self._change_reply.result().success
+            self._refused_in, self._change_reply = self.state if refused else None, None
+            self._request_state(now_s)
+        elif self._state_reply is not None and self._state_reply.done():
+            self._take_state(self._state_reply.result().current_state.label)
+        elif self._change_reply is not None or self._state_reply is not None:
+            if now_s - self._asked_s > ANSWER_S:
+                self._request_state(now_s)
+        elif self.state is None or self._refused_in is not None:
+            self._request_state(now_s)
+        else:
+            self._request_transition(now_s, may_activate)
 
-    def _ask(self, now_s: float, may_activate: bool) -> None:
-        """Ask for the state, or, if it is known, for the next transition."""
-        late = self._done is not None
-        if (self.state is None or late) and self._get.service_is_ready():
-            self._asked_s, self._answer = now_s, self._get.call_async(GetState.Request())
-            return
-        transition = TRANSITIONS.get(self.state or "")
-        allowed = self.state != "inactive" or may_activate
-        if transition is not None and allowed and not late and self._change.service_is_ready():
-            request = ChangeState.Request(transition=Transition(id=transition))
-            self._asked_s, self._done = now_s, self._change.call_async(request)
+    def _take_state(self, state: str) -> None:
+        """Note the state that the node reports.
 
-    def _finish(self, success: bool) -> None:
-        self._done = None
-        if not success:
+        Raises:
+            NodeError: it is the one in which it refused a transition, or none on the way up.
+        """
+        self._state_reply = None
+        if state not in UP or state == self._refused_in:
             assert self.process is not None
-            wanted = {"unconfigured": "configured", "inactive": "activated"}.get(self.state or "", "started")
+            wanted = {"unconfigured": "configured", "inactive": "activated"}.get(state, f"used as {state}")
             raise NodeError(f"node {self.row.name} could not be {wanted}: {self.process.last_line}")
-        self.state = UP[UP.index(self.state or UP[0]) + 1]
+        self._unmoved = self._unmoved + 1 if state == self.state else 0
+        if self._change_reply is not None and self._unmoved != 1:  # served; or its request or reply was lost
+            self._change.remove_pending_request(self._change_reply)
+            self._change_reply = None
+        self.state, self._refused_in = state, None
+
+    def _request_state(self, now_s: float) -> None:
+        if not self._get.service_is_ready():
+            return
+        if self._state_reply is not None:
+            self._get.remove_pending_request(self._state_reply)
+        self._asked_s, self._state_reply = now_s, self._get.call_async(GetState.Request())
+
+    def _request_transition(self, now_s: float, may_activate: bool) -> None:
+        assert self.state is not None, "otherwise the state is requested"
+        allowed = self.state != "inactive" or may_activate
+        if self.state in TRANSITIONS and allowed and self._change.service_is_ready():
+            request = ChangeState.Request(transition=Transition(id=TRANSITIONS[self.state]))
+            self._asked_s, self._change_reply = now_s, self._change.call_async(request)
+            self._unmoved = 0
 
 
 class Supervisor:
@@ -113,6 +142,7 @@ class Supervisor:
         self._on_line, self._on_note = on_line, on_note
         self.nodes = [Supervised(name, values, asker) for name, values in parameters.items()]
         self._brought_up = False
+        self._ticked_s = time.monotonic()
 
     def __enter__(self) -> Self:
         """Start the processes."""
@@ -153,6 +183,7 @@ class Supervisor:
         Raises:
             NodeError: a node that is needed refuses to start, gave up, or keeps dying.
         """
+        self._watch_heartbeats()
         for node in list(self.nodes):
             if node.process is None:
                 if time.monotonic() >= node.start_s:
@@ -165,6 +196,18 @@ class Supervisor:
                 except NodeError as error:
                     self._lose(node, str(error))
         self._brought_up = self._brought_up or all(node.state == "active" for node in self.nodes)
+
+    def _watch_heartbeats(self) -> None:
+        """Kill processes that hang: their ends are seen as any other."""
+        now_s, before_s = time.monotonic(), self._ticked_s
+        self._ticked_s = now_s
+        for process in {node.process for node in self.nodes if node.process is not None}:
+            process.watch(min(now_s - before_s, PASSED_MAX_S))
+            nodes = [node for node in self.nodes if node.process is process]
+            active = all(node.state == "active" for node in nodes)
+            patience_s = max(node.row.hang_s for node in nodes) if active else BEGIN_S
+            if process.silent_s > patience_s and not process.ended:
+                process.kill(f"gave no sign of life for {patience_s:.0f} s")
 
     def _lower_ranks_are_active(self, node: Supervised) -> bool:
         return all(

@@ -24,6 +24,8 @@ class NodeRow:
             first word and the last, and the world starts the mission.
         restarts: how often a node that died is started again within `supervisor.RESTART_WINDOW_S`; once more
             ends the mission, or, if the node is not needed for it, the restarts.
+        hang_s: how long its process may give no sign of life, once it is active, before it is killed and
+            started again: longer than any of its callbacks takes on a busy computer.
         needed: can no mission be flown without it? A bridge, not without one where the vehicle is a real one.
         on_request: is it started only when it is asked for?
         again: parameters with which it is restarted, beside those that it had.
@@ -38,6 +40,7 @@ class NodeRow:
     composable: bool = False
     rank: int = 1
     restarts: int = 3
+    hang_s: float = 5.0
     needed: bool = True
     on_request: bool = False
     again: Mapping[str, object] = field(default_factory=dict)
@@ -92,6 +95,7 @@ NODES: dict[str, NodeRow] = {
             ),
             hears_all=True,
             rank=0,
+            hang_s=10.0,  # a slow disk makes it wait
             again={"resume": True},
         ),
         NodeRow(

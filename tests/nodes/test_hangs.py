@@ -1,0 +1,58 @@
+"""Nodes that hang, here by SIGSTOP for good: killed, started again, and the mission goes on."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Ros, finish, read_bag, wait_for
+
+NODES = ("world", "channel_monitor", "policy", "recorder", "visualizer")
+AT_A_PACE = ("--pace", 15)  # twenty seconds: longer than the recorder is waited for
+IN_LOCKSTEP = ("--pace", "lockstep", "--missions", 500)
+
+
+def flown_with_hangs(ros: Ros, options: list[object], names: tuple[str, ...], *how: object) -> str:
+    """Fly, and stop nodes for good at the fifth step; what run_all printed."""
+    flight = ros.start("uav_dc_ros.run_all", *options, *how, "--bag", "bag", "--summary", "summary.json")
+    assert flight.stdout is not None
+    printed = wait_for(flight.stdout, "step 5/30")
+    for name in names:
+        os.kill(ros.node(name), signal.SIGSTOP)
+    status, output = finish(flight, 300)
+    assert status == 0, output
+    assert "Traceback" not in output
+    for name in names:
+        who = "the container of world, channel_monitor, policy" if name == "container" else f"node {name}"
+        assert f"note: {who} gave no sign of life for " in output, output
+    assert output.count("no sign of life") == len(names), "nobody else is to blame"
+    told = json.loads((ros.folder / "summary.json").read_text())
+    assert {each["steps"] for each in (told if isinstance(told, list) else [told])} == {30}
+    return printed + output
+
+
+@pytest.fixture
+def options(small_scenario: Path, small_policy: Path) -> list[object]:
+    """A small mission."""
+    return ["--scenario", small_scenario, "--policy", small_policy]
+
+
+def test_nodes_that_hang_are_started_again(ros: Ros, options: list[object]) -> None:
+    output = flown_with_hangs(ros, options, ("policy", "visualizer"), *AT_A_PACE)
+    assert "steps were hovered: no move came in time" in output
+    missions = {m["step"] for name, m in read_bag(ros.folder / "bag") if name == "/mission"}
+    assert missions == set(range(31))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize("how", [AT_A_PACE, (*IN_LOCKSTEP, "--no-compose")], ids=["at a pace", "lockstep"])
+def test_each_node_in_turn(ros: Ros, options: list[object], name: str, how: tuple[object, ...]) -> None:
+    flown_with_hangs(ros, options, (name,), *how)
+
+
+@pytest.mark.long
+def test_a_container(ros: Ros, options: list[object]) -> None:
+    flown_with_hangs(ros, options, ("container",), *IN_LOCKSTEP)
