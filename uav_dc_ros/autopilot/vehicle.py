@@ -51,7 +51,7 @@ class Telemetry:
         position: in the grid's ENU frame; None: not known yet.
         position_s: when that came.
         estimate_ok: does the autopilot trust its position enough to fly by it?
-        estimate_s: when the last report on that came; None: never.
+        estimate_s: when the last report on that came; None: not known, then `estimate_ok` is of now.
         battery: charge that is left, 0 to 1; None: it does not tell.
         battery_v: its voltage, volts; None: it does not tell.
         battery_fails: does the autopilot itself find the battery too low, or broken?
@@ -61,6 +61,7 @@ class Telemetry:
         said: what it warned of in the last seconds, in its own words; empty: nothing.
         home: where it returns to, in the grid's ENU frame; None: not reported.
         target: position target that the autopilot reports, in the grid's ENU frame; None: not reported.
+        target_s: when that came; None: not known, then nothing is concluded from it.
         tilt_rad: angle between the vehicle's vertical axis and the vertical, 0 to pi; None: not reported.
         limits: of the autopilot's own parameters; None: not reported.
         other_controller: another system that commands this vehicle, with the evidence; None: none was seen.
@@ -86,6 +87,7 @@ class Telemetry:
     said: str = ""
     home: Enu | None = None
     target: Enu | None = None
+    target_s: float | None = None
     tilt_rad: float | None = None
     limits: Limits | None = None
     other_controller: str | None = None
