@@ -1,7 +1,6 @@
 """The bridge's decisions, with a simulated vehicle and clock: missions, faults, pilots."""
 
 import dataclasses
-from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -9,68 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.autopilot.simulated import Vehicle
-from uav_dc_ros import scenarios
-from uav_dc_ros.autopilot.bridge import Bridge, Standing
+from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step, way_home
+from uav_dc_ros.autopilot.bridge import Standing
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
-
-SCENARIO = scenarios.load("five_clusters")
-TICK_S = 0.1
-START = Enu(*SCENARIO.mission.start_m)
-ARMING = Settings(arm=True)
-
-
-def way_home(bridge: Bridge) -> Action:
-    """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.goal, SCENARIO.dock_cell
-    if x != dock_x:
-        return Action.RIGHT if x < dock_x else Action.LEFT
-    if y != dock_y:
-        return Action.FORWARD if y < dock_y else Action.BACKWARD
-    return Action.HOVER
-
-
-class Flight:
-    """Bridge, vehicle and policy, tick by tick."""
-
-    def __init__(self, how: Settings = ARMING, vehicle: Vehicle | None = None, **bridge: object) -> None:
-        self.vehicle = vehicle or Vehicle(position=Enu(START.east_m, START.north_m, 0.0))
-        self.log: list[tuple[Phase, int, str]] = []
-        self.executed: list[int] = []
-        self.bridge = Bridge(SCENARIO, how, self._note, **bridge)  # type: ignore[arg-type]
-        self.policy: Callable[[Bridge], Action] | None = way_home
-
-    def _note(self) -> None:
-        bridge = self.bridge
-        changed = not self.log or self.log[-1][0] is not bridge.phase
-        self.log.append((bridge.phase, bridge.step, bridge.reason))
-        if bridge.phase is Phase.MOVING and changed:
-            self.executed.append(bridge.step)
-
-    def tick(self, tick_s: float = TICK_S) -> None:
-        bridge, vehicle = self.bridge, self.vehicle
-        for wish in bridge.tick(vehicle.now_s, vehicle.told):
-            vehicle.ask(wish)
-        if bridge.setpoint is not None:
-            assert bridge.fence.breach(bridge.setpoint) is None
-        if bridge.phase is Phase.READY and self.policy is not None:
-            bridge.move(bridge.step, self.policy(bridge))
-        vehicle.pass_time(tick_s, bridge.setpoint)
-
-    def until(self, phase: Phase, limit_s: float = 3000.0) -> None:
-        end_s = self.vehicle.now_s + limit_s
-        while self.bridge.phase is not phase:
-            assert self.vehicle.now_s < end_s, self.log[-5:]
-            assert not self.bridge.is_over, self.log[-5:]
-            self.tick()
-
-    def run(self, seconds: float) -> None:
-        for _ in range(round(seconds / TICK_S)):
-            self.tick()
 
 
 def test_a_whole_mission_from_the_ground_to_the_dock() -> None:
@@ -98,18 +42,11 @@ def test_without_arm_it_waits_for_a_pilot_and_asks_for_nothing() -> None:
     assert not any(isinstance(wish, Arm) or wish == SetMode(Mode.COMMANDED) for wish in flight.vehicle.asked)
 
 
-def fly_to_step(step: int, how: Settings = ARMING) -> Flight:
-    flight = Flight(how)
-    while flight.bridge.step < step or flight.bridge.phase is not Phase.MOVING:
-        flight.tick()
-    return flight
-
-
 def test_a_vehicle_whose_motors_need_their_time_is_not_told_to_take_off_anew() -> None:
     flight = Flight()
     flight.until(Phase.TAKEOFF)
     flight.vehicle.deaf = True  # it has heard, and is still on the ground
-    flight.run(4.5)
+    flight.run(2.5)
     assert sum(isinstance(wish, TakeOff) for wish in flight.vehicle.asked) == 1
     flight.run(1.0)
     assert sum(isinstance(wish, TakeOff) for wish in flight.vehicle.asked) == 2
@@ -243,17 +180,22 @@ def test_a_vehicle_that_is_never_heard_of_again_ends_the_mission_without_a_wish(
     assert flight.vehicle.asked == []
 
 
-def test_a_jump_within_the_fence_is_held_through_or_ends_the_mission() -> None:
-    flight = fly_to_step(5, Settings(arm=True, hold_s=2.0))
-    flight.vehicle.offset = (0.0, 300.0, 0.0)
-    flight.run(0.2)
-    assert "jumped by 300 m" in str(flight.bridge.fault)
+@pytest.mark.parametrize("metres", [30.0, 300.0, 5000.0])  # the last one lies outside the fence
+def test_a_jump_is_ignored_then_held_through_then_ends_the_mission(metres: float) -> None:
+    flight = fly_to_step(5)
+    flight.vehicle.offset = (0.0, metres, 0.0)
+    flight.run(0.4)
+    assert flight.bridge.fault is None
+    assert flight.bridge.discarded["impossible position"] > 0
+    flight.run(0.4)
+    assert "the position jumped by" in str(flight.bridge.fault)
     flight.vehicle.offset = (0.0, 0.0, 0.0)
     flight.run(0.2)
     assert flight.bridge.fault is None
-    flight.vehicle.offset = (0.0, 300.0, 0.0)
-    flight.until(Phase.ABORTED, 600.0)
-    assert "jumped by" in flight.bridge.reason
+    if metres > 100.0:
+        flight.vehicle.offset = (0.0, metres, 0.0)
+        flight.until(Phase.ABORTED, 600.0)
+        assert flight.bridge.reason == f"the position jumped by {metres:.0f} m"
 
 
 def test_a_pilot_who_flies_already_is_left_alone() -> None:

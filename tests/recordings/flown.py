@@ -137,7 +137,7 @@ class Flight:
         """What the bridge says at every change."""
         bridge = self.bridge
         assert bridge is not None
-        self._last = messages.Mission(
+        status = messages.Mission(
             mission=0,
             step=bridge.step,
             phase=bridge.phase,
@@ -147,8 +147,12 @@ class Flight:
             seed=self.seed,
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
+            steps_not_reached=bridge.steps_not_reached,
         )
-        self._say("mission", self._last)
+        if status == self._last:
+            return  # as the node does
+        self._last = status
+        self._say("mission", status)
         if bridge.phase is Phase.READY:
             self._ready_since_s = self.vehicle.now_s
         is_new = bridge.step != self._users_of

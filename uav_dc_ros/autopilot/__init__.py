@@ -10,6 +10,10 @@ patience how long a policy is waited for
 asking   when to utter a wish
 course   where a mission stands on the grid
 ground   before the first step
+crash    what shows that a vehicle does not fly any more
+plausibility  telemetry that cannot be true
+progress is it coming nearer
+field_check  the autopilot's limits beside the field
 descent  what brings a vehicle down
 beat     of heartbeats and a stream of setpoints
 priority running when it is due

@@ -3,7 +3,9 @@
 from uav_dc_ros.autopilot.vehicle import TakeOff, Wish
 from uav_dc_ros.autopilot.watch import Settings
 
-TAKEOFF_RETRIES = 2.5  # as many pauses between wishes to take off: motors need some seconds to lift it
+# As many pauses between wishes to take off. Motors need two seconds to lift the vehicle. ArduPilot disarms it
+# when it stands for ten seconds: within these, three wishes may be lost.
+TAKEOFF_RETRIES = 1.5
 
 
 class Asked:

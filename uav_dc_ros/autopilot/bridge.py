@@ -11,22 +11,27 @@ brings it down (an autopilot's failsafe does that, too), it is watched until it 
 
 from collections.abc import Callable
 
+import msgspec
+
 from uav_dc_ros.autopilot.asking import Asked
 from uav_dc_ros.autopilot.course import Cell, Course, Dwell, Standing
-from uav_dc_ros.autopilot.descent import DOWN, Descent
+from uav_dc_ros.autopilot.crash import Crash
+from uav_dc_ros.autopilot.descent import DOWN, Descent, Next
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.ground import Ground, Next
+from uav_dc_ros.autopilot.ground import Ground
 from uav_dc_ros.autopilot.hold import Hold
 from uav_dc_ros.autopilot.patience import Patience
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry, Wish
-from uav_dc_ros.autopilot.watch import Settings, Watch
+from uav_dc_ros.autopilot.progress import Tracking
+from uav_dc_ros.autopilot.vehicle import Mode, SetMode, TakeOff, Telemetry, Wish
+from uav_dc_ros.autopilot.watch import Fault, FaultKind, Settings, Watch
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 
 __all__ = ["Bridge", "Standing"]
 
+GROUND = (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT)
 FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
 DECIDED = (Phase.READY, Phase.MOVING)  # by a policy
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
@@ -71,9 +76,16 @@ class Bridge:
         self._patience = Patience(settings, scenario.mission.step_s)
         self._now_s = 0.0  # vehicle time
         self._steady_s = self._since_steady_s = 0.0  # steady clock: last tick, last change of phase
-        self._descent = Descent()
-        self._watched = Watch(settings, self.course.standing.at_rest_v)
-        self._hold = Hold(self._watched)
+        self._known = Telemetry()
+        home = self.course.standing.home
+        self._watched = Watch(settings, self.course.standing.at_rest_v, Enu(*home) if home else None)
+        self._descent = Descent(self.course, self._watched, settings.then, Phase.ABORTED, "")
+        self._hold = Hold(settings.hold_s)
+        self._crash = Crash(settings)
+        self._tracking = Tracking(self.course, settings)
+        self._finishes = self.course.standing.goal is not None  # the move that an earlier bridge had begun
+        self._reported: str | None = None  # another system that commands the vehicle in flight
+        self._taken = self.course.standing.released  # somebody else has the vehicle
         self._ground = Ground(self.course, settings, self.fence, self._watched)
 
     @property
@@ -99,21 +111,46 @@ class Bridge:
     @property
     def fault(self) -> str | None:
         """What keeps it from going on at the moment; None: nothing."""
-        return self._hold.fault
+        return self._hold.fault.why if self._hold.fault is not None else None
+
+    @property
+    def steps_not_reached(self) -> int:
+        """Of the steps flown, how many ended away from their cell's centre."""
+        return self.course.steps_not_reached
+
+    @property
+    def discarded(self) -> dict[str, int]:
+        """Positions that were not believed, by reason; beside those of `Telemetry.discarded`."""
+        return self._watched.discarded
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know of the vehicle, though it is no reason not to fly."""
+        return self._ground.warnings(self._known)
 
     @property
     def standing(self) -> Standing:
         """Where the mission stands now."""
-        if self.phase in (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT):
-            return self.course.standing
+        kept = msgspec.structs.replace(
+            self.course.standing,
+            allowed_mode=self._ground.allowed_mode,
+            is_a_pilots=self._ground.is_a_pilots,
+            at_rest_v=self._watched.battery.at_rest_v,
+            home=self._watched.home,
+        )
+        if self.phase in GROUND:
+            return kept
         over = self.phase is Phase.LANDING or self.is_over
-        return Standing(
-            step=self.step + (self.phase is Phase.MOVING),
-            cell=self.cell if over else self.goal,  # a move that was broken off did not reach its goal
+        return msgspec.structs.replace(
+            kept,
+            step=self.step,
+            cell=self.cell,
+            goal=self.goal if self._finishes or self.phase is Phase.MOVING else None,
+            steps_not_reached=self.steps_not_reached,
             flies=True,
+            released=self._taken or (self.is_over and not self._known.armed),
             outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
             reason=self.reason if over else "",
-            at_rest_v=self._watched.battery.at_rest_v,
         )
 
     def move(self, step: int, action: Action) -> str | None:
@@ -130,10 +167,20 @@ class Bridge:
         self._enter(Phase.MOVING, f"{action.label} to cell {cell}")
         return None
 
-    def stop(self, why: str) -> None:
-        """End the mission, since nobody will steer any more; a vehicle that flies comes down."""
+    def stop(self, why: str, known: Telemetry | None = None) -> None:
+        """End the mission, since nobody will steer any more; a vehicle that flies comes down.
+
+        So does one that is armed in the commanded mode before it begins; in another mode it is a pilot's.
+
+        Args:
+            why: in words.
+            known: of the vehicle, if no tick has told of it yet.
+        """
+        known = known or self._known
         if self.phase in STEERED:
             self._give_up(why)
+        elif self.phase in GROUND and known.armed and known.mode is Mode.COMMANDED and not self._taken:
+            self._descend(Mode.LAND if known.on_ground else self.settings.then, Phase.ABORTED, why)
         elif self.phase is not Phase.LANDING and not self.is_over:
             self._end(Phase.ABORTED, why)
 
@@ -151,16 +198,22 @@ class Bridge:
         Returns:
             Wishes to be passed on now, at most one of each kind.
         """
-        self._now_s, self._steady_s = known.vehicle_s, now_s
-        if self.phase is Phase.IDLE:
-            self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
         if self.phase.is_over:
             return []
+        self._known = known = self._watched.see(now_s, known)
+        self._now_s, self._steady_s = known.vehicle_s, now_s
+        self._tracking.send(self.setpoint, now_s)
+        if self.phase is Phase.IDLE:
+            self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
         if self.phase in FLYING:
             if self._taken_over(known):
                 return []
             self._watch(now_s, known)
-        if self.fault is not None and self.phase in STEERED:
+        elif not self.course.standing.flies and (why := self._ground.takeover(now_s, known)) is not None:
+            self._taken = True
+            self._end(Phase.ABORTED, why)
+            return []
+        if self._hold.fault is not None and self.phase in STEERED:
             return []  # hold: the setpoint stays
         if self.phase in DECIDED and not self._policy_lives(known):
             return []
@@ -187,10 +240,12 @@ class Bridge:
         after = "".join(
             f" ({word}: {what})" for word, what in (("after", why), ("it says", known.said)) if what
         )
+        moved = known.mode is not Mode.COMMANDED if not landing else not self._descent.is_ours(known.mode)
+        self._taken |= moved or not known.armed
         if not known.armed:
             who = "disarmed by a pilot or by the autopilot itself"
             self._end(Phase.ABORTED, f"{who} while it was {self.phase.value}{after}")
-        elif known.mode is not Mode.COMMANDED if not landing else not self._descent.is_ours(known.mode):
+        elif moved:
             mode = known.mode_name or known.mode.value
             changed = f"mode {mode}: changed by a pilot or by the autopilot's failsafe{after}"
             if not landing and known.mode in DOWN:
@@ -206,76 +261,110 @@ class Bridge:
         if (low := self._watched.battery_is_low(known)) is not None:
             self._give_up(low)
             return
-        position = known.position
-        if position is not None and (breach := self.fence.breach(position)) is not None:
+        if known.other_controller not in (None, self._reported):
+            self._reported = known.other_controller
+            self._change(f"{self.reason}; another system commands this vehicle: {self._reported}")
+        lost = self._watched.link_is_lost(now_s, known)
+        if not lost and (crash := self._crash.look(known, self.setpoint)) is not None:
+            self._give_up(crash, Mode.LAND)
+            return
+        if known.position is not None and (breach := self.fence.breach(known.position)) is not None:
             self._give_up(f"the vehicle is outside the fence: {breach}")
             return
-        match self._hold.look(now_s, known):
-            case "begins":
+        fault = self._watched.fault(now_s, known) or self._strays(known)
+        match self._hold.look(now_s, known, fault):
+            case "begins" | "turns":
                 self._change(f"holds: {self.fault}")
             case "passes":
                 self._change(f"goes on after: {self.reason}")
             case "ends":
-                self._give_up(str(self.fault), known)
+                self._give_up_for(self._hold.fault, now_s, known)
+
+    def _strays(self, known: Telemetry) -> Fault | None:
+        """Does it not fly to where a move has sent it."""
+        if self.phase not in DECIDED:
+            return None
+        moves = self.phase is Phase.MOVING and not self.policy_is_gone
+        return self._tracking.ignored(known) or (self._tracking.stalled(known) if moves else None)
 
     def _policy_lives(self, known: Telemetry) -> bool:
         """Is there somebody who decides; until there is, the vehicle stops, and the step's time with it."""
         since, now = self._patience.gone_since, (self._now_s, self._steady_s)
         if self.policy_is_gone and since is None:
             self._patience.gone_since = now
-            self.setpoint = known.position if self.phase is Phase.MOVING else self.setpoint
+            if self.phase is Phase.MOVING and known.position is not None:
+                self.setpoint = known.position
             self._change("holds: the policy is gone")
         elif self.policy_is_gone and since is not None and self._patience.is_over(since, now):
             self._give_up(f"the policy has been gone for {self._patience.limit_s:g} s")
         elif not self.policy_is_gone and since is not None:
             self._patience.gone_since = None
             self._since_s += now[0] - since[0]
+            self._tracking.resume()
             self.setpoint = self.course.target
             self._change(f"goes on after: {self.reason}")
         return not self.policy_is_gone
 
-    def _give_up(self, why: str, known: Telemetry | None = None) -> None:
-        """End the mission: bring the vehicle down. One that does not know where it is cannot return."""
+    def _give_up_for(self, fault: Fault | None, now_s: float, known: Telemetry) -> None:
+        """End the mission for a fault that lasts. A vehicle that does not know where it is cannot return."""
+        if fault is None:
+            return
+        blind_since_s = self._hold.since_s[0] if fault.kind is FaultKind.POSITION else None
+        how = Mode.LAND if self._watched.estimate_is_lost(now_s, known) else None
+        self._give_up(fault.why, how, blind_since_s)
+
+    def _give_up(self, why: str, how: Mode | None = None, blind_since_s: float | None = None) -> None:
+        """End the mission: bring the vehicle down."""
         self._hold.fault = None
-        lost = known is not None and not known.estimate_ok
-        self._descend(Mode.LAND if lost else self.settings.then, Phase.ABORTED, why)
+        self._descend(how or self.settings.then, Phase.ABORTED, why, blind_since_s)
 
     # What is to be done in each phase.
 
     def _connect(self, now_s: float, known: Telemetry) -> list[Wish]:
-        return self._follow(self._ground.connect(now_s, known))
+        return self._follow(self._ground.connect(now_s, known, now_s - self._since_steady_s))
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
-        return self._follow(self._ground.prepare(now_s, known, Arm() in self._asked.last_s))
+        before = self._ground.allowed_mode
+        wishes = self._follow(self._ground.prepare(now_s, known))
+        if self._ground.allowed_mode != before:
+            self._on_change()  # a bridge that is started anew has to know it, before it is requested
+        return wishes
 
     def _follow(self, advice: Next) -> list[Wish]:
-        """Do what a look at a vehicle on the ground led to."""
+        """Do what a look at a vehicle led to that is not steered."""
         self.setpoint = advice.setpoint
         if advice.phase.is_over:
             self._end(advice.phase, advice.why)
+        elif advice.phase is self.phase:
+            self._change(advice.why)
         elif advice.phase is Phase.LANDING:
             self._descend(advice.down, advice.outcome, advice.why)
         elif advice.phase is Phase.TAKEOFF and self.course.is_done:
             self._finish("when the bridge came back")
-        elif advice.phase is self.phase:
-            self._change(advice.why)
         else:
             self._enter(advice.phase, advice.why)
         return [] if advice.wish is None else [advice.wish]
 
     def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
         start, position = self.course.target, known.position
-        assert position is not None, "a fault otherwise"
         if known.vehicle_s - self._since_s > self.settings.takeoff_s:
             self._give_up(f"not at the start after {self.settings.takeoff_s:g} s")
             return []
-        if position.up_m >= start.up_m - self.settings.tolerance_m:
+        if position is not None and position.up_m >= start.up_m - self.settings.tolerance_m:
             self.setpoint = start  # high enough to fly across
         if self._dwell.is_there(start, known):
+            self._arrive_first()
+            return []
+        return [TakeOff(start.up_m)] if known.on_ground is not False and not self._crash.flies else []
+
+    def _arrive_first(self) -> None:
+        """Be at the cell where the mission begins, or at that to which an earlier bridge had begun to fly."""
+        if self._finishes:
+            self._finishes = False
+            self._arrive("there")
+        else:
             self.course.cell = self.course.goal
             self._enter(Phase.READY, f"at the start, cell {self.cell}")
-            return []
-        return [TakeOff(start.up_m)] if known.on_ground is not False else []
 
     def _wait(self, now_s: float, known: Telemetry) -> list[Wish]:
         if self._patience.is_over((self._since_s, self._since_steady_s), (known.vehicle_s, now_s)):
@@ -283,16 +372,27 @@ class Bridge:
         return []
 
     def _fly(self, now_s: float, known: Telemetry) -> list[Wish]:
-        there = self._dwell.is_there(self.course.target, known)
-        if not there and known.vehicle_s - self._since_s < self.scenario.mission.step_s:
-            return []
-        self.course.arrive()
-        how = "there" if there else f"not there after {self.scenario.mission.step_s:g} s, which a step has"
+        there, step_s = self._dwell.is_there(self.course.target, known), self.scenario.mission.step_s
+        if there:
+            self._arrive("there")
+        elif known.vehicle_s - self._since_s >= step_s and known.position is not None:
+            away_m = self.course.distance_m(known.position)
+            if away_m <= self.settings.tolerance_m:
+                self._arrive("there")
+            elif self.course.may_end_at(known.position, self.settings):
+                self._arrive(f"not there after {step_s:g} s, which a step has, {away_m:.0f} m away", False)
+            elif not self._tracking.is_late:
+                self._tracking.is_late = True
+                self._change(f"{self.reason}: {away_m:.0f} m away after {step_s:g} s, flies on")
+        return []
+
+    def _arrive(self, how: str, reached: bool = True) -> None:
+        """End a step."""
+        self.course.arrive(reached)
         if self.course.is_done:
             self._finish(how)
         else:
             self._enter(Phase.READY, f"step {self.step}: {how}")
-        return []
 
     def _finish(self, how: str) -> None:
         """Come down after the last step."""
@@ -303,31 +403,14 @@ class Bridge:
             self._descend(self.settings.then, Phase.TIMEOUT, why)
 
     def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
-        if self._watched.link_is_lost(now_s, known):  # who knows what mode it is in by now
-            if known.heartbeat_s is None or now_s - known.heartbeat_s > self.settings.lost_s:
-                self._end(Phase.ABORTED, f"{self.reason}; not heard of for {self.settings.lost_s:g} s")
-            return []
-        descent = self._descent
-        if not known.armed:
-            self._end(descent.outcome, descent.why)
-            return []
-        if descent.obeys(known):
-            self.setpoint = None
-            self._change(descent.why)
-            return []
-        if descent.lands_instead(
-            self.settings, self._asked.last_s.get(SetMode(Mode.RETURN)), known.vehicle_s
-        ):
-            descent.why += f"; it does not return ({known.refusal or 'no answer'}): lands"
-        refused = f"; {known.refusal}" if known.refusal and descent.tries else ""
-        self._change(f"{descent.why}{refused}")
-        return [descent.wish]
+        asked_s = self._asked.last_s.get(SetMode(Mode.RETURN))
+        return self._follow(self._descent.look(now_s, known, self.setpoint, asked_s))
 
     # Small change.
 
-    def _descend(self, how: Mode, outcome: Phase, why: str) -> None:
+    def _descend(self, how: Mode, outcome: Phase, why: str, blind_since_s: float | None = None) -> None:
         """Bring it down; until it obeys, the setpoint holds it where it is."""
-        self._descent = Descent(how, outcome, why)
+        self._descent = Descent(self.course, self._watched, how, outcome, why, blind_since_s)
         self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:
@@ -337,6 +420,8 @@ class Bridge:
     def _enter(self, phase: Phase, why: str) -> None:
         self.phase, self._since_s = phase, self._now_s
         self._dwell.begin()
+        self._tracking.begin()
+        self._crash.begin(flies=phase in DECIDED)
         self._patience.gone_since = None
         self._since_steady_s = self._steady_s
         self._asked.begin()

@@ -8,7 +8,6 @@ from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.core.scenario import Scenario
 
 MARGIN_M = 20.0
-CEILING_MARGIN_M = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +23,7 @@ class Fence:
 
     @classmethod
     def around(cls, scenario: Scenario, margin_m: float = MARGIN_M) -> Self:
-        """The box around a scenario's grid, from the ground up: the vehicle has to start and land."""
+        """The box around a scenario's grid and above it, from the ground up: the vehicle starts and lands."""
         grid = scenario.grid
         top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
         return cls(
@@ -32,7 +31,7 @@ class Fence:
             most=Enu(
                 (grid.n_x - 1) * grid.cell_m + margin_m,
                 (grid.n_y - 1) * grid.cell_m + margin_m,
-                top_m + CEILING_MARGIN_M,
+                top_m + margin_m,
             ),
         )
 

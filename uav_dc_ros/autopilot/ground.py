@@ -3,36 +3,16 @@
 Nothing here is done: each look ends in a `Next`, which the bridge carries out.
 """
 
-from dataclasses import dataclass
-
+from uav_dc_ros.autopilot import field_check
 from uav_dc_ros.autopilot.course import Course
-from uav_dc_ros.autopilot.descent import DOWN
+from uav_dc_ros.autopilot.descent import DOWN, Next
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 from uav_dc_ros.autopilot.watch import Settings, Watch
 from uav_dc_ros.messages import Phase
 
-
-@dataclass(frozen=True, kw_only=True)
-class Next:
-    """What to do next.
-
-    Attributes:
-        phase: to be in; `landing` means to descend, and one that is over to end.
-        why: in words.
-        setpoint: to stream from now on, in the grid's ENU frame; None: none.
-        wish: to utter; None: none.
-        down: how to descend.
-        outcome: of a mission that descends.
-    """
-
-    phase: Phase
-    why: str
-    setpoint: Enu | None = None
-    wish: Wish | None = None
-    down: Mode = Mode.LAND
-    outcome: Phase = Phase.ABORTED
+UNPLACED_S = 5.0  # after which a vehicle that flies has no place on the grid, though a link has told of it
 
 
 class Ground:
@@ -43,86 +23,165 @@ class Ground:
         settings: how carefully to fly.
         fence: where it may be.
         watch: finds what is wrong.
+
+    Attributes:
+        allowed_mode: with `Settings.arm`, the one mode besides the commanded one that the vehicle may be in:
+            that in which it was when the commanded mode was requested. The commanded mode's name: the vehicle
+            was in that already. None: neither has happened yet, and every mode is allowed.
+        is_a_pilots: had somebody else it armed? Who lands it does not want it to start again.
     """
 
     def __init__(self, course: Course, settings: Settings, fence: Fence, watch: Watch) -> None:
         self.course, self.settings, self.fence, self.watch = course, settings, fence, watch
-        self._is_a_pilots = False  # somebody else had it armed: who lands it does not want it to start again
+        self.allowed_mode = course.standing.allowed_mode
+        self.is_a_pilots = course.standing.is_a_pilots
+        self._unplaced_since_s: float | None = None  # steady clock: it flies, and nobody knows where
 
-    def connect(self, now_s: float, known: Telemetry) -> Next:
-        """Look at a vehicle that nothing is known of yet, at a steady time."""
-        self._is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
+    def takeover(self, now_s: float, known: Telemetry) -> str | None:
+        """Why somebody else has a vehicle that is to be armed here; None: nobody has.
+
+        Who chooses another mode after the commanded one was requested, or entered, takes the vehicle back.
+        Without `Settings.arm` nothing is requested, and a pilot is free to change modes until take-off.
+        """
+        if not self.settings.arm or self.is_a_pilots or self.watch.link_is_lost(now_s, known):
+            return None
+        mode = _name(known)
+        if known.mode is Mode.COMMANDED:
+            self.allowed_mode = mode
+        elif self.allowed_mode not in (None, mode):
+            return f"mode {mode} before take-off: changed by a pilot or by the autopilot's failsafe"
+        return None
+
+    def refusal(self, known: Telemetry) -> str | None:
+        """Why the mission cannot be flown with this vehicle as it is; None: it can."""
+        if known.other_controller is not None:
+            return f"another system commands this vehicle: {known.other_controller}"
+        return self._misfit(known)
+
+    def connect(self, now_s: float, known: Telemetry, waited_s: float) -> Next:
+        """Look at a vehicle that nothing is known of yet.
+
+        Args:
+            now_s: steady clock.
+            known: of the vehicle.
+            waited_s: for it, until now, steady clock.
+        """
+        flew, settings = self.course.standing.flies, self.settings
+        self.is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
+        if not flew and (why := self.refusal(known)) is not None:
+            return Next(phase=Phase.ABORTED, why=why)
         fault = self.watch.fault(now_s, known)
         if known.missing is not None or fault is not None or known.position is None:
-            return Next(phase=Phase.CONNECTING, why=known.missing or fault or "no position yet")
+            why = known.missing or (fault.why if fault is not None else "no position yet")
+            return self._not_yet(now_s, known, why, waited_s)
         breach = self.fence.breach(known.position)
-        if self.course.standing.flies and (otherwise := self._left_alone(known, breach)) is not None:
+        if flew and (otherwise := self._left_alone(known, breach)) is not None:
             return otherwise
+        flies = known.armed and known.on_ground is False and known.mode is Mode.COMMANDED
         if breach is not None:
-            return Next(phase=Phase.CONNECTING, why=f"the vehicle is outside the fence: {breach}")
-        if known.armed and known.on_ground is False and known.mode is Mode.COMMANDED:
-            if self.settings.flying_at_start == "land":
+            why = f"the vehicle is outside the fence: {breach}"
+            if flies:
+                why = f"{why}. It flies, and is left alone; expected it on the field, or another --datum"
+            return Next(phase=Phase.ABORTED if flies else Phase.CONNECTING, why=why)
+        if flies:
+            if settings.flying_at_start == "land":
                 why = "it flew already when the bridge came"
-                return Next(phase=Phase.LANDING, why=why, setpoint=known.position, down=self.settings.then)
+                return Next(phase=Phase.LANDING, why=why, setpoint=known.position, down=settings.then)
             why = "it flies already: to the cell where the mission stands"
             return Next(phase=Phase.TAKEOFF, why=why, setpoint=self.course.target)
         # An autopilot may want to see setpoints before it follows any.
         why = f"connected to {known.system}" if known.system else "connected"
         return Next(phase=Phase.PREFLIGHT, why=why, setpoint=known.position)
 
+    def _not_yet(self, now_s: float, known: Telemetry, why: str, waited_s: float) -> Next:
+        """Wait for what is missing; but a vehicle in the air is not waited for without end."""
+        lost = self.watch.link_is_lost(now_s, known)
+        unplaced = not lost and known.armed and known.on_ground is False and known.position is None
+        since_s = self._unplaced_since_s = (self._unplaced_since_s or now_s) if unplaced else None
+        if self.course.standing.flies:
+            if waited_s > self.settings.lost_s:
+                phase = Phase.ABORTED if lost or not known.armed else Phase.LANDING
+                return Next(phase=phase, why=f"{why}; waited {waited_s:.0f} s", down=self.settings.then)
+        elif since_s is not None and now_s - since_s > UNPLACED_S:
+            why = f"the vehicle flies, and its place on the grid is not known ({why})"
+            return Next(phase=Phase.ABORTED, why=f"{why}; expected --datum=LAT,LON,ALT, or it on the ground")
+        return Next(phase=Phase.CONNECTING, why=why)
+
     def _left_alone(self, known: Telemetry, breach: str | None) -> Next | None:
         """Why a mission that was in the air is not taken up again, or goes on coming down; None: it is."""
         before = self.course.standing
-        if before.outcome is not None and known.armed:
+        if before.released and not (known.armed and known.mode in DOWN):
+            return Next(phase=before.outcome or Phase.ABORTED, why=before.reason)
+        if before.outcome is not None and (known.armed or before.outcome is Phase.LANDED):
             down = known.mode if known.mode in DOWN else self.settings.then
             return Next(phase=Phase.LANDING, why=before.reason, down=down, outcome=before.outcome)
         if not known.armed:  # it is never armed a second time
             why = before.reason or "on the ground and disarmed when the bridge came back"
             return Next(phase=before.outcome or Phase.ABORTED, why=why)
         if known.mode in DOWN:
-            why = f"in mode {known.mode_name or known.mode.value} when the bridge came back"
+            why = f"in mode {_name(known)} when the bridge came back"
             return Next(phase=Phase.LANDING, why=why, down=known.mode)
         if known.mode is not Mode.COMMANDED:
-            why = f"in mode {known.mode_name or known.mode.value} when the bridge came back"
-            return Next(phase=Phase.ABORTED, why=why)
+            return Next(phase=Phase.ABORTED, why=f"in mode {_name(known)} when the bridge came back")
         if breach is not None:
             why = f"outside the fence when the bridge came back: {breach}"
             return Next(phase=Phase.LANDING, why=why, down=self.settings.then)
         return None
 
-    def prepare(self, now_s: float, known: Telemetry, begun: bool) -> Next:
-        """Look at a vehicle that is connected.
-
-        Args:
-            now_s: steady clock.
-            known: of the vehicle.
-            begun: was it asked to arm?
-        """
-        self._is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
-        here = known.position
-        fault = self.watch.fault(now_s, known) or (self.fence.breach(here) if here is not None else None)
+    def prepare(self, now_s: float, known: Telemetry) -> Next:
+        """Look at a vehicle that is connected."""
+        self.is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
+        here, fault = known.position, self.watch.fault(now_s, known)
         ours = known.armed and known.mode is Mode.COMMANDED
-        if fault is not None and not ours:
-            return Next(phase=Phase.CONNECTING, why=known.missing or fault)
         if ours:
-            target = self.course.target
-            above = Enu(here.east_m, here.north_m, target.up_m) if here is not None else target
-            if (breach := self.fence.breach(above)) is not None:
-                why = f"the target is outside the fence: {breach}"
-                return Next(phase=Phase.LANDING, why=why, setpoint=above, down=self.settings.then)
-            return Next(phase=Phase.TAKEOFF, why="armed, in the commanded mode", setpoint=above)
-        mode = known.mode_name or known.mode.value
-        if known.armed and begun:
-            return Next(phase=Phase.ABORTED, why=f"mode {mode} instead, before it took off: a pilot has it")
+            return self._take_it(known)
+        if (why := self.refusal(known)) is not None:
+            return Next(phase=Phase.ABORTED, why=why)
+        wrong = fault.why if fault is not None else self.fence.breach(here) if here is not None else None
+        if wrong is not None:
+            return Next(phase=Phase.CONNECTING, why=known.missing or wrong)
+        wish: Wish | None = None
         if known.armed:
-            why, wish = f"a pilot flies: mode {mode}", None
+            why = f"a pilot flies: mode {_name(known)}"
         elif (low := self.watch.battery_is_low(known)) is not None:
-            why, wish = low, None
-        elif self._is_a_pilots:
-            why, wish = "a pilot had it: waiting for a pilot to set the mode and arm", None
+            why = low
+        elif self.is_a_pilots:
+            why = "a pilot had it: waiting for a pilot to set the mode and arm"
         elif not self.settings.arm:
-            why, wish = "waiting for a pilot to set the mode and arm (--arm does it here)", None
+            why = "waiting for a pilot to set the mode and arm (--arm does it here)"
         else:
             why = known.refusal or "sets the mode and arms"
             wish = Arm() if known.mode is Mode.COMMANDED else SetMode(Mode.COMMANDED)
+            self.allowed_mode = self.allowed_mode or _name(known)
+        why = "; ".join([why, *self.warnings(known)])
         return Next(phase=Phase.PREFLIGHT, why=why, setpoint=here, wish=wish)
+
+    def _take_it(self, known: Telemetry) -> Next:
+        """Begin with a vehicle that is armed, in the commanded mode."""
+        here, target = known.position, self.course.target
+        above = Enu(here.east_m, here.north_m, target.up_m) if here is not None else target
+        breach = self.fence.breach(above)
+        why = f"the target is outside the fence: {breach}" if breach is not None else self._misfit(known)
+        if why is not None:
+            down = Mode.LAND if known.on_ground else self.settings.then
+            return Next(phase=Phase.LANDING, why=why, down=down)
+        return Next(phase=Phase.TAKEOFF, why="armed, in the commanded mode", setpoint=above)
+
+    def warnings(self, known: Telemetry) -> list[str]:
+        """What a user should know, though it is no reason not to fly."""
+        found = field_check.warnings(self.course.scenario, self.settings, known.limits) if known.limits else []
+        if known.other_controller is not None:
+            found.append(f"another system commands this vehicle: {known.other_controller}")
+        return found
+
+    def _misfit(self, known: Telemetry) -> str | None:
+        """Which of the autopilot's own limits the field does not keep. Arming makes home where it stands."""
+        home = known.home if known.armed else known.position or known.home
+        if known.limits is None or home is None:
+            return None
+        return field_check.misfit(self.course.scenario, self.settings, known.limits, home)
+
+
+def _name(known: Telemetry) -> str:
+    """The autopilot's name of its mode."""
+    return known.mode_name or known.mode.value

@@ -3,36 +3,47 @@
 from typing import Literal
 
 from uav_dc_ros.autopilot.vehicle import Telemetry
-from uav_dc_ros.autopilot.watch import Watch
+from uav_dc_ros.autopilot.watch import Fault, FaultKind
 
 
 class Hold:
     """A fault that may pass.
 
     Args:
-        watch: finds faults.
+        hold_s: how long it may last.
 
     Attributes:
         fault: what is wrong at the moment; None: nothing.
+        since_s: steady clock, and vehicle time, when it began.
     """
 
-    def __init__(self, watch: Watch) -> None:
-        self.watch = watch
-        self.fault: str | None = None
-        self._since_s = 0.0, 0.0  # steady clock, vehicle time
+    def __init__(self, hold_s: float) -> None:
+        self.hold_s = hold_s
+        self.fault: Fault | None = None
+        self.since_s = 0.0, 0.0
 
-    def look(self, now_s: float, known: Telemetry) -> Literal["begins", "lasts", "passes", "ends"] | None:
-        """What has become of it, at a steady time; None: nothing is wrong, and nothing was.
+    def look(
+        self, now_s: float, known: Telemetry, fault: Fault | None
+    ) -> Literal["begins", "turns", "lasts", "passes", "ends"] | None:
+        """What has become of it; None: nothing is wrong, and nothing was.
 
-        `ends` is the end of the mission: it has lasted for `hold_s`, on either clock.
+        A lost link explains all that is missing besides, from before it was noticed until after it is back.
+        `turns`: another fault than before is told now. `ends`: it has lasted for `hold_s`, on either clock.
+
+        Args:
+            now_s: steady clock.
+            known: of the vehicle.
+            fault: what is wrong now.
         """
-        before, fault = self.fault, self.watch.fault(now_s, known)
+        before, self.fault = self.fault, fault
         if fault is None:
-            self.fault = None
             return None if before is None else "passes"
         if before is None:
-            self.fault, self._since_s = fault, (now_s, known.vehicle_s)
+            self.since_s = now_s, known.vehicle_s
             return "begins"
-        steady_s, vehicle_s = self._since_s
-        lasted_s = max(now_s - steady_s, known.vehicle_s - vehicle_s)
-        return "ends" if lasted_s > self.watch.settings.hold_s else "lasts"
+        if before.kind in (fault.kind, FaultKind.LINK):
+            self.fault = before
+        steady_s, vehicle_s = self.since_s
+        if max(now_s - steady_s, known.vehicle_s - vehicle_s) > self.hold_s:
+            return "ends"
+        return "lasts" if self.fault is before else "turns"

@@ -1,12 +1,18 @@
 """How carefully to fly, and what keeps a vehicle from going on."""
 
+import dataclasses
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Literal
 
-import numpy as np
-
 from uav_dc_ros.autopilot.battery import Battery
+from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.plausibility import Plausibility
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
+
+ESTIMATE_AGE_S = 3.0  # age after which the last report on an estimate says nothing, steady clock
+HEARTBEATS_S = 1.5  # a link whose last heartbeat is that much younger than another message is alive
+CLOCK_S = 3.0  # steady time for which the vehicle's own may stand still
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +40,18 @@ class Settings:
         retry_s: pause before a wish that was not fulfilled is uttered again, vehicle time.
         returning_tries: how often it is asked to return before it is asked to land.
         takeoff_s: longest time from the first wish to take off until the start is reached, vehicle time.
+        max_offset_cells: how far from the goal's centre, in cells, a step may end whose time is over; with
+            0.5 the goal is the nearest cell. A vehicle that is farther away flies on.
+        progress_s: time within which a vehicle that flies on after a step's time has to come nearer.
+        target_timeout_s: time for which the autopilot may report another target than the one it was sent.
+        landing_radius_m: horizontal distance from the dock within which the vehicle has landed there.
+        return_progress_s: time within which a vehicle that returns has to come nearer to home, climb or
+            descend; after it, it is to land.
+        landing_progress_s: time within which a vehicle that lands has to come lower or disarm; after it,
+            the mission is over all the same.
+        tilt_limit_deg: a vehicle that is tilted further does not fly any more.
+        sink_limit_m: how far it may be below both its setpoint and the altitude that it had on the way there.
+        crash_s: how long it may be beyond one of these two, or on the ground while it should fly.
     """
 
     arm: bool = False
@@ -53,52 +71,108 @@ class Settings:
     retry_s: float = 2.0
     returning_tries: int = 3
     takeoff_s: float = 300.0
+    max_offset_cells: float = 0.5
+    progress_s: float = 5.0
+    target_timeout_s: float = 5.0
+    landing_radius_m: float = 5.0
+    return_progress_s: float = 30.0
+    landing_progress_s: float = 120.0
+    tilt_limit_deg: float = 70.0
+    sink_limit_m: float = 10.0
+    crash_s: float = 1.0
+
+
+class FaultKind(StrEnum):
+    """What keeps a vehicle from going on."""
+
+    LINK = "link"
+    POSITION = "position"
+    ESTIMATE = "estimate"
+    CLOCK = "clock"
+    TARGET = "target"
+    PROGRESS = "progress"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One that is present, and why, in words."""
+
+    kind: FaultKind
+    why: str
 
 
 class Watch:
-    """Finds what is wrong with what is known of a vehicle.
+    """Finds what is wrong with the telemetry of a vehicle.
 
     Args:
         settings: what is wrong, and what is not.
         at_rest_v: of the battery, see there.
+        home: where the vehicle was armed, if that was before the bridge was started.
 
     Attributes:
         battery: judges it.
+        home: where the vehicle stood last before it was armed; None: not seen.
     """
 
-    def __init__(self, settings: Settings, at_rest_v: float | None = None) -> None:
+    def __init__(self, settings: Settings, at_rest_v: float | None = None, home: Enu | None = None) -> None:
         self.settings = settings
         self.battery = Battery(settings.least_battery, at_rest_v)
-        self._believed: Telemetry | None = None  # the last one whose position could be true
+        self.home = home
+        self._plausible = Plausibility(settings.fastest_mps, settings.jump_m)
+        self._heartbeat_s: float | None = None
+        self._link_since_s = 0.0  # steady clock: since when heartbeats come without a gap
+        self._clock: tuple[float, float] | None = None  # vehicle time, and when it passed last
+
+    @property
+    def discarded(self) -> dict[str, int]:
+        """Positions that were left out, by reason."""
+        return self._plausible.discarded
+
+    def see(self, now_s: float, known: Telemetry) -> Telemetry:
+        """Take in telemetry, at each tick; what is returned can be true, and has a home if one is known."""
+        known = self._plausible.filter(now_s, known)
+        if known.heartbeat_s is not None and known.heartbeat_s != self._heartbeat_s:
+            last_s, self._heartbeat_s = self._heartbeat_s, known.heartbeat_s
+            if last_s is None or known.heartbeat_s - last_s > self.settings.link_age_s:
+                self._link_since_s = known.heartbeat_s
+        if self._clock is None or known.vehicle_s > self._clock[0]:
+            self._clock = known.vehicle_s, now_s
+        if not known.armed and known.on_ground is not False and known.position is not None:
+            self.home = known.position
+        return dataclasses.replace(known, home=known.home or self.home)
 
     def link_is_lost(self, now_s: float, known: Telemetry) -> bool:
         """Has no heartbeat come lately."""
         return known.heartbeat_s is None or now_s - known.heartbeat_s > self.settings.link_age_s
 
-    def fault(self, now_s: float, known: Telemetry) -> str | None:
+    def estimate_is_lost(self, now_s: float, known: Telemetry) -> bool:
+        """Does the autopilot itself not trust its position. Reports that no link delivers say nothing."""
+        if known.estimate_ok or self.link_is_lost(now_s, known) or known.heartbeat_s is None:
+            return False
+        if known.estimate_s is None or now_s - known.estimate_s <= ESTIMATE_AGE_S:
+            return True
+        return known.heartbeat_s - max(known.estimate_s, self._link_since_s) > HEARTBEATS_S
+
+    def clock_stands_for_s(self, now_s: float) -> float:
+        """For how long no time has passed on the vehicle, steady clock."""
+        return now_s - self._clock[1] if self._clock else 0.0
+
+    def fault(self, now_s: float, known: Telemetry) -> Fault | None:
         """What is wrong; None: nothing."""
-        settings = self.settings
+        age_s = self.settings.position_age_s
         if self.link_is_lost(now_s, known):
-            return f"no heartbeat for {settings.link_age_s:g} s"
-        if known.position_s is None or now_s - known.position_s > settings.position_age_s:
-            return f"no position for {settings.position_age_s:g} s"
-        if not known.estimate_ok:
-            return "the autopilot has lost its position estimate"
-        return self._jumped(known)
+            return Fault(FaultKind.LINK, f"link lost: no heartbeat for {self.settings.link_age_s:g} s")
+        jump = self._plausible.jump
+        if jump is not None and known.vehicle_s - self._plausible.accepted_s > age_s:
+            return Fault(FaultKind.POSITION, jump)
+        if known.position is None or known.position_s is None or now_s - known.position_s > age_s:
+            return Fault(FaultKind.POSITION, jump or f"no position for {age_s:g} s")
+        if self.estimate_is_lost(now_s, known):
+            return Fault(FaultKind.ESTIMATE, "the autopilot has lost its position estimate")
+        if self.clock_stands_for_s(now_s) > CLOCK_S:
+            return Fault(FaultKind.CLOCK, f"the vehicle's clock has stood still for {CLOCK_S:g} s")
+        return None
 
     def battery_is_low(self, known: Telemetry) -> str | None:
         """What is wrong with its charge; None: nothing, or it does not tell."""
         return self.battery.low(known) if self.settings.least_battery > 0 else None
-
-    def _jumped(self, known: Telemetry) -> str | None:
-        """Is the vehicle where it cannot have flown since it was somewhere believable."""
-        last = self._believed
-        if last is not None and known.position_s == last.position_s:
-            return None  # no other position has come; that one is from when it came
-        if last is not None and last.position is not None and known.position is not None:
-            passed_s = max(0.0, known.vehicle_s - last.vehicle_s)
-            moved_m = float(np.linalg.norm(np.subtract(known.position, last.position)))
-            if moved_m > self.settings.jump_m + self.settings.fastest_mps * passed_s:
-                return f"the position jumped by {moved_m:.0f} m"
-        self._believed = known
-        return None

@@ -79,4 +79,17 @@ SETTINGS = (
     _setting(
         "takeoff_s", "longest time for take-off and the way to the start, vehicle time", "s", 5.0, 3600.0
     ),
+    _setting(
+        "max_offset_cells", "how far from its cell a step may end whose time is over", "cells", 0.0, 1.0
+    ),
+    _setting("progress_s", "time to come nearer to a cell after that, vehicle time", "s", 1.0, 600.0),
+    _setting("target_timeout_s", "how long the autopilot may report another target", "s", 1.0, 600.0),
+    _setting("landing_radius_m", "distance from the dock within which it has landed there", "m", 0.1, 1000.0),
+    _setting("return_progress_s", "time to come nearer to home on a return, vehicle time", "s", 5.0, 3600.0),
+    _setting(
+        "landing_progress_s", "time to come lower or disarm while it lands, vehicle time", "s", 5.0, 3600.0
+    ),
+    _setting("tilt_limit_deg", "a vehicle that is tilted further does not fly any more", "deg", 10.0, 180.0),
+    _setting("sink_limit_m", "how far it may sink below its setpoint", "m", 1.0, 1000.0),
+    _setting("crash_s", "how long it may be beyond these two, or on the ground in flight", "s", 0.1, 60.0),
 )

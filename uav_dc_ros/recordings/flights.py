@@ -17,7 +17,8 @@ from uav_dc_ros.recordings.step import RecordedStep, Told
 
 _OVER = (Phase.LANDED, Phase.TIMEOUT, Phase.ABORTED)
 _DOWN = (Phase.LANDING, Phase.ABORTED)
-# A bridge that was killed begins again, at the same step; or at the next one, if it was flying to its cell.
+# A bridge that was killed begins again at the same step (in earlier versions, at the next). It flies a move
+# that was begun to its end, so the next step may follow a take-off.
 _RESTARTED = (Phase.IDLE, Phase.CONNECTING)
 AFTER: dict[Phase, tuple[Phase, ...]] = {  # what may follow within a step
     Phase.IDLE: (Phase.CONNECTING, *_DOWN),
@@ -31,7 +32,10 @@ AFTER: dict[Phase, tuple[Phase, ...]] = {  # what may follow within a step
     Phase.TIMEOUT: (),
     Phase.ABORTED: (),
 }
-NEXT_STEP: dict[Phase, tuple[Phase, ...]] = {Phase.MOVING: (Phase.READY, Phase.LANDING)}
+NEXT_STEP: dict[Phase, tuple[Phase, ...]] = {
+    Phase.MOVING: (Phase.READY, Phase.LANDING),
+    Phase.TAKEOFF: (Phase.READY, Phase.LANDING),
+}
 
 
 @dataclass

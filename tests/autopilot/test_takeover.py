@@ -1,0 +1,229 @@
+"""Who has the vehicle: a pilot's switch on the ground, another system, a bridge that is stopped anywhere."""
+
+import msgspec
+import pytest
+
+from tests.autopilot.simulated import ARMING, START, Flight, Vehicle, fly_to_step
+from uav_dc_ros.autopilot.bridge import Standing
+from uav_dc_ros.autopilot.frames import Enu
+from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry
+from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.messages import Phase
+
+GROUND = Enu(START.east_m, START.north_m, 0.0)
+ALOFT = Enu(300.0, 300.0, 150.0)
+
+
+class Stubborn(Vehicle):
+    """Does not arm while the throttle stick is up."""
+
+    stick_is_up = True
+
+    def ask(self, wish: object) -> None:
+        if isinstance(wish, Arm) and self.stick_is_up:
+            self.asked.append(wish)
+        else:
+            super().ask(wish)  # type: ignore[arg-type]
+
+
+def restarted(flight: Flight) -> Flight:
+    """Another bridge beside the same vehicle, that knows what the journal tells."""
+    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Standing)
+    return Flight(flight.bridge.settings, flight.vehicle, standing=standing)
+
+
+def test_a_switch_on_the_ground_is_the_last_word() -> None:
+    flight = Flight(vehicle=Stubborn(position=GROUND))
+    flight.run(10.0)
+    assert flight.vehicle.mode is Mode.COMMANDED
+    flight.vehicle.mode, flight.vehicle.mode_name = Mode.OTHER, "LOITER"
+    asked = len(flight.vehicle.asked)
+    flight.vehicle.stick_is_up = False  # type: ignore[attr-defined]
+    flight.run(60.0)
+    assert flight.vehicle.asked[asked:] == []
+    assert (flight.vehicle.mode, flight.vehicle.armed) == (Mode.OTHER, False)
+    reason = "mode LOITER before take-off: changed by a pilot or by the autopilot's failsafe"
+    assert (flight.bridge.phase, flight.bridge.reason) == (Phase.ABORTED, reason)
+    again = restarted(flight)
+    again.run(10.0)
+    assert flight.vehicle.asked[asked:] == []
+    assert (again.bridge.phase, again.bridge.reason) == (Phase.ABORTED, reason)
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+def test_a_bridge_that_is_restarted_on_the_ground_knows_what_it_requested(obeys: bool) -> None:
+    """The pilot's switch came while no bridge was there; also if the mode was never taken."""
+    flight = Flight(vehicle=Stubborn(position=GROUND, mode_name="STABILIZE", deaf=not obeys))
+    flight.run(10.0)
+    assert SetMode(Mode.COMMANDED) in flight.vehicle.asked
+    flight.vehicle.mode, flight.vehicle.mode_name = Mode.OTHER, "LOITER"
+    flight.vehicle.asked.clear()
+    again = restarted(flight)
+    again.run(10.0)
+    assert flight.vehicle.asked == []
+    assert again.bridge.phase is Phase.ABORTED
+    assert again.bridge.reason.startswith("mode LOITER before take-off: changed by a pilot")
+
+
+def test_what_was_requested_is_kept_before_it_is_sent() -> None:
+    kept: list[str | None] = []
+    flight = Flight()
+    note = flight.bridge._on_change
+
+    def keep() -> None:
+        note()
+        kept.append(flight.bridge.standing.allowed_mode)
+        assert flight.vehicle.asked == [] or kept[-1] is not None
+
+    flight.bridge._on_change = keep
+    flight.until(Phase.TAKEOFF)
+    assert kept[-1] is not None
+
+
+def test_a_request_that_is_refused_is_repeated_until_somebody_chooses_a_third_mode() -> None:
+    vehicle = Vehicle(position=GROUND, mode_name="STABILIZE", refused=(Mode.COMMANDED,))
+    flight = Flight(vehicle=vehicle)
+    flight.run(10.0)
+    assert vehicle.asked.count(SetMode(Mode.COMMANDED)) >= 4
+    vehicle.mode_name = "LOITER"
+    vehicle.refused = ()
+    vehicle.asked.clear()
+    flight.run(10.0)
+    assert vehicle.asked == []
+    assert flight.bridge.phase is Phase.ABORTED
+
+
+def test_before_anything_is_requested_a_pilot_may_choose_any_mode() -> None:
+    vehicle = Vehicle(position=GROUND, mode_name="STABILIZE", battery=0.1)
+    flight = Flight(vehicle=vehicle)
+    flight.run(5.0)
+    vehicle.mode_name = "LOITER"
+    flight.run(5.0)
+    assert flight.bridge.phase is Phase.PREFLIGHT
+    vehicle.battery = 1.0
+    flight.until(Phase.TAKEOFF)
+
+
+def test_without_arm_modes_on_the_ground_are_the_pilot_s_business() -> None:
+    vehicle = Vehicle(position=GROUND, mode=Mode.COMMANDED)
+    flight = Flight(Settings(), vehicle)
+    for mode in (Mode.OTHER, Mode.COMMANDED, Mode.HOLD, Mode.COMMANDED):
+        flight.run(3.0)
+        vehicle.mode = mode
+    assert flight.bridge.phase is Phase.PREFLIGHT
+    vehicle.armed = True
+    flight.until(Phase.MOVING)
+
+
+def test_what_a_pilot_took_over_stays_the_pilot_s_after_a_restart_and_a_stop() -> None:
+    flight = fly_to_step(3)
+    flight.vehicle.mode = Mode.OTHER
+    flight.run(0.5)
+    flight.vehicle.mode = Mode.COMMANDED  # a ground station's now
+    flight.vehicle.asked.clear()
+    again = restarted(flight)
+    again.run(5.0)
+    assert (again.bridge.phase, again.bridge.reason) == (Phase.ABORTED, flight.bridge.reason)
+    third = restarted(flight)
+    third.bridge.stop("the bridge was stopped", flight.vehicle.told)
+    third.run(1.0)
+    assert flight.vehicle.asked == []
+
+
+@pytest.mark.parametrize("how", [ARMING, Settings()])
+def test_a_vehicle_that_another_system_commands_is_refused_before_anything_is_sent(how: Settings) -> None:
+    evidence = "component 191 of system 254 sends heartbeats"
+    for vehicle in (
+        Vehicle(position=GROUND, other_controller=evidence),
+        Vehicle(position=ALOFT, other_controller=evidence, mode=Mode.COMMANDED, armed=True),
+    ):
+        flight = Flight(how, vehicle)
+        flight.run(5.0)
+        assert vehicle.asked == []
+        assert flight.bridge.setpoint is None
+        assert (flight.bridge.phase, flight.bridge.reason) == (
+            Phase.ABORTED,
+            f"another system commands this vehicle: {evidence}",
+        )
+
+
+def test_another_system_that_comes_in_flight_is_reported() -> None:
+    flight = fly_to_step(3)
+    flight.vehicle.other_controller = "component 191 of system 254 sends heartbeats"
+    flight.run(1.0)
+    assert flight.bridge.phase in (Phase.READY, Phase.MOVING)
+    assert flight.bridge.warnings == [
+        "another system commands this vehicle: component 191 of system 254 sends heartbeats"
+    ]
+    assert any("another system commands this vehicle" in reason for _, _, reason in flight.log)
+
+
+def test_a_target_that_is_not_ours_for_long_ends_the_mission() -> None:
+    """Another bridge drags the vehicle to a target of its own, or the autopilot refuses targets silently."""
+    flight = fly_to_step(3)
+    vehicle = flight.vehicle
+    vehicle.fence_m = 1.0  # it keeps the target that it has
+    vehicle.target = Enu(0.0, 500.0, 150.0)
+    flight.until(Phase.LANDING, 12.0)
+    assert "the autopilot does not take its target: it reports one" in flight.bridge.reason
+    flight.until(Phase.ABORTED)
+
+
+# A new mission beside a vehicle in the air, and Ctrl-C.
+
+
+@pytest.mark.parametrize("mode", [Mode.COMMANDED, Mode.OTHER])
+def test_a_vehicle_in_the_air_without_a_datum_is_refused_at_once(mode: Mode) -> None:
+    vehicle = Vehicle(position=ALOFT, mode=mode, armed=True, unplaced=True)
+    flight = Flight(vehicle=vehicle)
+    flight.until(Phase.ABORTED, 10.0)
+    assert "expected --datum=LAT,LON,ALT" in flight.bridge.reason
+    assert vehicle.asked == []
+
+
+def test_a_vehicle_in_the_air_outside_the_fence_is_refused_at_once() -> None:
+    vehicle = Vehicle(position=Enu(3000.0, 0.0, 150.0), mode=Mode.COMMANDED, armed=True)
+    flight = Flight(vehicle=vehicle)
+    flight.until(Phase.ABORTED, 5.0)
+    assert flight.bridge.reason.startswith("the vehicle is outside the fence: 3000.0 m east")
+    assert vehicle.asked == []
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 2, 5, 20])
+@pytest.mark.parametrize("unplaced", [True, False])
+@pytest.mark.parametrize("then", [Mode.RETURN, Mode.LAND])
+def test_a_bridge_that_is_stopped_brings_a_vehicle_down_in_every_phase(
+    ticks: int, unplaced: bool, then: Mode
+) -> None:
+    vehicle = Vehicle(position=ALOFT, mode=Mode.COMMANDED, armed=True, unplaced=unplaced)
+    vehicle.pass_time(0.1, None)
+    flight = Flight(Settings(then=then), vehicle)
+    for _ in range(ticks):
+        flight.tick()
+    flight.bridge.stop("the bridge was stopped", vehicle.told)
+    flight.run(0.3)
+    assert vehicle.asked == [SetMode(then)]
+    assert flight.bridge.is_done_with(vehicle.told)
+    flight.until(Phase.ABORTED)
+    assert flight.bridge.reason == "the bridge was stopped"
+
+
+def test_a_bridge_that_is_stopped_lets_a_pilot_s_vehicle_alone() -> None:
+    for vehicle in (Vehicle(position=ALOFT, armed=True), Vehicle(position=GROUND)):
+        flight = Flight(vehicle=vehicle)
+        flight.tick()
+        flight.bridge.stop("the bridge was stopped")
+        flight.run(1.0)
+        assert vehicle.asked == []
+        assert flight.bridge.phase is Phase.ABORTED
+
+
+def test_a_mission_in_the_air_that_cannot_be_taken_up_has_an_end() -> None:
+    """The position never comes back, though the link does."""
+    flight = fly_to_step(3)
+    flight.vehicle.frozen = True
+    flight.vehicle.told = Telemetry()
+    again = restarted(flight)
+    again.until(Phase.ABORTED, 1500.0)
+    assert again.bridge.reason.startswith("no position for 0.5 s; waited 300 s")
+    assert SetMode(Mode.RETURN) in flight.vehicle.asked
