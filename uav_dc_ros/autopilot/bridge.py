@@ -120,7 +120,7 @@ class Bridge:
 
     @property
     def discarded(self) -> dict[str, int]:
-        """Positions that were not believed, by reason; beside those of `Telemetry.discarded`."""
+        """Telemetry that could not be true and was left out, by reason; `Telemetry.discarded` has others."""
         return self._watched.discarded
 
     @property

@@ -66,6 +66,7 @@ class Descent:
         self._blind_since_s = blind_since_s
         self._instead = False  # it is to land, since its return does not come home
         self._mode: Mode | None = None
+        self._lost_since_s: float | None = None  # steady time: the link is lost
         self._seen_s: float | None = None  # vehicle time of the last look that had a position
         self._stood_s: float | None = None  # steady time when it was first seen disarmed
         self._to_home, self._lower = Progress(NEARER_M), Progress(LOWER_M)
@@ -91,6 +92,7 @@ class Descent:
         """
         if self._watch.link_is_lost(now_s, known):
             return self._wait_for_link(now_s, known, setpoint)
+        self._lost_since_s = None
         if not known.armed:
             return self._stand(now_s, known)
         if self._watch.clock_stands_for_s(now_s) > self._settings.lost_s:
@@ -121,7 +123,9 @@ class Descent:
             # No position came because nothing came.
             self.how, self._blind_since_s = settings.then, None
             self.why = f"link lost: no heartbeat for {settings.link_age_s:g} s"
-        if heartbeat_s is None or now_s - heartbeat_s > settings.lost_s:
+        if self._lost_since_s is None:
+            self._lost_since_s = now_s if heartbeat_s is None else min(now_s, heartbeat_s)
+        if now_s - self._lost_since_s > settings.lost_s:
             why = f"{self.why}; not heard of for {settings.lost_s:g} s"
             return Next(phase=Phase.ABORTED, why=why)
         return Next(phase=Phase.LANDING, why=self.why, setpoint=setpoint)

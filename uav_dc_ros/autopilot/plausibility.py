@@ -6,7 +6,12 @@ import math
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Telemetry
 
-AHEAD_S = 1.0  # a position cannot have come later than now, but for the time between two looks at the clock
+SLACK_S = 1.0  # between times of arrival that are taken in different threads, steady clock
+
+
+def is_finite(position: Enu) -> bool:
+    """Is a position one at all: three numbers."""
+    return all(map(math.isfinite, position))
 
 
 class Plausibility:
@@ -17,7 +22,7 @@ class Plausibility:
         jump_m: how far its estimate may jump besides.
 
     Attributes:
-        discarded: positions that were left out, by reason.
+        discarded: what was left out, by reason.
         jump: why the newest position was left out; None: it was not.
         accepted_s: vehicle time of the last position that was not left out.
     """
@@ -30,25 +35,37 @@ class Plausibility:
         self._newest_s = -math.inf  # steady clock: when the newest position came, accepted or not
         self._accepted: Telemetry | None = None
         self._vehicle_s = 0.0
+        self._last: Telemetry | None = None  # as it was returned
 
     def filter(self, now_s: float, known: Telemetry) -> Telemetry:
-        """The telemetry, with the last position that can be true, and a time that never goes back."""
-        self._vehicle_s = max(self._vehicle_s, known.vehicle_s)
+        """The telemetry, with the last position that can be true, and a time that never goes back.
+
+        Where its last heartbeat is older than that of telemetry before, the latter is returned.
+        """
+        last, heartbeat_s = self._last, known.heartbeat_s
+        if last is not None and (heartbeat_s or 0.0) < (last.heartbeat_s or 0.0) - SLACK_S:
+            self._discard("out of order")
+            return last
+        if math.isfinite(known.vehicle_s):
+            self._vehicle_s = max(self._vehicle_s, known.vehicle_s)
         if known.position is not None and known.position_s is not None:
             self._judge(now_s, known, known.position, known.position_s)
-        last = self._accepted
-        return dataclasses.replace(
+        accepted = self._accepted
+        self._last = dataclasses.replace(
             known,
             vehicle_s=self._vehicle_s,
-            position=last.position if last else None,
-            position_s=last.position_s if last else None,
+            position=accepted.position if accepted else None,
+            position_s=accepted.position_s if accepted else None,
+            home=known.home if known.home is not None and is_finite(known.home) else None,
+            target=known.target if known.target is not None and is_finite(known.target) else None,
         )
+        return self._last
 
     def _judge(self, now_s: float, known: Telemetry, position: Enu, position_s: float) -> None:
         """Accept a new position, or count why not."""
         if position_s == self._newest_s:
             return
-        if position_s < self._newest_s or position_s > now_s + AHEAD_S:
+        if position_s < self._newest_s or position_s > now_s + SLACK_S:
             self._discard("out of order")
             return
         self._newest_s = position_s
@@ -60,7 +77,7 @@ class Plausibility:
 
     def _jumped(self, position: Enu) -> str | None:
         """Is the vehicle where it cannot have flown since the last position that was accepted."""
-        if not all(map(math.isfinite, position)):
+        if not is_finite(position):
             return "the position is not a number"
         if self._accepted is None or self._accepted.position is None:
             return None

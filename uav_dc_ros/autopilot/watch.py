@@ -125,7 +125,7 @@ class Watch:
 
     @property
     def discarded(self) -> dict[str, int]:
-        """Positions that were left out, by reason."""
+        """Telemetry that was left out, by reason."""
         return self._plausible.discarded
 
     def see(self, now_s: float, known: Telemetry) -> Telemetry:
