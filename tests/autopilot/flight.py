@@ -16,6 +16,7 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.frames import Enu, Ned, to_enu
 from uav_dc_ros.autopilot.mavlink import Mavlink
+from uav_dc_ros.autopilot.vehicle import Telemetry
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
@@ -131,6 +132,8 @@ class Flight:
         log: each change of phase or reason.
         executed: the step of each move that was flown.
         cells: the cells that were flown to.
+        known: the telemetry of the last tick.
+        unflown: steps that counted, though the position that was reported was that of another cell.
     """
 
     def __init__(self, autopilot: Fake, how: Settings, scenario: Scenario = SCENARIO, **bridge: Any) -> None:
@@ -138,6 +141,9 @@ class Flight:
         self.log: list[tuple[Phase, int, str]] = []
         self.executed: list[int] = []
         self.cells: list[tuple[int, int, int]] = []
+        self.known = Telemetry()
+        self.unflown: list[int] = []
+        self._step = 0
         self.bridge = Bridge(scenario, how, self._note, **bridge)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
@@ -149,12 +155,25 @@ class Flight:
         if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
             self.executed.append(bridge.step)
             self.cells.append(bridge.goal)
+        if bridge.step != self._step:
+            self._step = bridge.step
+            self._check_step()
         self.log.append((bridge.phase, bridge.step, bridge.reason))
+
+    def _check_step(self) -> None:
+        grid, centre = self.bridge.scenario.grid, self.bridge.course.centre(self.bridge.cell)
+        sizes_m = (grid.cell_m, grid.cell_m, grid.altitude_step_m)
+        here = self.known.position
+        if here is None or any(
+            abs(h - c) > size / 2 for h, c, size in zip(here, centre, sizes_m, strict=True)
+        ):
+            self.unflown.append(self.bridge.step)
 
     def tick(self) -> None:
         """What the node's timer does."""
         bridge = self.bridge
-        for wish in bridge.tick(time.monotonic(), self.vehicle.telemetry()):
+        self.known = self.vehicle.telemetry()
+        for wish in bridge.tick(time.monotonic(), self.known):
             self.vehicle.ask(wish)
         if bridge.phase is Phase.READY and bridge.fault is None and self.policy is not None:
             bridge.move(bridge.step, self.policy(bridge))

@@ -1,4 +1,4 @@
-"""Whole flights whose telemetry is late, repeated, zeroed, reordered, impossible or missing."""
+"""Whole flights whose telemetry is late, repeated, reordered, impossible or missing; vehicles that fail."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from tests.autopilot.simulated import ARMING, Flight, way_home
+from tests.autopilot.simulated import ARMING, Flight, Vehicle, way_home
 from uav_dc_ros import scenarios
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Limits, Mode, Telemetry
@@ -37,6 +37,19 @@ KINDS = (
     *("late", "repeated", "zeroed", "reordered", "impossible", "not a number", "missing", "shifted"),
     *("clock back", "clock stands", "clock is none", "no heartbeat", "estimate", "disarmed?", "on ground?"),
     *("tilted", "target", "home", "limits", "other", "voltage", "silent policy", "policy gone"),
+)
+FAILURES = (
+    "wind",
+    "stuck",
+    "falls",
+    "deaf",
+    "silent",
+    "frozen",
+    "fence",
+    "pilot",
+    "lands",
+    "drained",
+    "disarmed",
 )
 ON_GROUND = (Phase.CONNECTING, Phase.PREFLIGHT)
 
@@ -92,6 +105,23 @@ def distorted(fault: Fault, known: Telemetry, history: deque[Telemetry], now_s: 
     return dataclasses.replace(known, **change)  # type: ignore[arg-type]
 
 
+def fail(fault: Fault, vehicle: Vehicle, present: bool) -> None:
+    """What goes wrong with the vehicle itself."""
+    match fault.kind:
+        case "wind":
+            vehicle.wind_mps = (30.0 * fault.much, 0.0) if present else (0.0, 0.0)
+        case "stuck" | "falls" | "deaf" | "silent" | "frozen":
+            setattr(vehicle, fault.kind, present)
+        case "fence":
+            vehicle.fence_m = 300.0 * fault.much if present else None
+        case "pilot" | "lands" if present:
+            vehicle.mode = Mode.OTHER if fault.kind == "pilot" else Mode.LAND
+        case "drained" if present:
+            vehicle.battery = 0.3 * fault.much
+        case "disarmed" if present:
+            vehicle.armed = False
+
+
 class Distorted(Flight):
     """A flight over the field whose telemetry has faults."""
 
@@ -120,7 +150,10 @@ class Distorted(Flight):
         while not bridge.is_over and vehicle.now_s < LONGEST_S:
             now_s = vehicle.now_s
             self.history.append(vehicle.told)
-            known, present = vehicle.told, [f for f in self.faults if f.at_s <= now_s < f.at_s + f.lasts_s]
+            present = [f for f in self.faults if f.at_s <= now_s < f.at_s + f.lasts_s]
+            for fault in self.faults:
+                fail(fault, vehicle, fault in present)
+            known = vehicle.told
             for fault in present:
                 known = distorted(fault, known, self.history, now_s)
             self.policy = None if any(f.kind == "silent policy" for f in present) else _way
@@ -139,11 +172,11 @@ def check(faults: list[Fault]) -> Distorted:
     flight = Distorted(faults)
     flight.fly()
     bridge, vehicle = flight.bridge, flight.vehicle
-    waits = bridge.phase in ON_GROUND and not vehicle.armed
+    waits = bridge.phase in ON_GROUND and vehicle.on_ground
     assert bridge.is_over or waits, flight.log[-4:]
     assert bridge.reason
     assert flight.executed == sorted(set(flight.executed)), "no step twice"
-    if bridge.phase is Phase.LANDED:
+    if bridge.phase is Phase.LANDED and not any(fault.kind == "wind" for fault in faults):
         assert math.dist(vehicle.position[:2], FIELD.mission.dock_m) <= 5.0 + 30.0, "shifted by that at most"
     return flight
 
@@ -151,7 +184,7 @@ def check(faults: list[Fault]) -> Distorted:
 FAULTS = st.lists(
     st.builds(
         Fault,
-        kind=st.sampled_from(KINDS),
+        kind=st.sampled_from(KINDS + FAILURES),
         at_s=st.floats(0.0, 300.0),
         lasts_s=st.one_of(st.floats(0.0, 1.0), st.floats(0.0, 30.0), st.just(1e6)),
         much=st.floats(0.0, 1.0),
@@ -167,14 +200,17 @@ QUIET = [HealthCheck.too_slow]
 @example(faults=[Fault("late", 80.0, 0.2, 0.15)])
 @example(faults=[Fault("zeroed", 80.0, 0.2, 0.0)])
 @example(faults=[Fault("impossible", 80.0, 0.8, 0.0)])
-def test_whatever_telemetry_tells_the_mission_has_an_end(faults: list[Fault]) -> None:
+@example(faults=[Fault("wind", 0.0, 1e6, 0.5)])
+@example(faults=[Fault("wind", 0.0, 1e6, 0.5), Fault("silent", 40.0, 20.0, 0.5)])
+@example(faults=[Fault("falls", 60.0, 1e6, 0.0), Fault("deaf", 30.0, 1e6, 0.0)])
+def test_whatever_goes_wrong_the_mission_has_an_end(faults: list[Fault]) -> None:
     check(faults)
 
 
 @pytest.mark.long
 @settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=QUIET)
 @given(faults=FAULTS)
-def test_whatever_telemetry_tells_the_mission_has_an_end_every_time(faults: list[Fault]) -> None:
+def test_whatever_goes_wrong_the_mission_has_an_end_every_time(faults: list[Fault]) -> None:
     check(faults)
 
 

@@ -11,6 +11,7 @@ from uav_dc_ros.autopilot.watch import Watch
 from uav_dc_ros.messages import Phase
 
 DOWN = (Mode.LAND, Mode.RETURN)
+HOMELESS = 10.0  # as many times as long is a return waited for whose home is not known
 NEARER_M, VERTICAL_M, LOWER_M = 10.0, 5.0, 1.0  # what counts as progress: to home; up or down; of a landing
 
 
@@ -67,7 +68,8 @@ class Descent:
         self._instead = False  # it is to land, since its return does not come home
         self._mode: Mode | None = None
         self._lost_since_s: float | None = None  # steady time: the link is lost
-        self._seen_s: float | None = None  # vehicle time of the last look that had a position
+        self._seen_s: float | None = None  # steady time since when no new position came
+        self._position_s: float | None = None  # when the newest came
         self._stood_s: float | None = None  # steady time when it was first seen disarmed
         self._to_home, self._lower = Progress(NEARER_M), Progress(LOWER_M)
         self._upward, self._downward = Progress(VERTICAL_M), Progress(VERTICAL_M)
@@ -102,7 +104,7 @@ class Descent:
             returns = known.mode is self.how is Mode.RETURN and self.tries  # as it was asked to
             if not returns:
                 return Next(phase=Phase.ABORTED, why=f"{self.why}; {stall}")
-            self._land_instead(known, f"{stall}: lands")
+            self._land_instead(now_s, f"{stall}: lands")
         if self.obeys(known):
             return Next(phase=Phase.LANDING, why=self.why)
         if self._refuses_to_return(known, asked_s):
@@ -160,30 +162,23 @@ class Descent:
         answered = asked_s is None or known.vehicle_s - asked_s >= settings.retry_s
         return self.how is Mode.RETURN and self.tries >= settings.returning_tries and answered
 
-    def _land_instead(self, known: Telemetry, why: str) -> None:
+    def _land_instead(self, now_s: float, why: str) -> None:
         self.how, self._instead, self.why = Mode.LAND, True, f"{self.why}; {why}"
         self._lower.begin()
-        self._seen_s = known.vehicle_s
+        self._seen_s = now_s
 
     def _stalls(self, now_s: float, known: Telemetry) -> str | None:
         """Why a vehicle that is armed, and in reach, does not come down; None: it does."""
-        settings, here, home, vehicle_s = (
-            self._settings,
-            self._position(now_s, known),
-            known.home,
-            known.vehicle_s,
-        )
+        settings, here, home, vehicle_s = self._settings, known.position, known.home, known.vehicle_s
         if known.mode is not self._mode:
             self._mode = known.mode
             for progress in (self._to_home, self._lower, self._upward, self._downward):
                 progress.begin()
-        if here is None:
-            since_s = self._seen_s = self._seen_s if self._seen_s is not None else vehicle_s
-            for progress in (self._to_home, self._lower, self._upward, self._downward):
-                progress.pause()
-            blind = vehicle_s - since_s > settings.lost_s
+        if here is None or known.position_s == self._position_s:  # nothing new
+            self._seen_s = now_s if self._seen_s is None else self._seen_s
+            blind = now_s - self._seen_s > settings.lost_s
             return f"no position for {settings.lost_s:g} s" if blind else None
-        self._seen_s = vehicle_s
+        self._position_s, self._seen_s = known.position_s, now_s
         away_m = math.dist(here[:2], home[:2]) if home is not None else 0.0
         stalled_s = min(
             self._to_home.stalled_s(away_m, vehicle_s),
@@ -192,13 +187,11 @@ class Descent:
         )
         landing_s = self._lower.stalled_s(here.up_m, vehicle_s)
         if known.mode is Mode.RETURN and not known.on_ground and not self._instead:
-            limit_s = settings.return_progress_s if home is not None else settings.lost_s
+            limit_s = settings.return_progress_s * (1.0 if home is not None else HOMELESS)
+            if stalled_s <= limit_s:
+                return None
             far = f" ({away_m:.0f} m away)" if home is not None else ""
-            return (
-                f"it returns, and has come no nearer to home{far} for {limit_s:g} s"
-                if (stalled_s > limit_s)
-                else None
-            )
+            return f"it returns, and has come no nearer to home{far} for {limit_s:g} s"
         if landing_s > settings.landing_progress_s:
             what = "it lands" if known.mode is Mode.LAND else f"mode {known.mode_name or known.mode.value}"
             return f"{what}, and has neither come lower nor disarmed for {settings.landing_progress_s:g} s"

@@ -64,11 +64,13 @@ class Tracking:
         """Begin another phase."""
         self.is_late = False
         self._elsewhere_since_s: float | None = None  # vehicle time: the autopilot reports another target
-        self._progress.begin()
+        self.resume()
 
     def resume(self) -> None:
         """Fly to the goal again, after it was stopped on the way."""
         self._progress.begin()
+        self._stall: Fault | None = None  # as of the newest position
+        self._position_s: float | None = None
 
     def send(self, setpoint: Enu | None, now_s: float) -> None:
         """Note the setpoint that is streamed."""
@@ -93,10 +95,13 @@ class Tracking:
 
     def stalled(self, known: Telemetry) -> Fault | None:
         """Does a vehicle that is late come no nearer to the goal. To be asked often while it moves."""
-        if known.position is None:
-            return None
+        if known.position is None or known.position_s == self._position_s:
+            return self._stall
+        self._position_s = known.position_s
         away_m, limit_s = self._course.distance_m(known.position), self._settings.progress_s
         if self._progress.stalled_s(away_m, known.vehicle_s) <= limit_s or not self.is_late:
+            self._stall = None
             return None
         why = f"no nearer to cell {self._course.goal} for {limit_s:g} s, {away_m:.0f} m away from it"
-        return Fault(FaultKind.PROGRESS, why)
+        self._stall = Fault(FaultKind.PROGRESS, why)
+        return self._stall
