@@ -162,13 +162,13 @@ class Watch:
         age_s = self.settings.position_age_s
         if self.link_is_lost(now_s, known):
             return Fault(FaultKind.LINK, f"link lost: no heartbeat for {self.settings.link_age_s:g} s")
+        if known.position is not None and self.estimate_is_lost(now_s, known):  # positions may end with it
+            return Fault(FaultKind.ESTIMATE, "the autopilot has lost its position estimate")
         jump = self._plausible.jump
         if jump is not None and known.vehicle_s - self._plausible.accepted_s > age_s:
             return Fault(FaultKind.POSITION, jump)
         if known.position is None or known.position_s is None or now_s - known.position_s > age_s:
             return Fault(FaultKind.POSITION, jump or f"no position for {age_s:g} s")
-        if self.estimate_is_lost(now_s, known):
-            return Fault(FaultKind.ESTIMATE, "the autopilot has lost its position estimate")
         if self.clock_stands_for_s(now_s) > CLOCK_S:
             return Fault(FaultKind.CLOCK, f"the vehicle's clock has stood still for {CLOCK_S:g} s")
         return None
