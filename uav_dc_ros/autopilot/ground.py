@@ -169,7 +169,8 @@ class Ground:
 
     def warnings(self, known: Telemetry) -> list[str]:
         """What a user should know, though it is no reason not to fly."""
-        found = field_check.warnings(self.course.scenario, self.settings, known.limits) if known.limits else []
+        limits, scenario = known.limits, self.course.scenario
+        found = [] if limits is None else field_check.warnings(scenario, self.settings, limits)
         if known.other_controller is not None:
             found.append(f"another system commands this vehicle: {known.other_controller}")
         return found
