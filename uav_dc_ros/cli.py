@@ -1,13 +1,10 @@
 """What the command lines share: mistakes become one line and exit status 2."""
 
 import argparse
-import contextlib
-import os
 import re
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NoReturn
 
 from uav_dc_ros.errors import UavDcError
@@ -81,17 +78,3 @@ def run(command: Callable[[], int], prog: str) -> NoReturn:
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file in one move, so that it is there in full or not at all, even after a power cut."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise UavDcError(f"{path} cannot be written: {error.strerror}") from None

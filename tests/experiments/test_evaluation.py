@@ -196,11 +196,13 @@ def test_nothing_is_flown_before_all_is_known_to_fit(tmp_path, capsys, monkeypat
 
 def test_the_command_prints_and_writes_figures(tmp_path):
     made = saved(tmp_path / "made", scenarios.load("three_clusters"))
-    picture = tmp_path / "mission.png"
+    picture, link = tmp_path / "mission.png", tmp_path / "link.png"
+    link.symlink_to(picture)
     status, out, err = command(
-        "--policy", made, "--seeds", 4, "--json", tmp_path / "x.json", "--picture", picture
+        "--policy", made, "--seeds", 4, "--json", tmp_path / "x.json", "--picture", link
     )
     assert (status, err) == (0, "")
+    assert link.is_symlink()
     report = json.loads((tmp_path / "x.json").read_text())
     (written,) = report["evaluations"]
     assert report["comparisons"] == []

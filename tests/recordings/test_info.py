@@ -148,6 +148,11 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert content(bag) == before
     info(bag, capsys, "--json", str(tmp_path / "info.json"))
     assert json.loads((tmp_path / "info.json").read_text()) == told
+    (tmp_path / "link.json").symlink_to("info.json")
+    (tmp_path / "info.json").unlink()
+    info(bag, capsys, "--json", str(tmp_path / "link.json"))
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "info.json").read_text()) == told
 
 
 def test_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

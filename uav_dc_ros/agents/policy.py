@@ -17,7 +17,7 @@ import safetensors.numpy
 from msgspec import Meta
 from safetensors import SafetensorError
 
-from uav_dc_ros import resources
+from uav_dc_ros import files, resources
 from uav_dc_ros.agents import network
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import ACTION_LABELS
@@ -245,7 +245,7 @@ def save(
         (partial / CARD).write_text(card(made), "utf-8")
         if draw:
             draw(made, partial)
-        partial.rename(folder)
+        files.place(partial, folder)
     except OSError as error:
         raise PolicyError(f"policy {str(folder)!r} cannot be written: {error}") from None
     finally:

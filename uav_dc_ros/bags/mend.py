@@ -5,7 +5,6 @@ its place; so the disk must have room for one part more. The bag can be mended a
 killed. No part is ever dropped: one that holds nothing becomes an empty part.
 """
 
-import os
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
+from uav_dc_ros import files
 from uav_dc_ros.bags import metadata
 from uav_dc_ros.bags.metadata import Part, is_told, total, write_metadata
 from uav_dc_ros.bags.part import FolderLock, PartWriter, part_paths
@@ -108,23 +108,13 @@ def _read(scan: Scan) -> None:
 
 def _rewrite(scan: Scan, path: Path) -> Part:
     """Put what can be read of a part into its place."""
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
-        writer = PartWriter(temporary, name=path.name)
+    with files.replacing(path) as partial:
+        writer = PartWriter(partial, name=path.name)
         try:
             copy(scan, writer)
             writer.finish()
         finally:
             writer.abandon()
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name, too
-    finally:
-        os.close(folder)
     return writer.part
 
 

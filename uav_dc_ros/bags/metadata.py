@@ -14,7 +14,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from uav_dc_ros.cli import write_whole
+from uav_dc_ros import files
 from uav_dc_ros.errors import BagError, UavDcError
 
 METADATA_NAME = "uav_dc_ros"  # of our record inside an MCAP file: what the bag is about
@@ -180,7 +180,7 @@ def write_metadata(folder: Path, parts: Sequence[Part]) -> None:
     """
     text = to_yaml({"rosbag2_bagfile_information": information(parts)}) + "\n"
     try:
-        write_whole(folder / FILE_NAME, text.encode())
+        files.write(folder / FILE_NAME, text.encode())
     except UavDcError as error:
         raise BagError(str(error)) from None
 

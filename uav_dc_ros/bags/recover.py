@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from uav_dc_ros import files
 from uav_dc_ros.bags.mend import copy
 from uav_dc_ros.bags.metadata import LOST, METADATA_NAME, Part, total, write_metadata
 from uav_dc_ros.bags.part import PartWriter
@@ -98,7 +99,7 @@ def recover(path: Path, folder: Path) -> Recovered:
         write_metadata(temporary, parts)
         if folder.exists():  # made in the meantime
             raise BagError(f"bag folder {folder} exists already; expected a new one")
-        temporary.rename(folder)
+        files.place(temporary, folder)
     except OSError as error:
         raise BagError(f"bag folder {folder} cannot be written: {error.strerror}") from None
     finally:

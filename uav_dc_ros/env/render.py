@@ -10,6 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from uav_dc_ros import files
 from uav_dc_ros.core import mission, radio, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
@@ -54,8 +55,10 @@ def picture(track: Track) -> Array:
 
 
 def save_picture(track: Track, path: Path) -> None:
-    """Writes the mission so far as an image; the path's ending names the kind."""
-    FigureCanvasAgg(_figure(track, dpi=150)).figure.savefig(path)
+    """Writes the mission so far as an image; the path's ending names the kind, PNG without one."""
+    with files.replacing(path) as partial:
+        kind = path.suffix.removeprefix(".") or "png"
+        FigureCanvasAgg(_figure(track, dpi=150)).figure.savefig(partial, format=kind)
 
 
 def _figure(track: Track, dpi: int) -> Figure:

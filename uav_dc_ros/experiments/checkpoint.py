@@ -1,7 +1,5 @@
 """The state of a training on disk: one file, which is there in full or not at all."""
 
-import contextlib
-import os
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +7,7 @@ import msgspec
 import safetensors.torch
 from safetensors import SafetensorError, safe_open
 
+from uav_dc_ros import files
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.runs import Population
 from uav_dc_ros.experiments.training import Training
@@ -31,23 +30,15 @@ def save(path: Path, training: Training, progress: dict[str, Any]) -> None:
     """
     arrays, values = training.state()
     values |= {"format": _FORMAT, "population": _plain(training.population), "progress": progress}
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        safetensors.torch.save_file(
-            {name: array.contiguous().clone() for name, array in arrays.items()},
-            partial,
-            metadata={"training": msgspec.json.encode(values).decode()},
-        )
-        # On the disk before it takes the name: a power cut must not leave a name without its content.
-        descriptor = os.open(partial, os.O_RDONLY)
-        os.fsync(descriptor)
-        os.close(descriptor)
-        partial.replace(path)
+        with files.replacing(path) as partial:
+            safetensors.torch.save_file(
+                {name: array.contiguous().clone() for name, array in arrays.items()},
+                partial,
+                metadata={"training": msgspec.json.encode(values).decode()},
+            )
     except (OSError, SafetensorError) as error:
         raise TrainingError(f"{path} cannot be written: {error}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def restore(path: Path, training: Training) -> dict[str, Any]:

@@ -222,4 +222,4 @@ def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) ->
     try:
         save_picture(fly_track(scenario, act, seed), path)
     except (OSError, ValueError) as error:
-        raise UavDcError(f"{path} cannot be written: {error}") from None
+        raise UavDcError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from None

@@ -1,9 +1,6 @@
 """The command line of `python -m uav_dc_ros.evaluate`."""
 
-import errno
-import os
 import sys
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from uav_dc_ros import cli, scenarios
+from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import UavDcError
@@ -90,7 +87,7 @@ def main(argv: list[str] | None = None) -> None:
         if options.picture and len(flights) > 1:
             raise UavDcError(f"--picture of {len(flights)} flights; expected one policy in one scenario")
         for path in filter(None, (options.json, options.picture)):
-            _refuse_unwritable(path)
+            files.refuse_unwritable(path)
         if options.picture:
             pilot, scenario = flights[0]
             save_mission_picture(pilot.steer(scenario), scenario, 0, options.picture)
@@ -108,7 +105,7 @@ def main(argv: list[str] | None = None) -> None:
         report = Report(evaluations=[one.evaluation for one in flown], comparisons=comparisons)
         show(report)
         if options.json:
-            cli.write_whole(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
+            files.write(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
         return 0
 
     cli.run(command, PROG)
@@ -149,17 +146,6 @@ def _pilot(given: str) -> Pilot:
         return Pilot(given, None, None, PLANNERS[given])
     policy = policies.load(given)
     return Pilot(policy.name, policy.sha256, policy.scenario.name, partial(steer, policy))
-
-
-def _refuse_unwritable(path: Path) -> None:
-    """Raises UavDcError when no file can be made at `path`: better before the flights than after."""
-    try:
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise UavDcError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def show(report: Report) -> None:

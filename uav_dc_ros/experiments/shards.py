@@ -19,7 +19,7 @@ import safetensors.numpy
 from safetensors import SafetensorError
 
 import uav_dc_ros
-from uav_dc_ros import __version__, cli
+from uav_dc_ros import __version__, files
 from uav_dc_ros.agents import network
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import TrainingError
@@ -155,7 +155,7 @@ def checkpoint_file(folder: Path, shard: Shard) -> Path:
 
 def keep(folder: Path, shard: Shard, content: bytes) -> None:
     """Writes the result of a shard, in one move, and drops its checkpoint."""
-    cli.write_whole(result_file(folder, shard), content)
+    files.write(result_file(folder, shard), content)
     checkpoint_file(folder, shard).unlink(missing_ok=True)
 
 

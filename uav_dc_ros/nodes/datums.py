@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from uav_dc_ros import cli
+from uav_dc_ros import files
 from uav_dc_ros.autopilot.frames import Geodetic
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError, ParameterError, UavDcError, VehicleError
@@ -93,7 +93,7 @@ def keep(scenario: Scenario, datum: Geodetic, vehicle: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise NodeError(f"{path.parent} cannot be made: {error.strerror}") from None
-    cli.write_whole(path, msgspec.json.encode(kept))
+    files.write(path, msgspec.json.encode(kept))
 
 
 def parse(text: str, scenario: Scenario, vehicle: str, *, arm: bool = False) -> Geodetic | None:

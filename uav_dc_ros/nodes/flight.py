@@ -10,7 +10,7 @@ import msgspec
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from uav_dc_ros import cli, scenarios
+from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
@@ -264,5 +264,5 @@ class Flight:
         if self.options.summary is not None:
             told = self.summaries[0] if self.options.missions == 1 else self.summaries
             text = msgspec.json.format(msgspec.json.encode(told), indent=2)
-            cli.write_whole(self.options.summary, text + b"\n")
+            files.write(self.options.summary, text + b"\n")
         self.display.summary(self.summaries)

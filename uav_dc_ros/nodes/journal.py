@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from uav_dc_ros import files
 from uav_dc_ros.errors import NodeError
 
 
@@ -49,10 +50,8 @@ class Journal:
         if self._path is None:
             return
         self.close()
-        new = self._path.with_name(f"{self._path.name}.new")
-        with self._told("written"):
+        with self._told("written"), files.replacing(self._path, durable=False) as new:
             new.write_bytes(line + b"\n")
-            new.replace(self._path)
 
     def append(self, line: bytes) -> None:
         """Write a line.

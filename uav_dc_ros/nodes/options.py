@@ -7,9 +7,10 @@ from pathlib import Path
 
 import msgspec
 
+from uav_dc_ros import files
 from uav_dc_ros.core import pace
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.errors import BagError, ParameterError
+from uav_dc_ros.errors import BagError, ParameterError, UavDcError
 from uav_dc_ros.nodes import datums, vehicles
 from uav_dc_ros.nodes.table import COMPOSABLE, NODES
 from uav_dc_ros.topics import SIMULATED, VEHICLES
@@ -132,12 +133,12 @@ def check_writable(summary: Path, bag: Path | None) -> None:
     Raises:
         ParameterError: why.
     """
-    folder = summary.absolute().parent
-    taken = summary.is_dir() or summary.absolute() == bag
-    if taken or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise ParameterError(
-            f"--summary {summary}: expected a file in an existing folder that can be written"
-        )
+    if summary.absolute() == bag:
+        raise ParameterError(f"--summary {summary}: it is the folder of the bag; expected another path")
+    try:
+        files.refuse_unwritable(summary)
+    except UavDcError as error:
+        raise ParameterError(f"--summary {error}; expected a file in an existing folder") from None
 
 
 def new_bag(wanted: Path | None) -> Path:

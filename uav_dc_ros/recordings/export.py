@@ -15,7 +15,7 @@ from typing import IO, Any, get_args
 import msgspec
 import numpy as np
 
-from uav_dc_ros import __version__
+from uav_dc_ros import __version__, files
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.reward import RewardForm
 from uav_dc_ros.core.scenario import Scenario
@@ -137,7 +137,7 @@ def _new(path: Path) -> Iterator[Path]:
         (partial / "result").parent.mkdir(parents=True)
         yield partial
         _refuse_existing(path)
-        (partial / "result").rename(path)
+        files.place(partial / "result", path)
     except OSError as error:
         raise BagError(f"{path} cannot be written: {error.strerror or error}") from None
     finally:

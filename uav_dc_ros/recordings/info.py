@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from uav_dc_ros import cli
+from uav_dc_ros import files
 from uav_dc_ros.bags.storage import RECOVER
 from uav_dc_ros.recordings.missions import MissionSurvey
 from uav_dc_ros.recordings.step import printable
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json == "-":
         print(text.decode(), end="")
     else:
-        cli.write_whole(Path(options.json), text)
+        files.write(Path(options.json), text)
     return 0
 
 

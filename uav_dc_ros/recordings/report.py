@@ -1,12 +1,13 @@
 """The verb `report`: a page about the missions of a bag, or several bags side by side."""
 
 import argparse
+import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from uav_dc_ros import __version__, cli
+from uav_dc_ros import __version__, cli, files
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.recordings import steps
@@ -64,8 +65,10 @@ def run(options: argparse.Namespace) -> int:
             [options.bag, *options.compare], options.mission, options.scenario, options.namespace
         )
     content = page.content()
-    cli.write_whole(out, content)
-    print(f"{out}: {told}, {len(content) / 1e6:.2f} MB")
+    files.write(out, content)
+    # Beside a page that goes to the output itself, not into it.
+    beside = sys.stdout if files.is_replaced(out) else sys.stderr
+    print(f"{out}: {told}, {len(content) / 1e6:.2f} MB", file=beside)
     return 0
 
 
@@ -146,7 +149,7 @@ def _check_out(out: Path) -> None:
     """
     if not out.absolute().parent.is_dir():
         raise ParameterError(f"--out {out}: expected a file in an existing folder")
-    if not out.exists():
+    if not out.exists() or not (out.is_dir() or files.is_replaced(out)):
         return
     if out.is_file():
         with out.open("rb") as file:

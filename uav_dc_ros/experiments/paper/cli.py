@@ -18,7 +18,7 @@ import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from uav_dc_ros import cli, scenarios
+from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.local_workers import train_here
 from uav_dc_ros.experiments.paper.setting import SCALES
@@ -155,7 +155,7 @@ def _make(folder: Path, options: argparse.Namespace) -> bool:
             f"{folder.parent} is half of a sweep with {kept.decode()}; expected the same --scale and --only, "
             "or another --out"
         )
-    cli.write_whole(folder / _PLAN_FILE, plan)
+    files.write(folder / _PLAN_FILE, plan)
     return any(folder.glob("*.safetensors"))
 
 

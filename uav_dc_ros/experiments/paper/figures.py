@@ -1,6 +1,5 @@
 """The paper's figures, drawn from the results."""
 
-import os
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from uav_dc_ros import files
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.bootstrap import interval
 from uav_dc_ros.env.render import PATH_COLOURS, Track, picture
@@ -68,12 +68,10 @@ def draw(figure: str, results: Results, tracks: Sequence[Track], path: Path) -> 
         raise TrainingError(f"figure {figure}: the results lack some of its runs")
     else:
         drawn = _panels(plan, results)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        FigureCanvasAgg(drawn).figure.savefig(partial, dpi=dpi, format="png")
-        partial.replace(path)
+        with files.replacing(path) as partial:
+            FigureCanvasAgg(drawn).figure.savefig(partial, dpi=dpi, format="png")
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise TrainingError(f"{path} cannot be written: {error.strerror or error}") from None
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from uav_dc_ros import cli
+from uav_dc_ros import files
 from uav_dc_ros.core.bootstrap import Interval
 from uav_dc_ros.env.render import Track
 from uav_dc_ros.experiments.paper.claims import Finding, check, count
@@ -38,9 +38,9 @@ def write(results: Results, tracks: Sequence[Track], folder: Path, only: Sequenc
         draw(name, results, tracks, folder / f"{name}.png")
     findings = check(results)
     drawn = [name for name in FIGURES if (folder / f"{name}.png").is_file()]
-    cli.write_whole(folder / CLAIMS_FILE, claims_md(results, findings, drawn).encode())
+    files.write(folder / CLAIMS_FILE, claims_md(results, findings, drawn).encode())
     verdicts = msgspec.json.format(msgspec.json.encode([_plain(one) for one in findings]), indent=2)
-    cli.write_whole(folder / VERDICTS_FILE, verdicts + b"\n")
+    files.write(folder / VERDICTS_FILE, verdicts + b"\n")
 
 
 def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str]) -> str:

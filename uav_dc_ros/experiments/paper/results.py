@@ -4,7 +4,6 @@ Two Parquet files: `runs.parquet`, a row for each run; `curves.parquet`, a row f
 curves. Each carries the metadata as JSON under the key `uav_dc_ros`.
 """
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import pyarrow as pa  # type: ignore[import-untyped]
 from pyarrow import parquet
 
-from uav_dc_ros import __version__
+from uav_dc_ros import __version__, files
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
@@ -238,14 +237,11 @@ def _check_arrays(
 
 
 def _write(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    table = pa.table(columns, schema=schema)
     try:
-        parquet.write_table(
-            pa.table(columns, schema=schema), partial, compression="zstd", write_page_checksum=True
-        )
-        partial.replace(path)
+        with files.replacing(path) as partial:
+            parquet.write_table(table, partial, compression="zstd", write_page_checksum=True)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise TrainingError(f"{path} cannot be written: {error.strerror or error}") from None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError
 
-from uav_dc_ros import cli, scenarios
+from uav_dc_ros import files, scenarios
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
@@ -124,7 +124,7 @@ def fly_tracks(networks: Trajectories, scale: Scale) -> list[Track]:
 def save_trajectories(networks: Trajectories, path: Path) -> None:
     """Writes the networks, each parameter as `ENVIRONMENT.NAME`."""
     arrays = {f"{e}.{name}": values for e, own in networks.items() for name, values in own.items()}
-    cli.write_whole(path, safetensors.numpy.save(arrays))
+    files.write(path, safetensors.numpy.save(arrays))
 
 
 def load_trajectories(path: Path, scale: Scale) -> Trajectories:
