@@ -11,6 +11,7 @@ from uav_dc_ros import __version__, cli
 from uav_dc_ros.errors import ParameterError
 
 PROG = "python -m uav_dc_ros.bag"
+DESCRIPTION = "Record, play, recover, verify and explain bags."
 # Module of each verb, with `add_options(parser)` and `run(options) -> exit status`, and what it does.
 VERBS = {
     "record": ("uav_dc_ros.nodes.record", "record topics into a new bag"),
@@ -30,17 +31,14 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command, and exit."""
     given = sys.argv[1:] if arguments is None else arguments
     wanted = given[0] if given else "--help"
-    if wanted == "--version":
-        print(__version__)
-        sys.exit(0)
-    if wanted in ("-h", "--help"):
-        print(f"usage: {PROG} VERB ...\n\n{__doc__.splitlines()[0]}\n")
-        for verb, (_, does) in VERBS.items():
-            print(f"  {verb:<8} {does}")
-        print(f"\n{PROG} VERB --help tells its options.")
-        sys.exit(0)
 
     def command() -> int:
+        if wanted == "--version":
+            print(__version__)
+            return 0
+        if wanted in ("-h", "--help"):
+            print(_help())
+            return 0
         if wanted not in VERBS:
             raise ParameterError(f"{wanted!r}; expected a verb: {', '.join(VERBS)}")
         module, does = VERBS[wanted]
@@ -50,6 +48,11 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         return int(verb.run(parser.parse_args(given[1:])))
 
     cli.run(command, f"{PROG} {wanted}" if wanted in VERBS else PROG)
+
+
+def _help() -> str:
+    verbs = "\n".join(f"  {verb:<8} {does}" for verb, (_, does) in VERBS.items())
+    return f"usage: {PROG} VERB ...\n\n{DESCRIPTION}\n\n{verbs}\n\n{PROG} VERB --help tells its options."
 
 
 if __name__ == "__main__":

@@ -138,9 +138,9 @@ def parser() -> cli.Parser:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command, and exit."""
-    options = parser().parse_args(arguments)
 
     def command() -> int:
+        options = parser().parse_args(arguments)
         from uav_dc_ros.nodes import environment, fastdds
 
         environment.prepare(alone=options.nodes is None)  # before ROS is imported

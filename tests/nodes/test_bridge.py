@@ -247,7 +247,6 @@ def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object,
     ("number", "wanted"),
     [
         (signal.SIGINT, 130),
-        pytest.param(signal.SIGHUP, 130, marks=pytest.mark.long),
         pytest.param(signal.SIGKILL, -9, marks=pytest.mark.long),
     ],
 )

@@ -79,9 +79,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write evaluations and comparisons")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
-    options = parser.parse_args(argv)
 
     def command() -> int:
+        options = parser.parse_args(argv)
         flights = _flights(options.policy, options.scenario)
         acts = [pilot.steer(scenario) for pilot, scenario in flights]
         if options.picture and len(flights) > 1:
@@ -103,9 +103,9 @@ def main(argv: list[str] | None = None) -> None:
             if one is not baseline:
                 comparisons.append(compare(one, baseline))
         report = Report(evaluations=[one.evaluation for one in flown], comparisons=comparisons)
-        show(report)
         if options.json:
             files.write(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
+        show(report)
         return 0
 
     cli.run(command, PROG)

@@ -49,8 +49,7 @@ _REWARD_OPTIONS = {"beta": "beta", "zeta": "zeta", "r_plus": "r_plus", "reward_f
 def main(argv: list[str] | None = None) -> None:
     """Runs the command line, and exits."""
     argv = sys.argv[1:] if argv is None else argv
-    options = options_parser().parse_args(argv)
-    cli.run(lambda: _train(options, f"{PROG} {shlex.join(argv)}"), PROG)
+    cli.run(lambda: _train(options_parser().parse_args(argv), f"{PROG} {shlex.join(argv)}"), PROG)
 
 
 def options_parser() -> cli.Parser:

@@ -41,6 +41,7 @@ supervisor       brings nodes up in order, starts dead ones again, takes them do
 launcher         a node, or several, as a child process
 observer         run_all's own eyes: the mission so far, and its summary
 display          what the user sees of it
+output           standard output and error, which can neither delay a mission nor end it
 
 Between them: convert (ROS messages and plain values), cdr (serialised messages, where speed matters).
 """

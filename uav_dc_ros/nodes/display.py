@@ -1,33 +1,24 @@
 """What run_all shows: a live line on a terminal, plain lines elsewhere, and the summary."""
 
-import os
 import sys
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console, JustifyMethod
+from rich.console import JustifyMethod
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission, Phase
 from uav_dc_ros.nodes.observer import MissionSoFar, Summary
+from uav_dc_ros.nodes.output import Output
 
 REFRESH_S = 0.05
 DAILY = (Phase.READY, Phase.MOVING)  # phases of each step
 NEWS = ("at the start", "holds", "goes on")  # of them
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
-
-
-class QuietConsole(Console):
-    """A console that falls silent when nobody reads it any more (`| head`): the mission flies on."""
-
-    def on_broken_pipe(self) -> None:
-        """Say nothing from now on."""
-        self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Display:
@@ -41,8 +32,10 @@ class Display:
     def __init__(self, scenario: Scenario, missions: int) -> None:
         self.scenario = scenario
         self.missions = missions
-        self.console = QuietConsole(highlight=False, soft_wrap=True)
-        self.errors = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._here = Path.cwd()  # by the end of the missions it may be deleted
+        self._output = Output()
+        self.console = self._output.console(sys.stdout)
+        self.errors = self._output.console(sys.stderr)
         self._every = max(1, scenario.mission.max_steps // PLAIN_LINES)
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -116,10 +109,11 @@ class Display:
             )
         self.console.print(table)
         if summaries and summaries[0].bag is not None:
-            bag, here = Path(summaries[0].bag), Path.cwd()
-            self.console.print(
-                f"bag: {bag.relative_to(here) if bag.is_relative_to(here) else bag}", markup=False
-            )
+            self.console.print(f"bag: {self._beside(Path(summaries[0].bag))}", markup=False)
+
+    def _beside(self, path: Path) -> Path:
+        """A path, short where it lies in the working directory."""
+        return path.relative_to(self._here) if path.is_relative_to(self._here) else path
 
     def __enter__(self) -> Self:
         """Start the live display."""
@@ -131,3 +125,4 @@ class Display:
     ) -> None:
         """Leave the terminal as it was."""
         self._bar.stop()
+        self._output.drain()

@@ -75,6 +75,7 @@ class Flight:
 
     def run(self) -> int:
         """Fly; returns the exit status of the command."""
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the terminal is gone: the mission goes on
         cli.on_stop(self._interrupt)
         status = 0
         remapped = ["--ros-args", "-r", f"__ns:={self.options.namespace}", "-r", "/clock:=clock"]

@@ -1,14 +1,14 @@
 """What play shows: a bar on a terminal, plain lines elsewhere."""
 
 import math
+import sys
 import time
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from uav_dc_ros.nodes.display import QuietConsole
+from uav_dc_ros.nodes.output import Output
 
 REFRESH_S = 0.1
 PLAIN_LINES = 6  # of progress in a pass through the bag, where there is no terminal
@@ -25,8 +25,9 @@ class PlayDisplay:
     """
 
     def __init__(self, begin_s: float, end_s: float) -> None:
-        self.console = QuietConsole(highlight=False, soft_wrap=True)
-        self._errors = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._output = Output()
+        self.console = self._output.console(sys.stdout)
+        self._errors = self._output.console(sys.stderr)
         self._begin_s, self._end_s = begin_s, end_s
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -86,6 +87,7 @@ class PlayDisplay:
     ) -> None:
         """Leave the terminal as it was."""
         self._bar.stop()
+        self._output.drain()
 
 
 def text_of(rate: float) -> str:

@@ -53,8 +53,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--resume", action="store_true", help="go on with what is in --out; draw again what is finished")
     add("--workers", default=_cores(), type=cli.count, metavar="N", help="processes, each on one core")
     add("--ray", metavar="ADDRESS", help="train on this Ray cluster instead, such as HOST:6379")
-    options = parser.parse_args(argv)
-    cli.run(lambda: _paper(options, f"{PROG} {shlex.join(argv)}".strip()), PROG)
+    cli.run(lambda: _paper(parser.parse_args(argv), f"{PROG} {shlex.join(argv)}".strip()), PROG)
 
 
 def _paper(options: argparse.Namespace, command: str) -> int:
