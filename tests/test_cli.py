@@ -1,5 +1,6 @@
 """What all commands share: mistakes are one line and status 2, whatever the output and the folder are."""
 
+import json
 import os
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from typing import Any
 import pytest
 
 from tests.conftest import ROOT
+from tests.recordings import report_bags
+from uav_dc_ros import scenarios
 
 COMMANDS = (
     ("run_all", "--help"),
@@ -142,3 +145,14 @@ def test_any_name_can_be_printed(tmp_path: Path, env: dict[str, str]) -> None:
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert ("b\\udcc3\\udca4g\\udcff" if env else "bäg\\udcff") in err
+
+
+@pytest.mark.parametrize("env", [ASCII, {}], ids=["ASCII", "UTF-8"])
+def test_a_bag_may_have_any_name(tmp_path: Path, env: dict[str, str]) -> None:
+    name = os.fsdecode(b"b\xc3\xa4g\xff")
+    report_bags.write(tmp_path / name, scenarios.load("three_clusters"), steps=3)
+    for verb in (("info", "--json", "info.json"), ("verify",), ("report", "--out", "page.html")):
+        status, _, err = run("-m", "uav_dc_ros.bag", verb[0], name, *verb[1:], env=env, cwd=tmp_path)
+        assert (status, err) == (0, ""), verb
+    told = json.loads((tmp_path / "info.json").read_bytes())["path"]
+    assert told == ("b\\udcc3\\udca4g\\udcff" if env else "bäg\\udcff")

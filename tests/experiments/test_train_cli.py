@@ -144,7 +144,11 @@ def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
         (["--beta", "-1"], "reward.beta = -1.0; expected float >= 0"),
         (["--device", "abacus"], "--device is 'abacus'"),
         (["--learning-rate", "inf"], "--learning-rate is inf; expected float <= 1"),
-        (["--out", "a policy"], "--out is 'a policy'; expected str matching"),
+        (
+            ["--out", "a policy"],
+            "--out a policy: 'a policy' is no name of a policy; expected at most 64 letters",
+        ),
+        (["--out", "x/größe"], "--out x/größe: 'größe' is no name of a policy; expected at most 64 letters"),
         (["--out", "/proc/made"], "/proc/made.checkpoints cannot be made"),
         (["--overwrite"], "--overwrite"),
         (["--tensorboard", "/proc/made"], "--tensorboard /proc/made cannot be written"),
@@ -229,7 +233,7 @@ LEARNS = {
 MOMENTS = {
     "never": (None, [10, 20, 30]),
     "before the first state": (("os.fsync", 1, "before"), [10, 20, 30]),
-    "before a state takes its name": (("pathlib.Path.replace", 2, "before"), [20, 30]),
+    "before a state takes its name": (("pathlib.Path.replace", 4, "before"), [20, 30]),  # policy, state
     "in the midst of writing a best policy": (("uav_dc_ros.agents.policy.load", 2, "before"), [20, 30]),
     "between a best policy and its state": (
         ("uav_dc_ros.experiments.train_cli._save_best", 2, "after"),

@@ -1,5 +1,6 @@
 """run_all's options: what a newcomer gets wrong is one clear line, status 2, and nothing written."""
 
+import os
 import shutil
 import signal
 from pathlib import Path
@@ -43,6 +44,10 @@ def refused(ros: Ros, *arguments: object) -> str:
             "missions: 3000000 of 60 steps of 15 s are 2.745e+09 s; expected less than",
         ),
         (("--bag", "/dev/null/bag"), "--bag /dev/null/bag: /dev/null is not a folder that can be written"),
+        (
+            ("--bag", os.fsdecode(b"\xff")),
+            "\\udcff: a ROS parameter cannot hold this path; expected one in UTF-8",
+        ),
         (("--bag", "x", "--summary", "x"), "--summary x: it is the folder of the bag; expected another path"),
         (("--pace", "nan"), "argument --pace: 'nan'; expected 'lockstep' or a number above 0"),
         (("--pace", "fast"), "argument --pace: 'fast'; expected 'lockstep' or a number above 0"),

@@ -74,6 +74,28 @@ def test_windows_line_ends_and_whole_numbers_for_real_ones(tmp_path):
     assert isinstance(scenario.grid.cell_m, float)
 
 
+def test_a_cluster_is_in_reach_while_a_cell_reaches_its_disc(refused, tmp_path):
+    """75 m beyond the last cell and 100 m down are 125 m."""
+    changed = {"users": VALUES["users"] | {"cluster_radius_m": 10.0}, "mission": VALUES["mission"]}
+    grid = VALUES["grid"]
+    edge_m = (grid["n_x"] - 1) * grid["cell_m"]
+    changed["grid"] = grid | {"altitude_min_m": 100.0}
+    changed["mission"] |= {"d_cons_m": 125.0}
+    for x_m, ok in ((edge_m + 85.0, True), (edge_m + 85.1, False)):
+        changed["users"] |= {"cluster_centres_m": [[x_m, 0.0]]}
+        if ok:
+            from_values(VALUES | changed, "test")
+        else:
+            with pytest.raises(ScenarioError, match=r"cluster_centres_m\[0\].* is 125\.1 m away"):
+                from_values(VALUES | changed, "test")
+
+
+def test_a_byte_order_mark_is_no_part_of_the_scenario(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(TEXT, "utf-8-sig")  # as Windows editors write it
+    assert scenarios.load(path) == scenarios.load("three_clusters")
+
+
 @pytest.mark.parametrize(
     ("key", "line", "message"),
     [
@@ -131,9 +153,9 @@ def test_windows_line_ends_and_whole_numbers_for_real_ones(tmp_path):
         ("beta", "beta = -1.0", "reward.beta = -1.0; expected float >= 0.0"),
         ("zeta", "zeta = -1.0", "reward.zeta = -1.0; expected float >= 0.0"),
         ("data_scale_bits", "data_scale_bits = 0.0", "reward.data_scale_bits = 0.0; expected float > 0.0"),
-        ("name", 'name = "Mine"', "name = 'Mine'; expected str matching regex"),
-        ("name", 'name = "a/../b"', "name = 'a/../b'; expected str matching regex"),
-        ("name", 'name = "a\\n"', "name = 'a\\n'; expected str matching regex"),
+        ("name", 'name = "Mine"', "name = 'Mine'; expected a lower-case letter (a to z), then"),
+        ("name", 'name = "a/../b"', "name = 'a/../b'; expected a lower-case letter (a to z), then"),
+        ("name", 'name = "a\\n"', "name = 'a\\n'; expected a lower-case letter (a to z), then"),
         # Choices.
         (
             "interference",
@@ -188,6 +210,11 @@ def test_windows_line_ends_and_whole_numbers_for_real_ones(tmp_path):
             "d_cons_m = 99.0",
             "mission.d_cons_m = 99; expected at least grid.altitude_min_m = 100, "
             "or nobody can ever be served",
+        ),
+        (
+            "cluster_centres_m",
+            "cluster_centres_m = [[100.0, 100.0], [0.0, 2000.0], [50.0, 50.0]]",
+            "users.cluster_centres_m[1] = [0.0, 2000.0]: from the nearest cell its disc is ",
         ),
     ],
     ids=lambda value: value if isinstance(value, str) and "=" in value and ";" not in value else "",

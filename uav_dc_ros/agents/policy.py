@@ -26,6 +26,8 @@ from uav_dc_ros.env import observations
 from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import PolicyError, ScenarioError
 
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z"
+NAME_IN_WORDS = "at most 64 letters (a to z, A to Z), digits, '_', '.' and '-', a letter or digit first"
 CONFIG, MODEL, CARD = "config.json", "model.safetensors", "README.md"
 # Pictures for people, which nothing reads: how it learnt, and one of its missions.
 LEARNING_CURVE, TRAJECTORY = "learning_curve.png", "trajectory.png"
@@ -78,7 +80,7 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """
 
     format: Literal[1] = 1
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    name: Annotated[str, Meta(pattern=NAME)]
     algorithm: Algorithm
     aggregation: network.Aggregation = "mean"
     observation: Observation

@@ -31,6 +31,10 @@ Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 
 
+_NAME = r"^[a-z][a-z0-9_]{0,63}\Z"
+_NAME_IN_WORDS = "a lower-case letter (a to z), then at most 63 of a to z, 0 to 9 and '_'"
+
+
 class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table of the scenario file: unknown keys are errors."""
 
@@ -125,7 +129,7 @@ class Reward(_Section, frozen=True):
 class Scenario(_Section, frozen=True, dict=True):
     """Every value of a world. `U` below is the number of users, M K."""
 
-    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,63}\Z")]
+    name: Annotated[str, Meta(pattern=_NAME)]
     grid: Grid
     users: Users
     mission: Mission
@@ -197,7 +201,7 @@ def parse(text: str, source: str) -> Scenario:
             do not fit together.
     """
     try:
-        values = tomllib.loads(text)
+        values = tomllib.loads(text.removeprefix("\ufeff"))  # the mark that Windows editors write first
     except (ValueError, RecursionError) as error:
         # ValueError: bad TOML, but also an integer of more digits than Python reads.
         raise ScenarioError(f"{source}: not a TOML file: {error}") from None
@@ -252,6 +256,8 @@ def _explain(message: str, values: Any) -> str:
         return f"missing {'table' if _is_table(kind) else 'key'} {key}"
     if expected.startswith("Invalid enum value"):
         expected = f"one of {', '.join(get_args(kind))}"
+    elif "matching regex" in expected:
+        expected = _NAME_IN_WORDS  # the only pattern of a scenario
     elif expected == "Number out of range":
         expected = "a finite number"
     expected = expected.replace("`", "").removeprefix("Expected ").replace("object", "table")
@@ -303,3 +309,22 @@ def _check_together(scenario: Scenario, source: str) -> None:
             f"{source}: mission.d_cons_m = {mission.d_cons_m:g}; expected at least "
             f"grid.altitude_min_m = {grid.altitude_min_m:g}, or nobody can ever be served"
         )
+    for i, centre_m in enumerate(scenario.users.cluster_centres_m):
+        away_m = _least_distance_m(centre_m, scenario)
+        if away_m > mission.d_cons_m:
+            raise ScenarioError(
+                f"{source}: users.cluster_centres_m[{i}] = {list(centre_m)}: from the nearest cell its disc "
+                f"is {away_m:.1f} m away; expected at most mission.d_cons_m = {mission.d_cons_m:g}, or its "
+                "users are out of reach"
+            )
+
+
+def _least_distance_m(centre_m: tuple[float, float], scenario: Scenario) -> float:
+    """Distance between the disc of a cluster and the cell nearest to it, metres."""
+    grid = scenario.grid
+    cell_m = [
+        min(max(round(at_m / grid.cell_m), 0), n - 1) * grid.cell_m
+        for at_m, n in zip(centre_m, (grid.n_x, grid.n_y), strict=True)
+    ]
+    level_m = max(0.0, math.dist(centre_m, cell_m) - scenario.users.cluster_radius_m)
+    return math.hypot(level_m, grid.altitude_min_m)

@@ -281,8 +281,12 @@ def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
         # Such as: Expected `float` <= 1.0 - at `$.hyperparameters.gamma`
         expected, _, path = str(error).replace("`", "").replace("Expected", "expected").partition(" - at $.")
         key = path.split(".")[-1].split("[")[0]
-        option, value = ("out", options.out.name) if key == "name" else (key, getattr(options, key))
-        raise TrainingError(f"{_option(option)} is {value!r}; {expected}") from None
+        if key == "name":
+            raise TrainingError(
+                f"--out {options.out}: {options.out.name!r} is no name of a policy; expected "
+                f"{policy.NAME_IN_WORDS}"
+            ) from None
+        raise TrainingError(f"{_option(key)} is {getattr(options, key)!r}; {expected}") from None
 
 
 def _option(key: str) -> str:

@@ -158,6 +158,12 @@ def new_bag(wanted: Path | None) -> Path:
             f"--bag {wanted}: it exists already, and no bag is ever overwritten; expected a new folder"
         )
     wanted = wanted.absolute()
+    try:
+        str(wanted).encode()
+    except UnicodeEncodeError:
+        raise BagError(
+            f"--bag {wanted}: a ROS parameter cannot hold this path; expected one in UTF-8"
+        ) from None
     above = next(parent for parent in wanted.parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
         raise BagError(f"--bag {wanted}: {above} is not a folder that can be written; expected one")
