@@ -131,7 +131,12 @@ def parser() -> cli.Parser:
         metavar="PORT",
         help="serve the mission to Foxglove over WebSocket (default port: %(const)s)",
     )
-    options.add_argument("--summary", type=Path, metavar="FILE", help="write the summary as JSON")
+    options.add_argument(
+        "--summary",
+        type=Path,
+        metavar="FILE",
+        help="write the summary as JSON; into /dev/stdout, a FIFO or a device, too",
+    )
     options.add_argument("--version", action="version", version=__version__)
     return options
 

@@ -6,7 +6,6 @@ import os
 import select
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -90,6 +89,7 @@ def main(
         arguments: ROS arguments; those of the command line, which may have no others, unless given.
         gives_way: see `give_way`.
     """
+    cli.open_streams()
     if arguments is None:
         arguments = usage.ros_arguments(makes[0].__doc__ or "")
     if gives_way:
@@ -129,8 +129,7 @@ def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> 
             status = _run(nodes, executor, stopper)
         stopper.close()
     except UavDcError as error:
-        print(f"error: {error}", file=sys.stderr)
-    sys.stderr.flush()
+        cli.complain(f"error: {error}")
     for node in nodes:
         node.destroy_node()
     return status
