@@ -80,9 +80,19 @@ def test_a_fifo_passes_the_content_on(tmp_path: Path) -> None:
     path = tmp_path / "fifo"
     os.mkfifo(path)
     files.refuse_unwritable(path)
+    with pytest.raises(UavDcError, match="fifo cannot be written: No such device or address"):
+        files.write(path, b"nobody reads it")
     for large in (False, True):
         read: list[bytes] = []
-        reader = threading.Thread(target=lambda into=read: into.append(path.read_bytes()))
+        opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        os.set_blocking(opened, True)
+
+        def all_of(descriptor: int = opened, into: list[bytes] = read) -> None:
+            with os.fdopen(descriptor, "rb") as file:
+                while not into:  # until the writer has come
+                    into.extend(filter(None, [file.read()]))
+
+        reader = threading.Thread(target=all_of)
         reader.start()
         if large:
             with files.replacing(path) as partial:

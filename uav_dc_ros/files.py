@@ -1,8 +1,7 @@
 """Output files: whole or not at all, durable, and never in place of a device or a link.
 
 A regular file is replaced in one move. Of a symbolic link, its target is replaced. A device, a FIFO and a
-descriptor of this process (`/dev/stdout`, `/dev/fd/3`) are written into, as by a shell: opening a FIFO waits
-for its reader.
+descriptor of this process (`/dev/stdout`, `/dev/fd/3`) are written into; a FIFO must have its reader by then.
 """
 
 import contextlib
@@ -140,7 +139,10 @@ def _opened(path: Path) -> BinaryIO:
     """What is no regular file, to write into."""
     descriptor = _descriptor(path)
     if descriptor is None:
-        return path.open("wb")
+        # With O_NONBLOCK a FIFO that nobody reads is an error (ENXIO), and not waited for without end.
+        opened = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+        os.set_blocking(opened, True)
+        return os.fdopen(opened, "wb")
     sys.stdout.flush()  # what was printed before comes before
     return os.fdopen(os.dup(descriptor), "wb")
 
