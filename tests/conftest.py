@@ -1,6 +1,7 @@
 """What tests share: a ROS domain of their own, processes that are all gone afterwards, small worlds."""
 
 import fcntl
+import functools
 import json
 import os
 import shutil
@@ -20,6 +21,12 @@ from uav_dc_ros.errors import MessageError
 
 MARK = "UAV_DC_TEST"
 ROOT = Path(__file__).parents[1]
+# How long a test waits for what must come, wall time. Only what never comes takes this long: a machine with
+# much else to do may take twenty times as long as a calm one.
+PATIENCE_S = 90.0
+
+# A shell without job control, such as that of a script, ignores Ctrl-C for what it starts in the background.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Ros:
@@ -73,12 +80,30 @@ class Ros:
         probe.communicate()
         return run
 
-    def run(self, module: str, *arguments: object, timeout_s: float = 90.0) -> tuple[int, str]:
+    def run(self, module: str, *arguments: object, timeout_s: float = PATIENCE_S) -> tuple[int, str]:
         """Run it to its end; the exit status and what it printed."""
         process = self.start(module, *arguments)
         return finish(process, timeout_s)
 
-    def run_all(self, *arguments: object, timeout_s: float = 90.0) -> tuple[int, str]:
+    def run_fork(self, module: str, *arguments: object) -> tuple[int, str]:
+        """As `run`, for what ends at once: in a fork of a process that has imported this project already."""
+        output = self.folder.with_name(f"{self.folder.name}.output")
+        output.write_text("")
+        order = {
+            "module": module,
+            "arguments": [str(argument) for argument in arguments],
+            "environment": self.environment,
+            "folder": str(self.folder),
+            "output": str(output),
+        }
+        forks = _forks()
+        assert forks.stdin is not None
+        assert forks.stdout is not None
+        forks.stdin.write(json.dumps(order) + "\n")
+        forks.stdin.flush()
+        return int(forks.stdout.readline()), output.read_text()
+
+    def run_all(self, *arguments: object, timeout_s: float = PATIENCE_S) -> tuple[int, str]:
         """Run run_all to its end."""
         return self.run("uav_dc_ros.run_all", *arguments, timeout_s=timeout_s)
 
@@ -98,7 +123,7 @@ class Ros:
 
     def node(self, name: str) -> int:
         """Process id of a node that runs, by name."""
-        deadline_s = time.monotonic() + 30.0
+        deadline_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline_s:
             for process_id, command in self.processes().items():
                 if f"uav_dc_ros.nodes.{name} " in command:
@@ -106,7 +131,7 @@ class Ros:
             time.sleep(0.02)
         raise AssertionError(f"node {name} did not start")
 
-    def gone(self, within_s: float = 10.0) -> bool:
+    def gone(self, within_s: float = PATIENCE_S) -> bool:
         """Wait for the end of this test's processes; have they all ended."""
         deadline_s = time.monotonic() + within_s
         while self.processes() and time.monotonic() < deadline_s:
@@ -114,7 +139,14 @@ class Ros:
         return not self.processes()
 
 
-def finish(process: subprocess.Popen[str], timeout_s: float = 90.0) -> tuple[int, str]:
+@functools.cache
+def _forks() -> subprocess.Popen[str]:
+    """The process that forks (tests/forks.py); it ends with this one."""
+    command = [sys.executable, "-m", "tests.forks"]
+    return subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str], timeout_s: float = PATIENCE_S) -> tuple[int, str]:
     """Wait for a process; its exit status and what it printed."""
     try:
         output, _ = process.communicate(timeout=timeout_s)
@@ -131,6 +163,14 @@ def outcome(act: Callable[[], Any]) -> Any:
         return act()
     except MessageError as refused:
         return refused
+
+
+def until(condition: Callable[[], Any], patience_s: float = PATIENCE_S) -> None:
+    """Wait until something is so."""
+    deadline_s = time.monotonic() + patience_s
+    while not condition():
+        assert time.monotonic() < deadline_s, f"not so within {patience_s} s"
+        time.sleep(0.02)
 
 
 def wait_for(stream: IO[str], text: str) -> str:
@@ -209,13 +249,15 @@ def but_run(payload: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in payload.items() if name != "run"}
 
 
-def read_bag(folder: Path) -> list[tuple[str, Any]]:
-    """Topic and content of each message of a bag, in its order; JSON payloads decoded."""
+def read_bag(folder: Path, *topics: str) -> list[tuple[str, Any]]:
+    """Topic and content of each message of a bag, or of some of its topics, in its order; JSON decoded."""
     from rosbags.highlevel import AnyReader
 
     read = []
     with AnyReader([folder]) as reader:
         for connection, _, data in reader.messages():
+            if topics and connection.topic not in topics:
+                continue
             message = reader.deserialize(data, connection.msgtype)
             is_json = connection.msgtype == "std_msgs/msg/String"
             read.append((connection.topic, json.loads(message.data) if is_json else message))

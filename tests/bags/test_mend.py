@@ -96,11 +96,12 @@ def in_memory() -> Iterator[Path]:
         yield Path(folder)
 
 
+@pytest.mark.parametrize("each", [5, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", ["zstd", "uncompressed", "without chunks"])
 def test_a_file_cut_at_any_byte_keeps_all_that_is_there_in_full(
-    in_memory: Path, quick: None, kind: str
+    in_memory: Path, quick: None, kind: str, each: int
 ) -> None:
-    """All cuts of a file are the parts of one bag, mended in one go; each is then read by itself."""
+    """All cuts of a file, or every fifth, are the parts of one bag, mended in one go; each is then read."""
     tmp_path = in_memory
     file = made(kind, n=12, qos="")  # short
     (tmp_path / "whole.mcap").write_bytes(file)
@@ -108,12 +109,13 @@ def test_a_file_cut_at_any_byte_keeps_all_that_is_there_in_full(
     ends = ends_of_messages(file)
     assert len(messages) == 12
     assert len(set(ends)) >= 4  # several chunks, or messages that lie open to see
-    bag = folder_of(tmp_path / "bag", *(file[:cut] for cut in range(len(file) + 1)))
+    cuts = [*range(0, len(file), each), len(file)]
+    bag = folder_of(tmp_path / "bag", *(file[:cut] for cut in cuts))
     mended = mend(bag)
-    assert len(mended.parts) == len(file) + 1
+    assert len(mended.parts) == len(cuts)
     assert mended.mended == mended.parts[:-1]  # all but the last, which is not cut
     total = 0
-    for cut, name in enumerate(mended.parts):
+    for cut, name in zip(cuts, mended.parts, strict=True):
         expected = messages[: sum(end <= cut for end in ends)]
         assert in_mcap(bag / name) == expected, f"cut at {cut} of {len(file)}"
         total += len(expected)

@@ -1,6 +1,7 @@
 """The paper's claims on made-up results: each can come true, and each can fail."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -187,9 +188,12 @@ def test_environments_that_disagree_decide_nothing(claim):
     assert found.verdict == "undecided", found.weighed.parts
 
 
+once = functools.cache(realistic)
+
+
 def decided_by(figure):
     """Claims that the runs of one figure decide."""
-    full = realistic(SMOKE)
+    full = once(SMOKE)
     wanted = set(runs(SMOKE, [figure]))
     kept = [i for i, run in enumerate(full.planned) if run in wanted]
     some = dataclasses.replace(
@@ -207,7 +211,7 @@ def test_runs_that_were_not_made_leave_claims_untested():
 
 @pytest.mark.parametrize("scale", [FULL, SMOKE], ids=["full", "smoke"])
 def test_every_claim_can_be_weighed(scale):
-    for one in check(realistic(scale)):
+    for one in check(once(scale)):
         assert one.verdict != "not tested"
         assert all(np.isfinite(part.effect).all() for part in (*one.weighed.parts, *one.weighed.beside))
         assert any(table.rows for table in one.weighed.tables)

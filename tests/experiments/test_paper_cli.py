@@ -28,19 +28,34 @@ def assert_equal(one, other):
         np.testing.assert_array_equal(values, other.greedy[name], err_msg=name)
 
 
+SOME = ("Traj", "lr")  # greedy missions, and curves
+ONLY = ("--only", *SOME)
+
+
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper") / "results"
-    done = paper("--out", folder)
+    done = paper("--out", folder, *ONLY)
     assert done.returncode == 0, done.stderr
     assert str(folder / "claims.md") in done.stdout
     return folder
 
 
-def test_smoke_makes_all_of_it(smoke):
+def test_smoke_makes_what_is_asked_for(smoke):
+    check_made(smoke, SOME)
+
+
+@pytest.mark.long
+def test_smoke_makes_all_of_it(tmp_path):
+    done = paper("--out", tmp_path / "all")
+    assert done.returncode == 0, done.stderr
+    check_made(tmp_path / "all", FIGURES)
+
+
+def check_made(smoke, figures):
     names = {path.name for path in smoke.iterdir()}
     pictures = {name for name in names if name.endswith(".png")}
-    assert pictures == {f"{figure}.png" for figure in FIGURES}
+    assert pictures == {f"{figure}.png" for figure in figures}
     assert {"claims.md", "runs.parquet", "curves.parquet", "trajectories.safetensors"} <= names
     assert "shards" not in names, "what only a resumed sweep needs"
     assert all((smoke / name).stat().st_size > 10_000 for name in pictures)
@@ -51,7 +66,7 @@ def test_smoke_makes_all_of_it(smoke):
 @pytest.mark.long
 def test_the_same_seeds_give_the_same_curves(smoke, tmp_path):
     """Whatever the number of workers."""
-    done = paper("--out", tmp_path / "again", "--workers", 1)
+    done = paper("--out", tmp_path / "again", "--workers", 1, *ONLY)
     assert done.returncode == 0, done.stderr
     assert_equal(Results.load(smoke), Results.load(tmp_path / "again"))
 

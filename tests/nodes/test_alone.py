@@ -114,7 +114,7 @@ def test_a_parameter_that_makes_no_sense_is_one_line_and_status_2(
 ) -> None:
     given = [f"{name}:={json.dumps(value)}" for name, value in parameters.items()]
     arguments = [argument for text in given for argument in ("-p", text)]
-    status, output = ros.run(f"uav_dc_ros.nodes.{node}", "--ros-args", *arguments)
+    status, output = ros.run_fork(f"uav_dc_ros.nodes.{node}", "--ros-args", *arguments)
     assert status == 2, output
     assert len(output.splitlines()) == 1, output
     assert output.startswith(("error: ", "[ERROR] "))  # a value, or what was found when it was loaded
@@ -122,7 +122,7 @@ def test_a_parameter_that_makes_no_sense_is_one_line_and_status_2(
 
 
 def test_help_tells_the_parameters(ros: Ros) -> None:
-    status, output = ros.run("uav_dc_ros.nodes.world", "--help")
+    status, output = ros.run_fork("uav_dc_ros.nodes.world", "--help")
     assert status == 0, output
     assert output.startswith("usage: python -m uav_dc_ros.nodes.world [-h] [--ros-args -p PARAMETER:=VALUE")
     for row in (*NODES["world"].parameters, *EVERY):

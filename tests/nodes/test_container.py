@@ -47,7 +47,7 @@ def flying(ros: Ros, *options: object) -> tuple[subprocess.Popen[str], set[str]]
 @pytest.mark.parametrize(
     ("options", "shares"),
     [
-        (("--pace", 100), False),
+        pytest.param(("--pace", 100), False, marks=pytest.mark.long),
         (("--pace", "lockstep", "--missions", 200), True),
         pytest.param(("--pace", 100, "--compose"), True, marks=pytest.mark.long),
         pytest.param(
@@ -90,14 +90,18 @@ def test_composing_what_cannot_be_composed(ros: Ros) -> None:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ((), "the following arguments are required: NODE"),
+        pytest.param((), "the following arguments are required: NODE", marks=pytest.mark.long),
         (("recorder",), "argument NODE: invalid choice: 'recorder' (choose from "),
-        (("world", "policy", "--ros-args", "-p"), "expected ROS arguments after --ros-args"),
+        pytest.param(
+            ("world", "policy", "--ros-args", "-p"),
+            "expected ROS arguments after --ros-args",
+            marks=pytest.mark.long,
+        ),
         (("world", "policy", "--ros-args", "-p", "seed:=1"), "seed: no such parameter of node policy"),
     ],
 )
 def test_mistakes(ros: Ros, given: tuple[str, ...], told: str) -> None:
-    status, output = ros.run("uav_dc_ros.nodes.container", *given)
+    status, output = ros.run_fork("uav_dc_ros.nodes.container", *given)
     assert status == 2, output
     assert told in output
     assert "Traceback" not in output
@@ -142,7 +146,7 @@ def test_one_node_that_cannot_begin_lets_none_begin(ros: Ros, small_policy: Path
         policy={"scenario": "three_clusters", "policy": str(small_policy)},
     )
     given = ("--ros-args", "--params-file", file)
-    status, output = ros.run("uav_dc_ros.nodes.container", *COMPOSED, *given)
+    status, output = ros.run_fork("uav_dc_ros.nodes.container", *COMPOSED, *given)
     assert status == 2, output
     assert "[policy]: policy " in output
     assert "Traceback" not in output

@@ -21,6 +21,7 @@ FLYING = "mission: step 5/30"
 def arguments(small_scenario: Path, small_policy: Path, tmp_path: Path) -> list[object]:
     """A mission of twelve seconds, which no test waits for."""
     return [
+        *("--nodes", "world,channel_monitor,policy,recorder"),
         *("--scenario", small_scenario, "--policy", small_policy, "--pace", 25),
         *("--bag", tmp_path / "bag", "--summary", tmp_path / "summary.json"),
     ]
@@ -166,7 +167,7 @@ def test_a_lockstep_waits_for_who_is_held_up(
     ros: Ros, arguments: list[object], tmp_path: Path, who: str
 ) -> None:
     """Stopped for as long as it takes to fly more steps than messages are kept."""
-    missions = 120
+    missions = 50
     process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", "lockstep", "--missions", missions)
     assert process.stdout is not None
     wait_for(process.stdout, "mission 5 of")

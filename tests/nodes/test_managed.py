@@ -197,7 +197,7 @@ def test_every_parameter_is_described_with_unit_and_range(ros: Ros, asker: Asker
     ],
 )
 def test_a_parameter_that_no_node_has(ros: Ros, arguments: tuple[str, ...], told: str) -> None:
-    status, output = ros.run("uav_dc_ros.nodes.world", "--ros-args", *arguments)
+    status, output = ros.run_fork("uav_dc_ros.nodes.world", "--ros-args", *arguments)
     assert status == 2, output
     assert told in output
     assert "Traceback" not in output

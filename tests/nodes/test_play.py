@@ -7,7 +7,6 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from tests.bags.made import STRING, TYPES, text
-from tests.conftest import Ros, each_once, finish, read_bag
+from tests.conftest import PATIENCE_S, Ros, each_once, finish, read_bag, until
 from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.write import BagWriter
@@ -71,17 +70,9 @@ def heard_so_far(process: "subprocess.Popen[str]") -> int:
     return int(process.stdout.readline())
 
 
-def until(there: Callable[[], Any], within_s: float = 15.0) -> None:
-    """Wait for something."""
-    deadline_s = time.monotonic() + within_s
-    while not there():
-        assert time.monotonic() < deadline_s, "it did not happen"
-        time.sleep(0.02)
-
-
 def raw(process: "subprocess.Popen[str]") -> list[tuple[str, bytes, int, int]]:
     """End a listener; all that it heard, serialised, in the order of receipt."""
-    told, _ = process.communicate(timeout=60)
+    told, _ = process.communicate(timeout=PATIENCE_S)
     return [(topic, base64.b64decode(data), a, b) for topic, data, a, b in json.loads(told.splitlines()[-1])]
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Ros
+from tests.conftest import Ros, until
 from tests.nodes.test_play import (
     LATCHED,
     VOLATILE,
@@ -25,7 +25,6 @@ from tests.nodes.test_play import (
     listener,
     made,
     numbers,
-    until,
 )
 
 # A shell that starts a command in its foreground or background, and waits for its end.

@@ -258,7 +258,7 @@ def test_recording_stops_before_the_disk_is_full(ros: Ros) -> None:
     ],
 )
 def test_mistakes_are_one_line(ros: Ros, options: tuple[str, ...], told: str) -> None:
-    status, output = ros.run("uav_dc_ros.bag", "record", "--out", ros.folder / "bag", *options)
+    status, output = ros.run_fork("uav_dc_ros.bag", "record", "--out", ros.folder / "bag", *options)
     assert status == 2, output
     assert told in output
     assert "Traceback" not in output

@@ -2,44 +2,68 @@
 
 import json
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, but_run, finish, read_bag, wait_for
+from tests.conftest import Ros, each_once, finish, read_bag, ros_in, wait_for
+from tests.nodes.conftest import SMALL
+from tests.small_worlds import saved
+from uav_dc_ros import scenarios
 from uav_dc_ros.topics import TOPICS
 
+NODES = "world,channel_monitor,policy,recorder"
 COMPARED = ("users", "rates", "mission", "move")
+SEEDS = (1, 2, 3)
 
 
-@pytest.fixture
-def options(small_scenario: Path, small_policy: Path) -> list[object]:
-    """A small mission in lockstep."""
-    return ["--scenario", small_scenario, "--policy", small_policy, "--pace", "lockstep"]
+@dataclass
+class Small:
+    """Options of a small mission in lockstep, and for each seed what is told of it when it is alone."""
+
+    scenario: Path
+    policy: Path
+    options: list[object]
+    alone: dict[int, dict[str, list[Any]]]
 
 
-def payloads(bag: Path, namespace: str = "") -> dict[str, list[Any]]:
-    """Payloads of a bag by topic."""
-    messages = read_bag(bag)
-    return {
-        topic: [but_run(m) for name, m in messages if name == f"{namespace}/{topic}"] for topic in COMPARED
-    }
-
-
-def test_two_missions_in_two_namespaces_do_not_touch(ros: Ros, options: list[object]) -> None:
-    alone = {}
-    for seed in (1, 2):
-        status, output = ros.run_all(*options, "--seed", seed, "--bag", ros.folder / f"alone{seed}")
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Small]:
+    """The missions of all seeds are flown alone, one after another."""
+    folder = tmp_path_factory.mktemp("alone")
+    scenario = folder / "small.toml"
+    scenario.write_text(SMALL)
+    policy = saved(folder / "untrained", scenarios.load(scenario), name="untrained")
+    options = ["--scenario", scenario, "--policy", policy, "--pace", "lockstep"]
+    for ros in ros_in(folder):
+        given = ("--nodes", NODES, "--seed", SEEDS[0], "--missions", len(SEEDS), "--bag", "bag")
+        status, output = ros.run_all(*options, *given)
         assert status == 0, output
-        alone[seed] = payloads(ros.folder / f"alone{seed}")
-    assert alone[1] != alone[2]
-    given = (*options, "--missions", 1)
+        alone = {seed: payloads(folder / "bag", mission=i) for i, seed in enumerate(SEEDS)}
+        yield Small(scenario, policy, options, alone)
+
+
+def payloads(bag: Path, namespace: str = "", mission: int = 0) -> dict[str, list[Any]]:
+    """Payloads of a mission by topic, without what depends on the missions before it."""
+    names = [f"{namespace}/{topic}" for topic in COMPARED]
+    told: dict[str, list[Any]] = {topic: [] for topic in COMPARED}
+    for name, payload in read_bag(bag, *names):
+        if payload["mission"] == mission:
+            payload = {key: payload[key] for key in payload if key not in ("run", "mission", "stamp_ns")}
+            told[name.rsplit("/", 1)[1]].append(payload)
+    return {topic: each_once(each) for topic, each in told.items()}
+
+
+def test_two_missions_in_two_namespaces_do_not_touch(ros: Ros, small: Small) -> None:
+    assert small.alone[1] != small.alone[2]
     flights = [
         ros.start(
             "uav_dc_ros.run_all",
-            *given,
-            *("--seed", seed, "--namespace", f"/fleet/uav{seed}", "--bag", ros.folder / f"side{seed}"),
+            *(*small.options, "--nodes", NODES, "--seed", seed),
+            *("--namespace", f"/fleet/uav{seed}", "--bag", ros.folder / f"side{seed}"),
         )
         for seed in (1, 2)
     ]
@@ -47,77 +71,67 @@ def test_two_missions_in_two_namespaces_do_not_touch(ros: Ros, options: list[obj
         status, output = finish(flight)
         assert status == 0, output
     for seed in (1, 2):
-        assert payloads(ros.folder / f"side{seed}", f"/fleet/uav{seed}") == alone[seed]
+        assert payloads(ros.folder / f"side{seed}", f"/fleet/uav{seed}") == small.alone[seed]
         names = {name for name, _ in read_bag(ros.folder / f"side{seed}")}
         assert all(name.startswith(f"/fleet/uav{seed}/") for name in names)
 
 
-def test_one_mission_on_two_hosts(ros: Ros, options: list[object]) -> None:
+def test_one_mission_on_two_hosts(ros: Ros, small: Small) -> None:
     """Each host starts its share; the one without the world learns the seed from the vehicle."""
-    status, output = ros.run_all(*options, "--seed", 3, "--bag", ros.folder / "alone")
-    assert status == 0, output
     bag = ros.folder / "shared"
     summaries = [ros.folder / "a.json", ros.folder / "b.json"]
     ground = ros.start(
         "uav_dc_ros.run_all",
-        *options,
+        *small.options,
         *("--nodes", "policy,recorder", "--bag", bag, "--summary", summaries[0]),
     )
-    time.sleep(1.0)  # whoever comes first waits
+    ros.node("recorder")  # whoever comes first waits
     field = ros.start(
         "uav_dc_ros.run_all",
-        *options,
+        *small.options,
         *("--nodes", "world,channel_monitor", "--seed", 3, "--summary", summaries[1]),
     )
     for flight in (ground, field):
         status, output = finish(flight)
         assert status == 0, output
-    assert payloads(bag) == payloads(ros.folder / "alone")
+    assert payloads(bag) == small.alone[3]
     told = [json.loads(summary.read_text()) for summary in summaries]
     assert told[0] == told[1] | {"bag": str(bag)}
     assert told[0]["seed"] == 3
 
 
-def test_a_policy_that_starts_late_flies_from_the_first_step(
-    ros: Ros, options: list[object], small_scenario: Path, small_policy: Path
-) -> None:
-    status, output = ros.run_all(*options, "--bag", ros.folder / "alone")
-    assert status == 0, output
+def test_a_policy_that_starts_late_flies_from_the_first_step(ros: Ros, small: Small) -> None:
     bag = ros.folder / "late"
-    flight = ros.start(
-        "uav_dc_ros.run_all", *options, "--nodes", "world,channel_monitor,recorder", "--bag", bag
-    )
-    time.sleep(5.0)
+    nodes = "world,channel_monitor,recorder"
+    flight = ros.start("uav_dc_ros.run_all", *small.options, "--nodes", nodes, "--seed", 1, "--bag", bag)
+    ros.node("recorder")
+    time.sleep(2.0)
     policy = ros.start(
         "uav_dc_ros.nodes.policy",
-        *("--ros-args", "-p", f"policy:={small_policy}", "-p", f"scenario:={small_scenario}"),
+        *("--ros-args", "-p", f"policy:={small.policy}", "-p", f"scenario:={small.scenario}"),
         *("-p", "peers:=[world, channel_monitor, recorder]"),  # with the recorder, as run_all has it
     )
     status, output = finish(flight)
     assert status == 0, output
     policy.terminate()
     finish(policy)
-    assert payloads(bag) == payloads(ros.folder / "alone")
+    assert payloads(bag) == small.alone[1]
 
 
 @pytest.mark.long
-def test_a_recorder_that_starts_late_is_told_what_it_missed(
-    ros: Ros, options: list[object], small_scenario: Path
-) -> None:
-    status, output = ros.run_all(*options, "--bag", ros.folder / "alone")
-    assert status == 0, output
-    flight = ros.start("uav_dc_ros.run_all", *options, "--pace", 30, "--no-record")
+def test_a_recorder_that_starts_late_is_told_what_it_missed(ros: Ros, small: Small) -> None:
+    flight = ros.start("uav_dc_ros.run_all", *small.options, "--seed", 1, "--pace", 30, "--no-record")
     assert flight.stdout is not None
     wait_for(flight.stdout, "mission: step 5/30")
     bag = ros.folder / "late"
-    given = ("-p", f"bag:={bag}", "-p", f"scenario:={small_scenario}")
+    given = ("-p", f"bag:={bag}", "-p", f"scenario:={small.scenario}")
     recorder = ros.start("uav_dc_ros.nodes.recorder", "--ros-args", *given)
     status, output = finish(flight)
     assert status == 0, output
     recorder.terminate()
     status, output = finish(recorder)
     assert status == 0, output
-    late, alone = payloads(bag), payloads(ros.folder / "alone")
+    late, alone = payloads(bag), small.alone[1]
     latched = [topic for topic in COMPARED if TOPICS[topic].latched]
     assert latched == ["users", "rates", "mission"]
     for topic in latched:  # a state has not changed since the first step; which step a move came in may
