@@ -250,7 +250,7 @@ def test_the_figure_of_the_field_is_what_its_command_prints(tmp_path: Path) -> N
     assert told is not None
     summary = tmp_path / "summary.json"
     command = [sys.executable, "-m", *words, "--json", str(summary)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=90, check=False)
     assert done.returncode == 0, done.stderr
     seeds = words[words.index("--seeds") + 1]
     assert int(told[1]) == int(seeds) - 1
@@ -283,7 +283,7 @@ def test_systemd_has_nothing_to_say_against_the_units(tmp_path: Path) -> None:
 def verified(path: Path) -> str:
     """What systemd says of a unit."""
     command = ["systemd-analyze", "verify", "--man=no", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
     return done.stdout + done.stderr
 
 

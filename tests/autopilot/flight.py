@@ -75,7 +75,7 @@ class Fake:
         self.process.stdin.write(" ".join(map(str, words)) + "\n")
         self.process.stdin.flush()
 
-    def wait_for(self, event: str, seconds: float = 20.0) -> dict[str, Any]:
+    def wait_for(self, event: str, seconds: float = 90.0) -> dict[str, Any]:
         """The next event of a name that was not waited for yet."""
         end = time.monotonic() + seconds
         while True:

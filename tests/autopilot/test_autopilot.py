@@ -24,7 +24,7 @@ class Client:
         self.link = mavutil.mavlink_connection(autopilot.address, dialect="ardupilotmega", retries=1)
         self.t_s = 0.0
 
-    def until(self, name: str, right: Callable[[Any], bool] = lambda m: True, seconds: float = 10.0) -> Any:
+    def until(self, name: str, right: Callable[[Any], bool] = lambda m: True, seconds: float = 90.0) -> Any:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             message = self.link.recv_match(blocking=True, timeout=0.5)

@@ -117,7 +117,7 @@ def test_a_mode_that_is_asked_for_is_the_one_that_is_understood(dialect: Any) ->
 
 
 def until(vehicle: Mavlink, right: Callable[[Telemetry], bool], setpoint: Enu | None = None) -> Telemetry:
-    end = time.monotonic() + 15.0
+    end = time.monotonic() + 90.0
     while not right(known := vehicle.telemetry()):
         assert time.monotonic() < end, known
         vehicle.steer(setpoint)

@@ -91,7 +91,7 @@ def start(*arguments):
 
 def command(*arguments):
     process = start(*arguments)
-    out, err = process.communicate(timeout=100)
+    out, err = process.communicate(timeout=90)
     return process.returncode, out, err
 
 
@@ -200,7 +200,7 @@ def test_ctrl_c_keeps_the_best_checkpoint(tmp_path, field):
     process.stderr.readline()  # the first checkpoint may still be being written
     process.stderr.readline()
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=90)
     assert process.returncode == 130
     last = err.splitlines()[-1]
     assert "stopped; the best policy until now is" in last

@@ -47,7 +47,7 @@ class Fake:
             self.events.append(event)
             self._new.put(event)
 
-    def wait_for(self, event: str, seconds: float = 20.0) -> dict[str, Any]:
+    def wait_for(self, event: str, seconds: float = 90.0) -> dict[str, Any]:
         """The next event of a name that was not waited for yet."""
         end = time.monotonic() + seconds
         while True:
@@ -165,7 +165,7 @@ class Flight:
             bridge.move(bridge.step, way_home(bridge))
         self.vehicle.steer(bridge.setpoint)
 
-    def until(self, done: Callable[[], bool], seconds: float = 40.0) -> None:
+    def until(self, done: Callable[[], bool], seconds: float = 90.0) -> None:
         """Fly until something is so."""
         end = time.monotonic() + seconds
         while not done():

@@ -36,7 +36,7 @@ def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path
         assert status == 0, output
         assert "Traceback" not in output
     probe.stdin.close()
-    probe.wait(10)
+    probe.wait(90)
     probe.stdout.close()
 
 
@@ -84,7 +84,7 @@ def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario:
         node.terminate()
     output = finish(nodes[0])[1]
     finish(nodes[1])
-    stranger.wait(10)
+    stranger.wait(90)
     stranger.stdout.close()
     assert "move wrong_step 2" in output
 

@@ -60,7 +60,7 @@ def killed(ros: Ros, node: str) -> float:
     return time.monotonic()
 
 
-def until(condition: Callable[[], Any], process: subprocess.Popen[str], seconds: float = 40.0) -> None:
+def until(condition: Callable[[], Any], process: subprocess.Popen[str], seconds: float = 90.0) -> None:
     end_s = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()[0]
@@ -292,7 +292,7 @@ def test_broken_moves_and_moves_out_of_turn_change_nothing(ros: Ros, low: tuple[
             probe.stdin.write((json.dumps(command) + "\n") * 5)
         probe.stdin.close()
         status, output = finish(process)
-        probe.wait(30)
+        probe.wait(90)
     assert status == 0, output
     assert "Traceback" not in output
     check_steps(ros.folder / "bag")

@@ -66,7 +66,7 @@ def test_a_mission_on_px4_s_topics(
         assert px4.poll() is None
     finally:
         px4.stdin.close()
-        px4.wait(10)
+        px4.wait(90)
     assert status == 0, output
     assert "Traceback" not in output
     told = json.loads(summary.read_text())

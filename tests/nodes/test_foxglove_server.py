@@ -48,7 +48,7 @@ def test_bytes_and_time_arrive_as_they_were(server: FoxgloveServer) -> None:
     with client(server) as viewer:
         viewer.open("/mission")
         server.send("/mission", cdr_of_text(b"now"), 1_700_000_000_123_456_789)
-        (message,) = viewer.read_until(lambda heard: len(heard) == 1, 5.0)
+        (message,) = viewer.read_until(lambda heard: len(heard) == 1, 60.0)
     assert message.content.data == "now"
     assert message.time_ns == 1_700_000_000_123_456_789
 
@@ -59,12 +59,12 @@ def test_who_comes_late_gets_the_last_message_of_latched_topics_only(server: Fox
             server.send(topic, cdr_of_text(text), 7)
     with client(server) as first:
         first.open("/users", "/mission", "/move", "/rates")
-        heard = [(m.topic, m.content.data, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 5.0)]
+        heard = [(m.topic, m.content.data, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 60.0)]
         assert sorted(heard) == [("/mission", "newest", 7), ("/users", "newest", 7)]
         assert first.read(0.3) is None
         with client(server) as second:
             second.open("/users")
-            (message,) = second.read_until(lambda h: len(h) == 1, 5.0)
+            (message,) = second.read_until(lambda h: len(h) == 1, 60.0)
             assert message.content.data == "newest"
 
 
@@ -87,11 +87,11 @@ def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> 
         for _ in range(10):
             with client(server) as visitor:
                 visitor.open("/mission")
-                assert visitor.read(5.0) is not None
+                assert visitor.read(60.0) is not None
         stop.set()
         sender.join(5.0)
         assert not sender.is_alive()
-        heard = watcher.read_until(lambda h: bool(h) and h[-1].content.data == "last", 10.0)
+        heard = watcher.read_until(lambda h: bool(h) and h[-1].content.data == "last", 60.0)
     times = [message.time_ns for message in heard]
     assert times == sorted(times)
 
@@ -101,7 +101,7 @@ def test_a_stopped_server_is_gone(server: FoxgloveServer) -> None:
         assert not is_free(server.port)
         server.stop()
         with pytest.raises(ConnectionClosed):
-            viewer.read(5.0)
+            viewer.read(60.0)
     assert is_free(server.port)
 
 
@@ -127,7 +127,7 @@ def test_a_port_that_was_only_checked_is_free_still() -> None:
         port = taken.getsockname()[1]
     check(address="127.0.0.1", port=port)
     serve(port).stop()
-    deadline_s = time.monotonic() + 5.0
+    deadline_s = time.monotonic() + 60.0
     while not is_free(port) and time.monotonic() < deadline_s:  # a port is let go of a moment later
         time.sleep(0.02)
     check(address="127.0.0.1", port=port)

@@ -44,10 +44,10 @@ def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy:
                 f"/{name}": TOPICS[name].type for name in SERVED
             }
             viewer.open(*viewer.channels)
-            heard = viewer.read_until(lambda h: {m.topic for m in h} == set(viewer.channels), 30.0)
+            heard = viewer.read_until(lambda h: {m.topic for m in h} == set(viewer.channels), 60.0)
             with FoxgloveClient(port, len(SERVED)) as late:
                 late.open(*(f"/{name}" for name in LATCHED))
-                late.read_until(lambda h: {m.topic for m in h} == {f"/{name}" for name in LATCHED}, 5.0)
+                late.read_until(lambda h: {m.topic for m in h} == {f"/{name}" for name in LATCHED}, 60.0)
     finally:
         flight.send_signal(signal.SIGINT)
         status, output = finish(flight)
@@ -76,7 +76,7 @@ def until_closed(viewer: FoxgloveClient) -> Iterator[Heard]:
     """All messages, until the server closes the connection."""
     try:
         while True:
-            message = viewer.read(15.0)
+            message = viewer.read(60.0)
             assert message is not None, "the mission stands still, or the server did not end with it"
             yield message
     except ConnectionClosed:

@@ -34,7 +34,7 @@ class Asker:
         return answer
 
     def close(self) -> None:
-        self.process.communicate(timeout=20)
+        self.process.communicate(timeout=90)
 
 
 @pytest.fixture

@@ -184,7 +184,9 @@ def test_a_stop_and_its_end_lose_no_time_of_the_bag(ros: Ros, bag: Path) -> None
     heard = heard_by(listens)
     gaps_ms = [(b - a) * 1e-6 for (*_, a, _), (*_, b, _) in itertools.pairwise(heard)]
     assert max(gaps_ms) > 1400
-    assert len([gap for gap in gaps_ms if gap < 1.0]) < 100  # what was due meanwhile did not come in a burst
+    went_on = gaps_ms.index(max(gaps_ms)) + 1
+    soon = [sent for *_, sent, _ in heard[went_on:] if sent - heard[went_on][2] < 0.5e9]
+    assert len(soon) < 250  # of which 100 are due: the 300 that would have been due meanwhile were not sent
 
 
 def test_a_play_in_the_background_takes_no_keys_and_is_not_stopped(ros: Ros, bag: Path) -> None:

@@ -92,7 +92,7 @@ class Spun:
         return made
 
     def until(
-        self, done: Callable[[], object], beat: Callable[[], object] = lambda: None, seconds: float = 20.0
+        self, done: Callable[[], object], beat: Callable[[], object] = lambda: None, seconds: float = 90.0
     ) -> None:
         """Spin until something is so, with a beat every few milliseconds."""
         end_s = time.monotonic() + seconds
@@ -717,7 +717,7 @@ class Flight:
             assert bridge.move(bridge.step, action) is None
         vehicle.steer(bridge.setpoint)
 
-    def until(self, done: Callable[[], object], seconds: float = 40.0) -> None:
+    def until(self, done: Callable[[], object], seconds: float = 90.0) -> None:
         """Fly until something is so."""
         try:
             self.spun.until(done, self.tick, seconds)

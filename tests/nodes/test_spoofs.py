@@ -138,7 +138,7 @@ def test_a_lie_ends_no_node_and_no_run_hangs(ros: Ros, truth: dict[str, list[Any
     probe.stdin.write(json.dumps(command) + "\n")
     probe.stdin.close()
     status, rest = finish(flight, 120)
-    probe.wait(30)
+    probe.wait(90)
     output += rest
 
     assert "Traceback" not in output
