@@ -25,6 +25,11 @@ ROOT = Path(__file__).parents[1]
 # much else to do may take twenty times as long as a calm one.
 PATIENCE_S = 90.0
 
+# Where nothing may be written beside the sources, rewritten tests are kept here: to rewrite them takes each
+# worker as long as to import all else.
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(ROOT / ".pytest_cache" / "bytecode")
+
 # A shell without job control, such as that of a script, ignores Ctrl-C for what it starts in the background.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -52,6 +57,7 @@ class Ros:
         self.environment = {
             **os.environ,
             MARK: self.mark,
+            "PYTHONFAULTHANDLER": "1",
             "ROS_DOMAIN_ID": str(domain),
             "ROS_LOG_DIR": str(folder / "log"),
             "XDG_STATE_HOME": str(folder / "state"),
@@ -165,6 +171,8 @@ def finish(process: subprocess.Popen[str], timeout_s: float = PATIENCE_S) -> tup
     try:
         output, _ = process.communicate(timeout=timeout_s)
     except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGABRT)  # it tells where it was
+        time.sleep(1.0)
         process.kill()
         output, _ = process.communicate()
         raise AssertionError(f"still running after {timeout_s} s; it printed:\n{output}") from None

@@ -208,7 +208,7 @@ def test_a_killed_policy_makes_the_vehicle_hold(ros: Ros, low: tuple[object, ...
 @pytest.mark.parametrize("kind", ["ardupilot", pytest.param("px4", marks=pytest.mark.long)])
 def test_a_killed_bridge_takes_the_mission_up_again(ros: Ros, low: tuple[object, ...], kind: str) -> None:
     """ArduCopter hovers meanwhile; PX4 misses the stream, and returns: then the mission is over."""
-    with fake(kind, speed=8.0) as autopilot:
+    with fake(kind, speed=16.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 3), process)
         killed(ros, "bridge")

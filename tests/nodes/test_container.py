@@ -66,6 +66,7 @@ def test_who_shares_a_process(
     assert running == {"recorder", "visualizer", *(["container"] if shares else COMPOSED)}
 
 
+@pytest.mark.long
 def test_a_composed_mission_says_who_shares_a_process(ros: Ros, flight: list[object]) -> None:
     process, _ = flying(ros, *flight, "--pace", 100, "--compose")
     status, output = finish(process)

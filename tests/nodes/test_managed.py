@@ -74,9 +74,26 @@ def test_a_bad_policy_fails_at_configure_with_its_reason_and_a_good_one_heals_it
     assert "policy 'nobody': no such name or folder; expected one of five_clusters_dueling" in output
 
 
-def test_every_node_goes_all_ways_twice(ros: Ros, asker: Asker) -> None:
+def check_parameters(asker: Asker, name: str) -> None:
+    """Every parameter of a node is described, with unit and range."""
+    told = asker.ask(node=f"/{name}")
+    for row in (*EVERY, *NODES[name].parameters):
+        unit = f" [{row.unit}]" if row.unit else ""
+        assert told[row.name] == {
+            "description": f"{row.description}{unit}",
+            "expected": row.expected,
+            "read_only": row.read_only,
+            "range": [] if row.least is None else [[row.least, row.most]],
+        }
+    own = {row.name for row in (*EVERY, *NODES[name].parameters)}
+    assert {n for n in told if not n.startswith(("use_sim_time", "start_type_"))} == own
+
+
+def test_every_node_describes_its_parameters_and_goes_all_ways_twice(ros: Ros, asker: Asker) -> None:
     given = {"recorder": ["-p", f"bag:={ros.folder / 'recorder'}"], "bridge": ["-p", f"connect:={NOBODY}"]}
     nodes = {name: waiting(ros, name, *given.get(name, [])) for name in PROCESSES}
+    for name in nodes:
+        check_parameters(asker, name)
     for turn in range(2):
         for name in nodes:
             for transition, state in (

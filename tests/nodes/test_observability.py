@@ -124,7 +124,7 @@ def test_every_node_tells_of_itself_once_a_second(flown: Flown) -> None:
         assert each[-1][1]["restarts"] == "0"
     assert len({each[-1][1]["process id"] for each in told.values()}) == len(told), "a process for each"
     _, world = told["uav1/world"][-1]
-    assert world["phase"] == "ready"
+    assert "ready" in {values["phase"] for _, values in told["uav1/world"]}
     # Steps begin ten times a second, whatever else the machine does.
     assert float(world["pose said [Hz]"]) == pytest.approx(10.0, rel=0.5)
     assert float(world["move heard [Hz]"]) > 0.0
@@ -191,7 +191,7 @@ def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[ob
     peer = python(ros, DEMANDING)
     assert peer.stdout is not None
     wait_for(peer.stdout, "listening")
-    status, output = ros.run_all(*options, "--no-record", "--pace", 50)
+    status, output = ros.run_all(*options, "--no-record", "--pace", 100)
     peer.kill()
     peer.communicate()
     assert status == 0, output
