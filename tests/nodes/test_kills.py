@@ -27,7 +27,8 @@ ENDLESS = 100_000  # missions: the flight goes on until it is stopped, however l
 
 def flight(ros: Ros, name: str, *options: object, missions: int) -> subprocess.Popen[str]:
     """Start missions in lockstep with a bag and a summary of this name."""
-    given = ("--bag", ros.folder / name, "--summary", ros.folder / f"{name}.json", *options)
+    nodes = ("--nodes", ",".join(KILLED))
+    given = (*nodes, "--bag", ros.folder / name, "--summary", ros.folder / f"{name}.json", *options)
     return ros.start("uav_dc_ros.run_all", "--pace", "lockstep", "--missions", missions, *given)
 
 

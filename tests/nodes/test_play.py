@@ -297,7 +297,8 @@ def test_a_monitor_hears_of_a_played_mission_what_it_heard_of_the_real_one(
     ros: Ros, small_scenario: Path, small_policy: Path, tmp_path: Path
 ) -> None:
     """Its rates are those of the bag, to the last digit."""
-    flown = ["--scenario", small_scenario, "--policy", small_policy, "--pace", "lockstep"]
+    nodes = ("--nodes", "world,channel_monitor,policy,recorder")
+    flown = ["--scenario", small_scenario, "--policy", small_policy, "--pace", "lockstep", *nodes]
     status, printed = ros.run_all(*flown, "--bag", tmp_path / "bag")
     assert status == 0, printed
     recorded = [told for topic, told in read_bag(tmp_path / "bag") if topic == "/rates"]
