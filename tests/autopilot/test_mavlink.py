@@ -175,7 +175,7 @@ def test_the_stream_ends_with_those_who_decide() -> None:
         assert known.position is not None
         before = autopilot.report()["setpoints"]
         until(vehicle, lambda known: autopilot.report()["setpoints"] > before, known.position)
-        ends_s = time.monotonic() + LIFE_S + 5.0
+        ends_s = time.monotonic() + LIFE_S + 60.0
         last, still_s = -1, 0.0
         while still_s < 0.5:  # ten setpoints long
             assert time.monotonic() < ends_s, "nobody decides any more"
@@ -364,7 +364,7 @@ def test_a_vehicle_that_starts_anew_is_asked_again() -> None:
         autopilot.do("reboot")
         autopilot.wait_for("control")
         until(vehicle, lambda known: (known.position_s or 0.0) < time.monotonic() - 1.0)
-        until(vehicle, lambda known: (known.position_s or 0.0) > time.monotonic() - 0.1)
+        until(vehicle, lambda known: (known.position_s or 0.0) > time.monotonic() - 0.5)
 
 
 def test_px4_tells_its_origin_again_to_a_bridge_that_comes_back() -> None:

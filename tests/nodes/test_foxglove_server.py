@@ -89,7 +89,7 @@ def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> 
                 visitor.open("/mission")
                 assert visitor.read(60.0) is not None
         stop.set()
-        sender.join(5.0)
+        sender.join(60.0)
         assert not sender.is_alive()
         heard = watcher.read_until(lambda h: bool(h) and h[-1].content.data == "last", 60.0)
     times = [message.time_ns for message in heard]

@@ -170,10 +170,10 @@ def test_the_stream_is_20_hz_without_the_executor_and_ends_a_second_after_the_la
             vehicle.steer(target)
             last_s = time.monotonic()
             time.sleep(0.5)
-        time.sleep(LIFE_S + 1.0)
+        time.sleep(LIFE_S + 3.0)
         times = np.array(mavros.report()["times"])
         # As the other process heard it; on a busy machine it hears late.
-        assert LIFE_S - 0.1 < times[-1] - last_s < LIFE_S + 5.0
+        assert LIFE_S - 0.1 < times[-1] - last_s < LIFE_S + 2.0
         assert np.median(np.diff(times)) == pytest.approx(0.05, abs=0.02)
         assert len(times) <= (last_s + LIFE_S - began_s) / 0.05 + 10
         assert mavros.all("setpoint")[-1]["enu"] == [-7.0, 16.0, 13.0]
