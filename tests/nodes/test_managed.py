@@ -174,24 +174,6 @@ def test_a_whole_number_is_a_real_one_wherever_it_is_given(ros: Ros, asker: Aske
     ended(node)
 
 
-def test_every_parameter_is_described_with_unit_and_range(ros: Ros, asker: Asker) -> None:
-    nodes = {name: waiting(ros, name) for name in PROCESSES}
-    for name in nodes:
-        told = asker.ask(node=f"/{name}")
-        for row in (*EVERY, *NODES[name].parameters):
-            unit = f" [{row.unit}]" if row.unit else ""
-            assert told[row.name] == {
-                "description": f"{row.description}{unit}",
-                "expected": row.expected,
-                "read_only": row.read_only,
-                "range": [] if row.least is None else [[row.least, row.most]],
-            }
-        own = {row.name for row in (*EVERY, *NODES[name].parameters)}
-        assert {n for n in told if not n.startswith(("use_sim_time", "start_type_"))} == own
-    for process in nodes.values():
-        ended(process)
-
-
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
