@@ -178,7 +178,7 @@ def test_a_host_without_the_vehicle_adopts_no_player_s(bench: Bench) -> None:
     node.check_run("mission", OTHER)
     bench.publishers = {"mission": ["/player"]}
     with pytest.raises(AnotherMissionError, match="/player publishes mission here, and is no node of"):
-        bench.looks(node, ALONE_S)
+        bench.looks(node, TELL_S + 0.2)
 
 
 def test_who_keeps_messages_as_bytes_knows_those_of_another_run(bench: Bench) -> None:

@@ -7,6 +7,7 @@ journal where the mission stood, and takes it up in the air; it never arms a sec
 
 import dataclasses
 import time
+from collections import Counter
 from contextlib import ExitStack
 
 import msgspec
@@ -100,8 +101,9 @@ class AutopilotBridge(MissionNode):
 
     def deactivate(self) -> None:
         """Bring a vehicle that flies down, and let go of it once it obeys."""
-        if self._begun and not self.bridge.is_over:
-            self.bridge.stop("the bridge was stopped")
+        if not self.bridge.is_over:
+            self._begun = True  # a vehicle that flies already is brought down, too
+            self.bridge.stop("the bridge was stopped", self._known)
             self._wait_until_it_obeys()
         self._tell_diagnostics()  # the last changes, too
 
@@ -280,7 +282,7 @@ class AutopilotBridge(MissionNode):
             reason=messages.told(waits or bridge.reason),
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
-            steps_not_reached=getattr(bridge, "steps_not_reached", 0),
+            steps_not_reached=bridge.steps_not_reached,
             seed=self.values["seed"],
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
@@ -300,7 +302,8 @@ class AutopilotBridge(MissionNode):
         aborted = bridge.phase is Phase.ABORTED
         warnings = [bridge.reason] if aborted or bridge.fault else []
         warnings += ["the journal cannot be written"] if self._forgets else []
-        warnings += [] if known.other_controller is None else [known.other_controller]
+        warnings += bridge.warnings
+        discarded = Counter(known.discarded) + Counter(bridge.discarded)
         values = {
             "phase": bridge.phase.value,
             "reason": bridge.reason,
@@ -313,7 +316,7 @@ class AutopilotBridge(MissionNode):
             "grid": self._grid,
             "system": known.system,
             "other controller": known.other_controller or "",
-            **{f"discarded: {why}": str(count) for why, count in known.discarded.items()},
+            **{f"discarded: {why}": str(n) for why, n in discarded.items()},
         }
         for name, at_s in (("position", known.position_s), ("heartbeat", known.heartbeat_s)):
             values[f"{name} age [s]"] = "" if at_s is None else f"{now_s - at_s:.2f}"

@@ -21,8 +21,8 @@ SHARED_MEMORY = Path("/dev/shm")
 ENOUGH_MB = 16  # for a dozen participants with their ports; a full one ends a process by SIGBUS
 LEAST_MB = 0.1  # LTTng's pages, which rclpy's libraries touch when they are loaded
 OWNED = re.compile(r"(?P<owned>(?:fastrtps|fastdds)_(?:port\d{1,5}|[0-9a-f]{16}))(?P<lock>_el|_sl)?")
-# A port is locked a moment after it is made. One without any lock is a dead one's only when it is older.
-UNLOCKED_S = 2.0
+# A file is locked a moment after it is made, and to look whether it is locks it. Younger ones are let alone.
+YOUNG_S = 2.0
 
 
 def use_profiles() -> None:
@@ -68,9 +68,10 @@ def remove_leftovers() -> int:
 
 def _is_left(owned: str, locks: list[str]) -> bool:
     """Has the owner of a segment or port ended."""
+    files = [SHARED_MEMORY / name for name in locks or [owned]]
     try:
-        if not locks:
-            return time.time() - (SHARED_MEMORY / owned).stat().st_mtime > UNLOCKED_S
+        if any(time.time() - file.stat().st_mtime < YOUNG_S for file in files):
+            return False
         return not any(_is_locked(SHARED_MEMORY / name) for name in locks)
     except OSError:
         return False

@@ -178,7 +178,7 @@ class Flight:
             status = self._status
             if status is not None and status.mission == flown:
                 now.hear(status)
-            if self._why or status is None or not status.phase.is_over:
+            if self._why or not now.reason:
                 now.reason = self._why or "run_all was interrupted"
             self._on_end(now, Phase.ABORTED)
 

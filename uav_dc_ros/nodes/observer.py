@@ -20,7 +20,7 @@ from uav_dc_ros.nodes.pairs import StepPairs
 ALONE_S = 1.0  # nobody else was found for so long, before any node of this mission may begin
 LOOK_S = 0.1  # for others, until this mission has begun
 LOOK_LATER_S = 1.0  # for others, afterwards
-TELL_S = 0.5  # both who publishes and for which run are told, if they are known within this time
+TELL_S = 3.0  # both who publishes and for which run are told, if they are known within this time
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
