@@ -1,6 +1,7 @@
 """An environment in which ROS cannot start is one line; shared memory holds what the living have in it."""
 
 import fcntl
+import mmap
 import os
 import subprocess
 import sys
@@ -123,6 +124,11 @@ def test_leftovers_go_and_what_the_living_have_stays(clean: Path) -> None:
     for name in clean.iterdir():
         if name.name not in ("fastrtps_port7004", "fastrtps_00000000000000dd_el"):
             os.utime(name, (old_s, old_s))
+    mapped = (clean / "fastrtps_port7006").open("wb+")  # its listener has ended, and others may send there
+    mapped.write(b"x")
+    mapped.flush()
+    sender = mmap.mmap(mapped.fileno(), 1)
+    os.utime(clean / "fastrtps_port7006", (old_s, old_s))
     held = [(clean / f"{name}_el").open("rb+") for name in living]
     for file in held:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -136,9 +142,10 @@ def test_leftovers_go_and_what_the_living_have_stays(clean: Path) -> None:
         *(part for name in living for part in (name, f"{name}_el", f"sem.{name}_mutex")),
         *("fastrtps_port7004", "fastrtps_port7005", "fastrtps_port7005_sl"),
         *("fastrtps_00000000000000dd", "fastrtps_00000000000000dd_el"),
-        *("another", "fastrtps_short", "sem.another"),
+        *("another", "fastrtps_short", "sem.another", "fastrtps_port7006"),
     }
-    for file in (*held, shared):
+    sender.close()
+    for file in (*held, shared, mapped):
         file.close()
 
 

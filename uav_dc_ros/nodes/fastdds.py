@@ -48,7 +48,8 @@ def free_mb() -> float:
 def remove_leftovers() -> int:
     """Remove the shared memory of processes that have ended; returns how many segments and ports that was.
 
-    Files of the living are locked, and those of another user cannot be opened: both stay.
+    What the living use stays. A port outlives the process that listened at it as long as others have it open
+    to send: whoever listens there next is to find the same one.
     """
     try:
         names = os.listdir(SHARED_MEMORY)
@@ -58,7 +59,8 @@ def remove_leftovers() -> int:
     for name in names:
         if found := OWNED.fullmatch(name):
             locks.setdefault(found["owned"], []).extend([name] if found["lock"] else [])
-    removed = [owned for owned, its in locks.items() if _is_left(owned, its)]
+    left = [owned for owned, its in locks.items() if _is_left(owned, its)]
+    removed = set(left) - _in_use() if left else set()
     for owned in removed:
         for name in (owned, *locks[owned], f"sem.{owned}_mutex"):
             with contextlib.suppress(OSError):
@@ -67,7 +69,7 @@ def remove_leftovers() -> int:
 
 
 def _is_left(owned: str, locks: list[str]) -> bool:
-    """Has the owner of a segment or port ended."""
+    """Has the owner of a segment or port ended. Files of another user cannot be opened: they stay."""
     files = [SHARED_MEMORY / name for name in locks or [owned]]
     try:
         if any(time.time() - file.stat().st_mtime < YOUNG_S for file in files):
@@ -75,6 +77,16 @@ def _is_left(owned: str, locks: list[str]) -> bool:
         return not any(_is_locked(SHARED_MEMORY / name) for name in locks)
     except OSError:
         return False
+
+
+def _in_use() -> set[str]:
+    """Names of the shared memory that a process has mapped."""
+    used = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended, or is another user's, and so is its memory
+            for line in (process / "maps").read_text(errors="replace").splitlines():
+                used.update([Path(line).name] if f" {SHARED_MEMORY}/" in line else [])
+    return used
 
 
 def _is_locked(path: Path) -> bool:
