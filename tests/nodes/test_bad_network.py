@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import uav_dc_ros
-from tests.conftest import PATIENCE_S, Ros, finish, read_bag, ros_in
+from tests.conftest import PATIENCE_S, Ros, but_run, finish, read_bag, ros_in
 from tests.nodes.conftest import SMALL
 from tests.nodes.link import Carried, Link, unavailable
 from tests.small_worlds import saved
@@ -200,7 +200,7 @@ def steps(messages: list[tuple[str, Any]], topic: str) -> list[Any]:
     for name, message in messages:
         if name != f"/{topic}":
             continue
-        values = message if isinstance(message, dict) else dataclasses.asdict(message)
+        values = but_run(message) if isinstance(message, dict) else dataclasses.asdict(message)
         if values not in told[-1:]:
             told.append(values)
     return told

@@ -141,6 +141,7 @@ def test_the_summaries_are_the_environment_s_numbers(flown: Flown, simulated: li
             "distance_m": pytest.approx(np.abs(metres).sum()),
             "reward": pytest.approx(last["reward"]),  # the episode form pays r^t itself
             "reason": "",
+            "steps_not_reached": 0,
             "bag": str(flown.bag),
         }
 
