@@ -161,7 +161,7 @@ class Autopilot:
         if due("ack", self.rival_acks, RIVAL_ACK_S):
             self.mav.command_ack_send(mav.MAV_CMD_DO_SET_MODE, 0, 0, 0, *BRIDGE)
         if due("target", self.rival_target is not None, RIVAL_S) and self.rival_target is not None:
-            c.streamed_s = c.t_s
+            self._note_stream()
             if c.mode in FOLLOWS and not c.landed:
                 c.aim(list(self.rival_target))
 
@@ -331,6 +331,13 @@ class Autopilot:
         fresh = c.t_s - c.streamed_s <= OFFBOARD_GAP_S
         return fresh and c.streamed_s - c.streamed_since_s >= OFFBOARD_PROOF_S
 
+    def _note_stream(self) -> None:
+        """A setpoint came, of anybody's."""
+        c = self.copter
+        if c.t_s - c.streamed_s > OFFBOARD_GAP_S:
+            c.streamed_since_s = c.t_s
+        c.streamed_s = c.t_s
+
     def _setpoint(self, m: Any) -> None:
         c = self.copter
         self.setpoints += 1
@@ -343,9 +350,7 @@ class Autopilot:
         frames = (1, 8) if c.px4 else (1, 7, 8, 9)
         if m.coordinate_frame not in frames:
             return
-        if c.t_s - c.streamed_s > OFFBOARD_GAP_S:
-            c.streamed_since_s = c.t_s
-        c.streamed_s = c.t_s
+        self._note_stream()
         if c.mode not in FOLLOWS or (c.landed and not c.px4):
             return
         if c.taking_off_to_m is not None:
@@ -368,7 +373,7 @@ class Control:
         param NAME VALUE|none            sets a parameter (whole numbers are PX4's integers); none: unknown
         wind NORTH EAST                  m/s; more than 12 blow it away: it returns, and gets no nearer
         motor SECONDS                    a motor fails: it tilts and falls, and is armed so long after that
-        battery SHARE                    charge and voltage
+        battery SHARE                    another battery: charge and voltage
         counted SHARE                    charge alone; the voltage stays
         volts VOLTS|none                 voltage alone; the charge stays (below 10.5 V for 10 s: a text, and
                                          the battery's health bit off, until it is switched on anew)
@@ -432,6 +437,7 @@ class Control:
                 c.arm(verb == "arm", "pilot")
             case "battery":
                 c.battery, c.counted = float(words[0]), 0.0
+                c.volts_set, c.battery_failed = None, False
             case "counted":
                 c.counted = c.battery - float(words[0])
             case "lose":

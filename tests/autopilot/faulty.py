@@ -54,6 +54,22 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "odd messages": ("late_position 1.5; zero_time; nonsense; twice 1", "twice 0", ("",)),
     "late message": ("late_position 1.5", "", ("",)),
     "silent policy": ("policy", "", ("no move from the policy", "")),
+    "wind": ("wind 20 0", "", ("outside the fence", "no nearer", "not at the start", "")),
+    "fence": (
+        "param FENCE_ENABLE 1; param FENCE_RADIUS 300; param GF_MAX_HOR_DIST 300",
+        "",
+        ("circular fence ends 300 m", "does not take its target", "no nearer", "RTL: changed by", ""),
+    ),
+    "motor": ("motor 600", "", ("too low", "on the ground", "outside the fence", "not at the start", "")),
+    "low voltage": ("volts 9.0", "", ("under load", "low or broken", "")),
+    "slow": ("param WPNAV_SPEED_DN 50; param MPC_Z_VEL_MAX_DN 0.5", "", ("",)),
+    "lost commands": ("ignore 22 2; ignore 176 1; ignore 400 1", "", ("",)),
+    "second bridge": ("second_bridge_heartbeats 1", "", ("another system commands", "")),
+    "second target": (
+        "second_bridge_target 100 100 -100",
+        "",
+        ("another system", "does not take its target", "no nearer", "not at the start", "outside", ""),
+    ),
 }
 
 

@@ -56,6 +56,7 @@ class Vehicle:
     limits: Limits | None = None
     other_controller: str | None = None
     unplaced: bool = False  # nobody knows where it is on the grid
+    missing: str | None = None  # what else has not come
     asked: list[Wish] = field(default_factory=list)
     told: Telemetry = field(default_factory=Telemetry)
 
@@ -134,7 +135,7 @@ class Vehicle:
             battery=self.battery,
             battery_v=self.battery_v,
             vehicle_s=self.now_s,
-            missing="the grid has no datum" if self.unplaced else None,
+            missing="the grid has no datum" if self.unplaced else self.missing,
             said=self.said,
             home=self.home if self.reports_home else None,
             target=self.target if self.reports_target else None,

@@ -1,8 +1,12 @@
-"""Scenes of whole flights, in the vehicle's time: odd telemetry, low voltage, others on the link."""
+"""Scenes of whole flights, in the vehicle's time: odd telemetry, low voltage, others on the link.
+
+And what real flights broke: each ends on the ground or with a pilot, in bounded time, and says why.
+"""
 
 import random
 from collections.abc import Iterable
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +15,9 @@ from tests.autopilot.autopilot import Autopilot
 from tests.autopilot.copter import Copter
 from tests.autopilot.flight import KINDS
 from tests.autopilot.virtual import VirtualFlight, short
+from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.watch import Settings
+from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 
 STEPS = list(range(6))
@@ -24,6 +30,14 @@ def check_landed(flight: VirtualFlight) -> None:
     assert len(flight.all("armed")) == 1
     assert not flight.copter.armed
     assert flight.dock_distance_m() < flight.bridge.settings.tolerance_m
+
+
+def check_aborted(flight: VirtualFlight, *causes: str) -> None:
+    """It ended on the ground, disarmed, and the reason names the cause."""
+    assert flight.bridge.phase is Phase.ABORTED, flight.log[-5:]
+    assert all(cause in flight.bridge.reason for cause in causes), flight.bridge.reason
+    assert (flight.copter.landed, flight.copter.armed) == (True, False)
+    assert len(flight.all("armed")) <= 1
 
 
 def moving(flight: VirtualFlight, step: int = 1) -> None:
@@ -158,3 +172,190 @@ def test_after_a_lost_link_the_report_on_the_estimate_is_older_than_the_heartbea
     known = flight.hearing.telemetry(flight.now_s)
     assert known.estimate_ok
     assert flight.now_s - (known.estimate_s or 0.0) < 0.3
+
+
+# What real flights broke.
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_wind_that_outdoes_the_vehicle_ends_with_a_landing_where_it_is(kind: str) -> None:
+    flight = VirtualFlight(kind, scenario=short(20))
+    moving(flight)
+    flight.do("wind 20 0")
+    flight.until_over(120.0)
+    check_aborted(flight, "no nearer to cell", "it returns, and has come no nearer to home", "lands")
+    returns, lands = ("RTL", "LAND") if kind == "ardupilot" else ("AUTO.RTL", "AUTO.LAND")
+    assert [event["mode"] for event in flight.all("mode")][-2:] == [returns, lands]
+
+
+def fence_in(flight: VirtualFlight, kind: str) -> None:
+    """An autopilot's own circle around home, smaller than the field."""
+    px4, ardupilot = ("param GF_MAX_HOR_DIST 30",), ("param FENCE_ENABLE 1", "param FENCE_RADIUS 30")
+    for line in px4 if kind == "px4" else ardupilot:
+        flight.do(line)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_autopilot_s_fence_inside_the_field_is_refused_before_take_off(kind: str) -> None:
+    flight = VirtualFlight(kind)
+    fence_in(flight, kind)
+    flight.until_over(30.0)
+    check_aborted(flight, "circular fence ends 30 m from home", "expected at least 285 m")
+    assert flight.all("armed") == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "cause"), [("ardupilot", "does not take its target"), ("px4", "AUTO.RTL: changed by")]
+)
+def test_an_autopilot_s_fence_that_comes_in_flight_is_noticed(kind: str, cause: str) -> None:
+    """ArduCopter ignores a target outside in silence; PX4 returns, and says so."""
+    flight = VirtualFlight(kind, scenario=short(20))
+    moving(flight, 0)
+    fence_in(flight, kind)
+    flight.until_over(120.0)
+    check_aborted(flight, cause)
+    assert flight.bridge.steps_not_reached == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_motor_that_fails_ends_the_mission_within_seconds(kind: str) -> None:
+    """The autopilot stays armed: the wreck does not end it."""
+    flight = VirtualFlight(kind, scenario=short(20))
+    moving(flight)
+    flight.do("motor 600")
+    begun_s = flight.copter.t_s
+    flight.until(lambda: flight.bridge.phase is Phase.LANDING, 5.0)
+    flight.until_over(150.0)
+    assert flight.bridge.phase is Phase.ABORTED
+    assert "too low; expected at most 10 m" in flight.bridge.reason
+    assert flight.copter.t_s - begun_s < 150.0
+    assert flight.bridge.step == 1, "no step counts that was not flown"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("line", ["second_bridge_heartbeats 1", "second_bridge_acks 1"])
+def test_a_second_bridge_is_refused_before_take_off(kind: str, line: str) -> None:
+    flight = VirtualFlight(kind)
+    flight.do("lose 1")  # not ready yet: there is time to listen
+    flight.do(line)
+    flight.run(15.0)
+    flight.do("lose 0")
+    flight.until_over(10.0)
+    check_aborted(flight, "another system commands this vehicle: ")
+    assert flight.all("armed") == []
+    assert flight.all("mode") == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_bridge_that_comes_in_flight_is_reported(kind: str) -> None:
+    flight = VirtualFlight(kind, scenario=short(20))
+    moving(flight)
+    flight.do("second_bridge_target 30 30 -15")
+    flight.until_over(300.0)
+    assert any("another system commands this vehicle: position targets" in why for _, _, why in flight.log)
+    assert not flight.copter.armed
+    assert flight.bridge.steps_not_reached == 0, "no step counts that was not flown"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_who_switches_the_mode_on_the_ground_has_the_vehicle(kind: str) -> None:
+    flight = VirtualFlight(kind)
+    flight.do("balk 1")
+    flight.until(lambda: flight.bridge.reason.startswith("arming refused"), 60.0)
+    mode = "POSCTL" if kind == "px4" else "LOITER"
+    flight.do(f"mode {mode}")
+    flight.do("balk 0")
+    flight.until_over(10.0)
+    flight.run(60.0)
+    check_aborted(flight, f"mode {mode} before take-off: changed by a pilot")
+    assert flight.all("armed") == []
+    assert flight.copter.mode == mode
+
+
+@pytest.mark.parametrize(("kind", "command"), [("ardupilot", 22), ("ardupilot", 176), ("px4", 176)])
+def test_two_lost_commands_are_sent_again(kind: str, command: int) -> None:
+    flight = VirtualFlight(kind)
+    flight.do(f"ignore {command} 2")
+    flight.until_over()
+    check_landed(flight)
+    assert len(flight.all("lost")) == 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_link_that_is_cut_for_ten_seconds_makes_it_return(kind: str) -> None:
+    flight = VirtualFlight(kind, scenario=short(20))
+    moving(flight)
+    flight.link_is_up = False
+    flight.run(10.0)
+    flight.link_is_up = True
+    flight.until_over(120.0)
+    check_aborted(flight, "link lost: no heartbeat for 3 s")
+    assert flight.copter.mode == ("AUTO.RTL" if kind == "px4" else "RTL")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_vehicle_in_the_air_without_a_datum_is_refused_at_once(kind: str) -> None:
+    """Without a stream PX4 returns by itself meanwhile."""
+    flight = VirtualFlight(kind)
+    flight.do("fly 10 10 20")
+    flight.until_over(15.0)
+    assert flight.bridge.phase is Phase.ABORTED
+    cause = "--datum" if kind == "ardupilot" else "mode AUTO.RTL"
+    assert cause in flight.bridge.reason
+    assert flight.all("command") == []
+
+
+def down_and_up(bridge: Bridge) -> Action:
+    """Between two layers."""
+    return Action.UPWARD if bridge.cell[2] == 0 else Action.DOWNWARD
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_descent_that_takes_longer_than_a_step_is_told_before_and_counted_after(kind: str) -> None:
+    world = short()
+    grid = msgspec.structs.replace(world.grid, altitude_step_m=12.0)
+    start = (*world.mission.start_m[:2], 22.0)
+    world = msgspec.structs.replace(
+        world, grid=grid, mission=msgspec.structs.replace(world.mission, start_m=start)
+    )
+    flight = VirtualFlight(kind, scenario=world)
+    flight.policy = down_and_up
+    flight.do("param MPC_Z_VEL_MAX_DN 0.5" if kind == "px4" else "param WPNAV_SPEED_DN 50")
+    flight.until(lambda: flight.bridge.phase is Phase.TAKEOFF, 60.0)
+    warning = "a layer down takes 24 s at 0.5 m/s, and a step has 15 s"
+    assert flight.bridge.warnings == [warning]
+    assert any(warning in why for phase, _, why in flight.log if phase is Phase.PREFLIGHT)
+    flight.until_over()
+    assert flight.bridge.phase is Phase.TIMEOUT
+    assert flight.bridge.steps_not_reached == 3
+    assert not flight.copter.armed
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_voltage_that_the_autopilot_finds_low_brings_it_home_though_the_count_is_high(kind: str) -> None:
+    flight = VirtualFlight(kind, scenario=short(60))
+    moving(flight)
+    flight.do("volts 10.3")  # more than four fifths of what it had at rest
+    flight.until_over(180.0)
+    check_aborted(flight, "at 10.3 V, 12.6 V at rest: the autopilot finds it low or broken")
+    assert flight.copter.charge > 0.8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_vehicle_that_comes_before_arming_stops_it(kind: str) -> None:
+    flight = VirtualFlight(kind)
+    flight.do("balk 1")
+    flight.until(lambda: flight.bridge.reason.startswith("arming refused"), 60.0)
+    flight.autopilot.other = Autopilot(Copter(kind, 0.0, "second "), 7)
+    flight.run(5.0)
+    flight.do("balk 0")
+    flight.run(30.0)
+    assert flight.all("armed") == []
+    assert "2 autopilots on this link: system 1" in flight.bridge.reason
+    if kind == "px4":  # it has no stream meanwhile, and leaves OFFBOARD
+        check_aborted(flight, "mode AUTO.RTL before take-off")
+        return
+    assert flight.bridge.phase is Phase.CONNECTING
+    flight.autopilot.other = None
+    flight.until_over()
+    check_landed(flight)

@@ -147,6 +147,25 @@ def test_a_vehicle_that_another_system_commands_is_refused_before_anything_is_se
         )
 
 
+@pytest.mark.parametrize("armed", [False, True])
+def test_what_is_missing_after_connecting_stops_a_take_off(armed: bool) -> None:
+    """Such as a second vehicle on the link; also where somebody has armed meanwhile."""
+    flight = Flight(vehicle=Stubborn(position=GROUND))
+    flight.until(Phase.PREFLIGHT)
+    flight.run(5.0)
+    vehicle, missing = flight.vehicle, "2 autopilots on this link"
+    vehicle.missing, vehicle.stick_is_up = missing, False  # type: ignore[attr-defined]
+    vehicle.armed = armed
+    vehicle._tell()
+    vehicle.asked.clear()
+    flight.run(10.0)
+    assert vehicle.asked == []
+    assert flight.bridge.setpoint is None
+    assert (flight.bridge.phase, flight.bridge.reason) == (Phase.CONNECTING, missing)
+    vehicle.missing = None
+    flight.until(Phase.TAKEOFF, 10.0)
+
+
 def test_another_system_that_comes_in_flight_is_reported() -> None:
     flight = fly_to_step(3)
     flight.vehicle.other_controller = "component 191 of system 254 sends heartbeats"

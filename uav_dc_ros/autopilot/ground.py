@@ -49,7 +49,8 @@ class Ground:
         if known.mode is Mode.COMMANDED:
             self.allowed_mode = mode
         elif self.allowed_mode not in (None, mode):
-            return f"mode {mode} before take-off: changed by a pilot or by the autopilot's failsafe"
+            after = "" if known.missing is None else f" (after: {known.missing})"
+            return f"mode {mode} before take-off: changed by a pilot or by the autopilot's failsafe{after}"
         return None
 
     def refusal(self, known: Telemetry) -> str | None:
@@ -133,13 +134,15 @@ class Ground:
         self.is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
         here, fault = known.position, self.watch.fault(now_s, known)
         ours = known.armed and known.mode is Mode.COMMANDED
+        if not ours and (why := self.refusal(known)) is not None:
+            return Next(phase=Phase.ABORTED, why=why)
+        if known.missing is not None:
+            return Next(phase=Phase.CONNECTING, why=known.missing)
         if ours:
             return self._take_it(known)
-        if (why := self.refusal(known)) is not None:
-            return Next(phase=Phase.ABORTED, why=why)
         wrong = fault.why if fault is not None else self.fence.breach(here) if here is not None else None
         if wrong is not None:
-            return Next(phase=Phase.CONNECTING, why=known.missing or wrong)
+            return Next(phase=Phase.CONNECTING, why=wrong)
         wish: Wish | None = None
         if known.armed:
             why = f"a pilot flies: mode {_name(known)}"

@@ -188,6 +188,7 @@ class Hearing:
             said="; ".join(self._said(now_s - TEXT_S, now_s)),
             home=self._home.seen_from(self.datum) if self._home and self.datum else None,
             target=self.frame.from_autopilot(target) if self.frame and target else None,
+            target_s=self.heard.get("POSITION_TARGET_LOCAL_NED"),
             tilt_rad=self._tilt_rad if self._is_fresh("ATTITUDE", now_s) else None,
             limits=self._limits(),
             other_controller=self.rivals.found(self.vehicle_s),
