@@ -20,6 +20,7 @@ from rclpy.task import Future
 from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Wish
+from uav_dc_ros.autopilot.watch import Settings, Watch
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.nodes.vehicles import mavros_messages
 from uav_dc_ros.nodes.vehicles.mavros_commands import ASK_AGAIN_S, Commands
@@ -356,13 +357,14 @@ def test_with_mavros_msgs_home_and_target_are_told_in_the_grid_s_frame() -> None
     point = Message(x=5.0, y=16.0, z=7.0)
     hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.1, tilt_rad(0.5, 0.5, 0.5, 0.5))
     hearing.on_home(Message(position=point))
-    hearing.on_target(Message(position=point, type_mask=0xDF8))
+    hearing.on_target(Message(position=point, type_mask=0xDF8), 1.05)
     known = hearing.telemetry(1.1)
     there = (PLACE.east_m, PLACE.north_m + 10.0, PLACE.up_m)
     assert (known.home, known.target) == (pytest.approx(there), pytest.approx(there))
+    assert known.target_s == 1.05
     assert known.tilt_rad == pytest.approx(math.pi / 2)
     assert known.system == "mavros (uas:///uas1)"
-    hearing.on_target(Message(position=point, type_mask=0xDFF))
+    hearing.on_target(Message(position=point, type_mask=0xDFF), 1.1)
     assert hearing.telemetry(1.1).target is None, "it follows a velocity"
 
 
@@ -398,6 +400,33 @@ def test_with_mavros_msgs_the_estimators_flags_count(wrong: dict[str, bool]) -> 
     assert not hearing.telemetry(9.0).estimate_ok, "nothing new for a while"
     hearing.on_estimator_status(estimator(**wrong), 1.0)
     assert not hearing.telemetry(1.0).estimate_ok
+
+
+@pytest.mark.parametrize("kind", ["PX4 Autopilot", "ArduPilot"])
+def test_with_mavros_msgs_an_estimate_that_a_cut_link_leaves_old_is_not_lost(kind: str) -> None:
+    """The link is back: heartbeats come first. What ended while heartbeats came was lost."""
+    watch = Watch(Settings())
+    hearing = full(kind)
+    sys_status = Message(sensors_enabled=1 << 21, sensors_health=0)
+
+    def report(now_s: float) -> None:
+        if kind == "PX4 Autopilot":
+            hearing.on_estimator_status(estimator(attitude=False), now_s)
+        else:
+            hearing.on_sys_status(sys_status, now_s)
+
+    def is_lost(now_s: float, heartbeat_s: float) -> bool:
+        hearing.on_state(Message(connected=True, armed=True, mode="GUIDED", system_status=4), heartbeat_s)
+        return watch.estimate_is_lost(now_s, watch.see(now_s, hearing.telemetry(now_s)))
+
+    hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.0)
+    report(1.0)
+    assert hearing.telemetry(1.0).estimate_s == 1.0
+    assert is_lost(1.1, 1.1), "it says so"
+    assert not is_lost(11.1, 11.0), "nothing was said since"
+    assert is_lost(14.0, 13.9), "heartbeats come, and no report"
+    report(14.1)
+    assert is_lost(14.2, 13.9)
 
 
 class Client:

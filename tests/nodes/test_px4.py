@@ -571,6 +571,15 @@ def test_a_battery_tells_its_voltage_and_what_px4_thinks_of_it(msg: Any) -> None
         assert (known.battery, known.battery_v, known.battery_fails) == (0.75, 9.0, fails)
 
 
+def test_when_it_last_said_whether_it_trusts_its_position_is_told(msg: Any) -> None:
+    hearing = standing(msg)
+    assert hearing.telemetry().estimate_s == 0.0
+    hearing.hear("vehicle_local_position", position(msg, START, xy_valid=False), 1.0)
+    hearing.hear("vehicle_status", status(msg), 2.0)
+    known = hearing.telemetry()
+    assert (known.estimate_ok, known.estimate_s, known.position_s) == (False, 1.0, 0.0)
+
+
 def test_home_and_tilt_are_told(msg: Any) -> None:
     hearing = standing(msg)
     assert (hearing.telemetry().home, hearing.telemetry().tilt_rad) == (None, None)

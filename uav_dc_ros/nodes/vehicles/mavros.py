@@ -124,7 +124,7 @@ class Mavros:
                 package.estimator_status, ESTIMATOR_STATUS, _timed(hearing.on_estimator_status), SEVERAL
             )
             self._hear(package.home, HOME, lambda home, _: hearing.on_home(home), SEVERAL)
-            self._hear(package.target, TARGET, lambda target, _: hearing.on_target(target), NEWEST)
+            self._hear(package.target, TARGET, _timed(hearing.on_target), NEWEST)
             commands = self._commands
             self._hear(package.statustext, STATUSTEXT, lambda text, _: commands.on_statustext(text), SEVERAL)
         self._stream.start()

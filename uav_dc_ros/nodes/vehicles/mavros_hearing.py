@@ -173,6 +173,7 @@ class Hearing:
             position=self.position,
             position_s=self.heard.get(POSE),
             estimate_ok=self._estimate_ok(now_s),
+            estimate_s=self.heard.get(ESTIMATOR_STATUS, self.heard.get(SYS_STATUS)),
             battery=charge,
             battery_v=volts,
             battery_fails=bool(BATTERY & enabled & ~health),
@@ -182,6 +183,7 @@ class Hearing:
             said=said,
             home=self._in_grid(self._home),
             target=self._in_grid(self._target),
+            target_s=self.heard.get(TARGET),
             tilt_rad=self._tilt_rad,
             system=self.diagnostics.source,
             discarded=dict(self.discarded),
@@ -322,8 +324,9 @@ class Hearing:
         """HomePosition: its `position` is in MAVROS's frame."""
         self._home = _finite(home.position)
 
-    def on_target(self, target: Any) -> None:
+    def on_target(self, target: Any, now_s: float) -> None:
         """PositionTarget that the autopilot follows."""
+        self.heard[TARGET] = now_s
         self._target = None if target.type_mask & NO_POSITION else _finite(target.position)
 
 

@@ -94,6 +94,7 @@ class Px4Hearing:
         self._reference: Geodetic | None = None  # where PX4 counts its local position from
         self._position: Enu | None = None
         self._sure = False
+        self._estimate_s: float | None = None  # when it last said whether it trusts its position
         self._status_s: float | None = None
         self._landed: bool | None = None
         self._batteries: dict[int, tuple[float, float, bool]] = {}  # by number: charge, volts, does it fail
@@ -134,6 +135,7 @@ class Px4Hearing:
             position=self._position,
             position_s=self.position_s,
             estimate_ok=self._sure,
+            estimate_s=self._estimate_s,
             battery=charge,
             battery_v=volts or None,
             battery_fails=fails,
@@ -176,6 +178,7 @@ class Px4Hearing:
         self._pass_time(message.timestamp)
         ned = Ned(message.x, message.y, message.z)
         valid = message.xy_valid and message.z_valid and message.v_xy_valid and message.v_z_valid
+        self._estimate_s = now_s
         self._sure = valid and not message.dead_reckoning and all(map(math.isfinite, ned))
         if self._sure:
             self._place(ned, _reference(message))
