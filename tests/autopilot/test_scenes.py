@@ -359,3 +359,18 @@ def test_a_second_vehicle_that_comes_before_arming_stops_it(kind: str) -> None:
     flight.autopilot.other = None
     flight.until_over()
     check_landed(flight)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_bridge_that_is_restarted_beside_a_second_vehicle_goes_on(kind: str) -> None:
+    flight = VirtualFlight(kind, scenario=short(20))
+    moving(flight, 3)
+    system = flight.hearing.telemetry(flight.now_s).system_id
+    assert system == 1
+    flight.autopilot.other = other = Autopilot(Copter(kind, 0.0, "second "), 7)
+    flight.restart(system)
+    flight.until_over()
+    assert flight.bridge.phase is Phase.LANDED, flight.log[-5:]
+    assert flight.executed == list(range(20))
+    assert len(flight.all("armed")) == 1
+    assert other.setpoints == 0

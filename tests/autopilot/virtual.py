@@ -111,6 +111,19 @@ class VirtualFlight:
         """A line of `Control`'s; what needs a process of its own is none for here."""
         self._control._do(*line.split())
 
+    def restart(self, system: int | None) -> None:
+        """Another bridge takes up the mission of this one, which was killed.
+
+        Args:
+            system: the vehicle that the journal names.
+        """
+        standing, old = self.bridge.standing, self.bridge
+        self.hearing = Hearing(self.hearing.datum, self.place, system, again=True)
+        self.session = Session(load_codec(), self.hearing, self._write)
+        self.bridge = Bridge(old.scenario, old.settings, self._note, standing)
+        self.session.live(self.now_s)
+        self.session.begin(self.now_s)
+
     def all(self, event: str) -> list[dict[str, Any]]:
         """All events of a name so far."""
         return [told for told in self.events if told["event"] == event]

@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import bridge, datums, vehicles
 from uav_dc_ros.nodes.bridge import AutopilotBridge
+from uav_dc_ros.nodes.journal import Journal
 
 DATUM = Geodetic(latitude_deg=47.4, longitude_deg=8.5, altitude_m=400.0)
 FLIES = Telemetry(
@@ -167,9 +169,9 @@ def test_who_else_is_there_and_what_was_ignored_is_in_the_diagnostics(made: Made
         system="system 7", other_controller="system 255 sends setpoints", discarded={"late": 2, "repeated": 1}
     )
     activate(made)
-    made.until(lambda: made.node.bridge.warnings)
+    made.until(lambda: made.node.bridge.is_over)
     warnings, values = made.node.diagnose()
-    assert any("system 255 sends setpoints" in warning for warning in warnings)
+    assert "another system commands this vehicle: system 255 sends setpoints" in warnings
     expected = {
         "system": "system 7",
         "other controller": "system 255 sends setpoints",
@@ -192,6 +194,33 @@ def test_where_the_grid_lies_is_logged_and_kept_when_the_vehicle_takes_off(made:
     kept = datums.last(made.node.scenario)
     assert kept is not None
     assert (kept.datum, kept.vehicle) == (str(DATUM), "mavlink")
+
+
+@pytest.mark.parametrize("flies", [False, True])
+def test_the_journal_keeps_which_vehicle_flies(
+    made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, flies: bool
+) -> None:
+    """One that was only met, on the ground, need not be the one that is meant."""
+    given: list[Any] = []
+
+    def make(*values: Any) -> Stub:
+        given.append(values[-1])
+        return made.vehicle
+
+    monkeypatch.setattr(vehicles, "make", make)
+    node, made.vehicle.datum = made.node, DATUM
+    made.vehicle.known = replace(FLIES, system_id=7, armed=flies)
+    node.trigger_configure()
+    node.journal = Journal(str(tmp_path / "journal"))
+    node.trigger_activate()
+    made.until(lambda: node._begun)
+    node.bridge.phase = Phase.READY if flies else Phase.PREFLIGHT
+    node._on_change()
+    node._open.close()  # it is killed
+    node.bridge.phase = Phase.ABORTED
+    node.trigger_deactivate()
+    node.trigger_activate()
+    assert given == [None, 7 if flies else None]
 
 
 def test_steps_that_were_not_reached_are_told(made: Made) -> None:

@@ -193,6 +193,7 @@ class Hearing:
             limits=self._limits(),
             other_controller=self.rivals.found(self.vehicle_s),
             system=str(self.systems),
+            system_id=self.system,
             discarded=dict(self.discarded),
         )
 

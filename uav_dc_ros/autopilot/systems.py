@@ -27,7 +27,7 @@ class Systems:
     def __init__(self, named: int | None, again: bool = False) -> None:
         self.named, self.number = named, named
         self.dialect: Dialect | None = None
-        self._listens = LISTENED_AGAIN if again else LISTENED
+        self._listens = LISTENED if not again else LISTENED_AGAIN if named is None else 1
         self._heartbeats = 0  # of the vehicle
         self._present: dict[int, tuple[float, str]] = {}  # vehicles that could be meant: when they spoke last
         self._stranger: str | None = None  # why somebody who spoke is not meant

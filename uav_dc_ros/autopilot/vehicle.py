@@ -66,6 +66,7 @@ class Telemetry:
         limits: of the autopilot's own parameters; None: not reported.
         other_controller: another system that commands this vehicle, with the evidence; None: none was seen.
         system: the vehicle's identity on its link, such as `system 1`; empty: not known.
+        system_id: its number there, for a transport that is opened again; None: not known.
         discarded: messages that were counted and ignored, by reason (late, repeated, impossible, ...).
     """
 
@@ -92,6 +93,7 @@ class Telemetry:
     limits: Limits | None = None
     other_controller: str | None = None
     system: str = ""
+    system_id: int | None = None
     discarded: Mapping[str, int] = field(default_factory=dict)
 
 

@@ -1,11 +1,14 @@
 """Who else is there while a bag is played: subscribers, those that cannot hear, other publishers."""
 
+from collections import defaultdict
 from collections.abc import Collection, Iterator
 
 from rclpy.node import Node
 
-from uav_dc_ros.nodes import qos
+from uav_dc_ros.nodes import qos, rivals
 from uav_dc_ros.nodes.outlet import Outlet
+from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.topics import TOPICS
 
 
 class Audience:
@@ -29,6 +32,24 @@ class Audience:
         """Full names of the nodes that subscribe to an outlet's topic."""
         ends = self._node.get_subscriptions_info_by_topic(outlet.name)
         return ", ".join(sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends))
+
+    def mission(self, also: Collection[str] = ()) -> str | None:
+        """The mission that publishes an outlet's topic, and has to be the only one; None: there is none.
+
+        Args:
+            also: full names of topics that are published beside the outlets.
+        """
+        publishers: dict[str, dict[str, list[str]]] = defaultdict(dict)  # by namespace and relative name
+        for name in sorted({*also, *(outlet.name for outlet in self._outlets)}):
+            namespace, _, relative = name.rpartition("/")
+            if relative in TOPICS and TOPICS[relative].exclusive:
+                ends = self._node.get_publishers_info_by_topic(name)
+                publishers[namespace][relative] = [qos.full_name(end) for end in ends]
+        for namespace, ends_by_topic in publishers.items():
+            found = rivals.find(ends_by_topic, namespace, NODES, absent=NODES)
+            if found.doubles:
+                return rivals.Rivals(doubles=found.doubles).told()
+        return None
 
     def others(self) -> Iterator[str]:
         """What is to be told of topics that somebody else publishes, too: two worlds at once help nobody."""

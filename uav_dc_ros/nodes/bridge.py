@@ -36,13 +36,18 @@ OBEYS_S = 2.5  # for a vehicle to obey a bridge that stops
 
 
 class Kept(msgspec.Struct, frozen=True, kw_only=True):
-    """The journal's line: which mission it is, where it stands, and where the grid lies."""
+    """The journal's line: which mission it is, where it stands, where the grid lies, and which vehicle flies.
+
+    Attributes:
+        system: the vehicle's number on its link, as `Telemetry.system_id`; None: not known.
+    """
 
     fingerprint: str
     seed: int
     run: str
     standing: Standing
     anchor: str
+    system: int | None
 
 
 class AutopilotBridge(MissionNode):
@@ -70,15 +75,17 @@ class AutopilotBridge(MissionNode):
         """Reach for the vehicle; the mission begins when the peers are ready, or goes on at once."""
         kept = self._restore()
         standing, anchor = (None, "") if kept is None else (kept.standing, kept.anchor)
+        # On the ground it is found anew: who was heard first there need not be the one that is meant.
+        system = kept.system if kept is not None and kept.standing.flies else None
         datum = self._datum()
         self.run = self.values["run"] or (self.run if kept is None else kept.run)
         self.bridge = Bridge(self.scenario, self.settings, self._on_change, standing, self.fence)
-        self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, datum, anchor)
+        self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, datum, anchor, system)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
         self._begun = standing is not None and standing.flies
         self._forgets = False  # the journal cannot be written
-        self._known = Telemetry()
+        self._known = Telemetry(system_id=system)
         self._told: messages.Mission | None = None
         self._news: list[str] = []  # changes since the last diagnostics
         self._changes = 0
@@ -261,6 +268,7 @@ class AutopilotBridge(MissionNode):
             run=self.run,
             standing=self.bridge.standing,
             anchor=self.vehicle.anchor,
+            system=self._known.system_id,
         )
         try:
             self.journal.begin(msgspec.json.encode(kept))

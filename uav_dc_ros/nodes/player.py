@@ -24,6 +24,7 @@ from uav_dc_ros.nodes.keys import HELP, Keys
 from uav_dc_ros.nodes.outlet import Outlet
 from uav_dc_ros.nodes.play_clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN, PlayClock
 from uav_dc_ros.nodes.play_display import PlayDisplay
+from uav_dc_ros.nodes.rivals import AnotherMissionError
 from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.05  # keys, the bar and `/clock` are looked at as often, at least
@@ -124,6 +125,7 @@ class Player:
         Raises:
             BagError: the bag is damaged somewhere.
             NodeError: a topic got no subscriber in time.
+            AnotherMissionError: a mission is being flown on topics that are played.
         """
         self.clock.jump(self._start_ns)
         with self._keys:
@@ -311,5 +313,8 @@ class Player:
             self._tick(now_s, GRAPH_IDLE_S)
             self._heed(self._keys.wait(TICK_S))
         self._waits = False
+        beside = () if self.plan.clock_hz is None else (CLOCK_TOPIC,)
+        if (mission := self._audience.mission(beside)) is not None:
+            raise AnotherMissionError(mission)
         for told in (*self._audience.others(), *self._audience.deaf()):
             self.display.note(told)

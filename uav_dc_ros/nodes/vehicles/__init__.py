@@ -17,7 +17,12 @@ from uav_dc_ros.nodes.vehicles.px4 import Px4, load_messages
 
 
 def make(
-    node: Node, values: Mapping[str, Any], scenario: Scenario, datum: Geodetic | None, anchor: str
+    node: Node,
+    values: Mapping[str, Any],
+    scenario: Scenario,
+    datum: Geodetic | None,
+    anchor: str,
+    system: int | None = None,
 ) -> Vehicle:
     """The vehicle that a bridge's parameters name; not opened yet.
 
@@ -27,6 +32,7 @@ def make(
         scenario: whose start the vehicle stands under, unless there is a datum.
         datum: of the grid; None: see `scenario`.
         anchor: of the same vehicle before the bridge was started again; empty: there was none.
+        system: likewise its number on the link, where the parameter names none; None: see `anchor`.
 
     Raises:
         VehicleError: there is no such way on this machine.
@@ -37,8 +43,8 @@ def make(
     kind, connect = values["vehicle"], values["connect"]
     check(kind, connect, values["system"], values["arm"])
     if kind == "mavlink":
-        system = values["system"] or None
-        return Mavlink(connect, datum=datum, place=place, anchor=anchor, system=system)
+        named = values["system"] or system
+        return Mavlink(connect, datum=datum, place=place, anchor=anchor, system=named)
     if kind == "mavros":
         return Mavros(node, place=place, anchor=anchor, datum=datum, arms=values["arm"])
     return Px4(node, place=place, anchor=anchor, datum=datum)
