@@ -167,14 +167,16 @@ def test_what_is_missing_after_connecting_stops_a_take_off(armed: bool) -> None:
 
 
 def test_another_system_that_comes_in_flight_is_reported() -> None:
-    flight = fly_to_step(3)
-    flight.vehicle.other_controller = "component 191 of system 254 sends heartbeats"
+    flight, evidence = fly_to_step(3), "component 191 of system 254 sends heartbeats"
+    flight.vehicle.other_controller = evidence
     flight.run(1.0)
     assert flight.bridge.phase in (Phase.READY, Phase.MOVING)
-    assert flight.bridge.warnings == [
-        "another system commands this vehicle: component 191 of system 254 sends heartbeats"
-    ]
+    assert flight.bridge.warnings == [f"another system commands this vehicle: {evidence}"]
     assert any("another system commands this vehicle" in reason for _, _, reason in flight.log)
+    flight.vehicle.other_controller = None
+    flight.vehicle.battery = 0.1
+    flight.until(Phase.LANDING)
+    assert flight.bridge.reason.endswith("; another system commands this vehicle: " + evidence)
 
 
 def test_a_target_that_is_not_ours_for_long_ends_the_mission() -> None:

@@ -19,7 +19,7 @@ from uav_dc_ros.autopilot.crash import Crash
 from uav_dc_ros.autopilot.descent import DOWN, Descent, Next
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.ground import Ground
+from uav_dc_ros.autopilot.ground import Ground, rival
 from uav_dc_ros.autopilot.hold import Hold
 from uav_dc_ros.autopilot.patience import Patience
 from uav_dc_ros.autopilot.progress import Tracking
@@ -261,9 +261,9 @@ class Bridge:
         if (low := self._watched.battery_is_low(known)) is not None:
             self._give_up(low)
             return
-        if known.other_controller not in (None, self._reported):
-            self._reported = known.other_controller
-            self._change(f"{self.reason}; another system commands this vehicle: {self._reported}")
+        if (other := rival(known)) not in (None, self._reported):
+            self._reported = other
+            self._change(f"{self.reason}; {other}")
         lost = self._watched.link_is_lost(now_s, known)
         if not lost and (crash := self._crash.look(known, self.setpoint)) is not None:
             self._give_up(crash, Mode.LAND)
@@ -316,6 +316,7 @@ class Bridge:
     def _give_up(self, why: str, how: Mode | None = None, blind_since_s: float | None = None) -> None:
         """End the mission: bring the vehicle down."""
         self._hold.fault = None
+        why = why if self._reported is None else f"{why}; {self._reported}"  # which may be why
         self._descend(how or self.settings.then, Phase.ABORTED, why, blind_since_s)
 
     # What is to be done in each phase.

@@ -55,9 +55,7 @@ class Ground:
 
     def refusal(self, known: Telemetry) -> str | None:
         """Why the mission cannot be flown with this vehicle as it is; None: it can."""
-        if known.other_controller is not None:
-            return f"another system commands this vehicle: {known.other_controller}"
-        return self._misfit(known)
+        return rival(known) or self._misfit(known)
 
     def connect(self, now_s: float, known: Telemetry, waited_s: float) -> Next:
         """Look at a vehicle that nothing is known of yet.
@@ -174,8 +172,8 @@ class Ground:
         """What a user should know, though it is no reason not to fly."""
         limits, scenario = known.limits, self.course.scenario
         found = [] if limits is None else field_check.warnings(scenario, self.settings, limits)
-        if known.other_controller is not None:
-            found.append(f"another system commands this vehicle: {known.other_controller}")
+        if (other := rival(known)) is not None:
+            found.append(other)
         return found
 
     def _misfit(self, known: Telemetry) -> str | None:
@@ -184,6 +182,12 @@ class Ground:
         if known.limits is None or home is None:
             return None
         return field_check.misfit(self.course.scenario, self.settings, known.limits, home)
+
+
+def rival(known: Telemetry) -> str | None:
+    """Who else commands the vehicle; None: nobody was seen."""
+    who = known.other_controller
+    return None if who is None else f"another system commands this vehicle: {who}"
 
 
 def _name(known: Telemetry) -> str:
