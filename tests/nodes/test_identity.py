@@ -110,9 +110,7 @@ sys.exit(bag.main())
 """
 
 
-def test_a_player_that_comes_later_is_refused_and_another_one_changes_nothing(
-    ros: Ros, options: list[object], bag: Path
-) -> None:
+def test_a_player_that_comes_later_changes_nothing(ros: Ros, options: list[object], bag: Path) -> None:
     """The bag has another seed, so that every payload and, but for the first, every pose is another."""
     given = (*options, "--seed", 7, "--pace", "lockstep")
     status, output = ros.run_all(*given, "--bag", "seven", "--summary", "seven.json")
@@ -122,18 +120,8 @@ def test_a_player_that_comes_later_is_refused_and_another_one_changes_nothing(
     assert flight.stdout is not None
     printed = wait_for(flight.stdout, "mission: step 0/30")
     player = ros.start_command(sys.executable, "-c", HEEDLESS, "play", bag, "--loop", "--rate", 2)
-    refused = [ros.run("uav_dc_ros.bag", "play", bag, *more) for more in ((), ("--topics", "/pose"))]
-    elsewhere = ros.run("uav_dc_ros.bag", "play", bag, "--namespace", "/uav2", "--rate", "max")
-    assert flight.poll() is None, "the mission has to outlive them"
     status, output = finish(flight)
     stopped(player)
-    for status_of_player, told in refused:
-        assert status_of_player == 2, told
-        assert "bag play: another mission is being flown here by /" in told, told
-        assert "/world" in told
-        assert "give this one a namespace of its own (--namespace uav2)" in told
-        assert "published 0 messages" in told
-    assert elsewhere[0] == 0, elsewhere[1]
     assert status == 0, output
     assert "note: /player publishes " in output, output
     assert "mission: another_run: it belongs to run" in printed + output

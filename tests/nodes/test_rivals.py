@@ -1,8 +1,12 @@
 """Who else publishes what a mission has one publisher of."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from uav_dc_ros.nodes import rivals
+from uav_dc_ros.nodes.audience import Audience
 from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
 from uav_dc_ros.topics import TOPICS
 
@@ -64,3 +68,40 @@ def test_nobody_is_a_rival_on_a_topic_that_this_mission_does_not_have() -> None:
     around = {**NODES, "world": WORLD_AROUND}
     assert not rivals.find({"clock": ["/gazebo"]}, "/", around)
     assert rivals.find({"clock": ["/gazebo"]}, "/", NODES)
+
+
+def audience(publishers: dict[str, list[str]], *played: str) -> Audience:
+    """Who is there while topics are played, by what the graph tells: full names of nodes, by topic."""
+
+    def ends(topic: str) -> list[Any]:
+        names = [name.rpartition("/") for name in ("/player", *publishers.get(topic, ()))]
+        return [SimpleNamespace(node_namespace=space or "/", node_name=name) for space, _, name in names]
+
+    node: Any = SimpleNamespace(get_publishers_info_by_topic=ends)
+    outlets: Any = [SimpleNamespace(name=topic) for topic in played]
+    return Audience(node, outlets)
+
+
+@pytest.mark.parametrize(
+    ("topic", "publisher", "is_refused"),
+    [
+        ("/pose", "/world", True),
+        ("/pose", "/bridge", True),
+        ("/uav2/move", "/uav2/policy", True),
+        ("/uav2/pose", "/world", False),  # another's: a note says so
+        ("/pose", "/player", False),
+        ("/pose", "/mavros", False),
+        ("/diagnostics", "/world", False),  # which anybody may publish
+        ("/camera", "/world", False),
+    ],
+)
+def test_a_bag_is_not_played_into_a_mission(topic: str, publisher: str, is_refused: bool) -> None:
+    told = audience({topic: [publisher]}, topic, "/other").mission()
+    assert told == (f"another mission is being flown here by {publisher}" if is_refused else None)
+    assert audience({topic: [publisher]}, f"/elsewhere{topic}").mission() is None, "by --namespace"
+
+
+def test_a_bag_s_clock_does_not_stand_beside_a_mission_s() -> None:
+    beside = audience({"/clock": ["/world"]}, "/pose")
+    assert beside.mission() is None
+    assert beside.mission(["/clock"]) == "another mission is being flown here by /world"
