@@ -112,7 +112,7 @@ def test_wrong_arguments_are_named():
 
 def test_observations_stay_within_their_space_for_a_centre_off_the_grid():
     scenario = changed(
-        "three_clusters", users={"cluster_centres_m": [[-500.0, 2000.0], [0.0, 0.0], [1e4, 5.0]]}
+        "three_clusters", users={"cluster_centres_m": [[-100.0, 1100.0], [0.0, 0.0], [1100.0, 5.0]]}
     )
     env = DataCollectionEnv(scenario, "map")
     seen, _ = env.reset(seed=0)

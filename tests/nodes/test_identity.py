@@ -1,6 +1,7 @@
 """One mission beside another, and beside a player of bags: never the other's summary, always a reason."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -91,7 +92,9 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
         assert f"(run {run}): give this one" in told
     status, rest = stopped(first)
     assert status == 130, rest
-    assert "WARN" not in printed + rest, "it was touched"
+    # A latched path keeps the newest one only: a recorder on a busy machine misses some.
+    warnings = re.findall(r".*WARN(?!: dropped messages: /path).*", printed + rest)
+    assert warnings == [], "it was touched"
     assert payloads(ros.folder / "first") == payloads(bag)
     assert {m["run"] for topic, m in read_bag(ros.folder / "first") if topic in COMPARED} == {run}
     summaries = json.loads((ros.folder / "first.json").read_text())

@@ -453,7 +453,10 @@ def test_a_monitor_that_outlives_a_flight_takes_no_pose_of_it_for_the_next(ros: 
         assert status == 0, output
 
     probe = ros.stranger("probe", "/mission")
-    others = [start("channel_monitor"), start("recorder", f"bag:={bag}", 'peers:=["channel_monitor"]')]
+    others = [
+        start("channel_monitor", 'peers:=["world", "recorder"]'),
+        start("recorder", f"bag:={bag}", 'peers:=["channel_monitor"]'),
+    ]
     first = start("world", "pace:='100'", 'peers:=["channel_monitor", "recorder"]')
     wait_for(probe.stdout, '\\"step\\":7')
     stop(first)

@@ -284,7 +284,8 @@ class MissionNode(ManagedNode):
     def on_peers(self) -> None:
         """All peers are there."""
         if "ready" in self.row.publishes:
-            self.say("ready", messages.Ready(run=self.run, node=self.row.name))
+            # A run that was adopted may be one that is over: whoever begins the next takes a node without one.
+            self.say("ready", messages.Ready(run=self.values["run"], node=self.row.name))
 
     # Diagnostics.
 
