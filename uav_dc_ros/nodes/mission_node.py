@@ -284,7 +284,7 @@ class MissionNode(ManagedNode):
     def on_peers(self) -> None:
         """All peers are there."""
         if "ready" in self.row.publishes:
-            # A run that was adopted may be one that is over: whoever begins the next takes a node without one.
+            # An adopted run may be over: the vehicle of the next one takes a node without any.
             self.say("ready", messages.Ready(run=self.values["run"], node=self.row.name))
 
     # Diagnostics.
