@@ -191,7 +191,7 @@ def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[ob
     peer = python(ros, DEMANDING)
     assert peer.stdout is not None
     wait_for(peer.stdout, "listening")
-    status, output = ros.run_all(*options, "--no-record", "--pace", 100)
+    status, output = ros.run_all(*options, "--no-record", "--pace", 40)  # the second look tells it
     peer.kill()
     peer.communicate()
     assert status == 0, output
