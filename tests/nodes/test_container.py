@@ -156,8 +156,8 @@ def test_one_node_that_cannot_begin_lets_none_begin(ros: Ros, small_policy: Path
 def test_a_line_of_a_shared_process_says_whose_it_is(ros: Ros, flight: list[object]) -> None:
     status, output = ros.run_all(*flight, "--pace", "lockstep", "--set", "channel_monitor.journal=/dev/full")
     assert status == 1, output
-    told = "ERROR: channel_monitor: journal /dev/full: it is no file; expected one, or a new one"
-    assert f"container: {told}" in output
+    told = "journal /dev/full: it is no file; expected one, or a new one"
+    assert f"container: ERROR: channel_monitor: {told}" in output
     assert f"error: node channel_monitor could not be configured: {told}" in output
 
 

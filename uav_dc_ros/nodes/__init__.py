@@ -38,7 +38,7 @@ What run_all is made of:
 flight           one run: check everything, start, follow, stop, tell
 options          what of its options needs more than the command line to be checked
 supervisor       brings nodes up in order, starts dead ones again, takes them down in reverse
-launcher         a node, or several, as a child process
+launcher         a node, or several, as a child process; control is what both ends of its pipes agree on
 observer         run_all's own eyes: the mission so far, and its summary
 display          what the user sees of it
 output           standard output and error, which can neither delay a mission nor end it

@@ -92,7 +92,8 @@ class Flight:
             executor = DirectExecutor(node.rest_s)
             executor.add_node(node)
             with Supervisor(
-                node, parameters, self.together, folder, self.display.node_line, self.display.note
+                *(node.get_namespace(), parameters, self.together, folder),
+                *(self.display.node_line, self.display.note),
             ) as supervisor:
                 try:
                     self._follow(supervisor, node, executor)
@@ -127,9 +128,10 @@ class Flight:
             now_s = time.monotonic()
             if now_s >= check_s:
                 check_s = now_s + TICK_S
-                node.look()
-                if node.is_alone:  # until then it asks nothing of nodes, which may be another mission's
-                    supervisor.tick()
+                node.look(supervisor.have_started)
+                supervisor.tick(node.is_alone)
+                if not node.is_alone:  # patience begins when the mission may
+                    self._step_s = now_s
                 if node.restarts_of != supervisor.restarts:  # the mission waits for a node that starts again
                     node.restarts_of, self._step_s = supervisor.restarts, now_s
                 node.close(LAST_RATES_S)

@@ -1,10 +1,11 @@
 """Runs a node of the node table as a process, or several in one.
 
 Such a process ends when its standard input ends, so none outlives a run_all that was killed. What it prints
-is passed on with its name in front. The thread that runs its callbacks sends a heartbeat through a pipe, so
-that one that hangs is told from one that has nothing to do.
+is passed on with its name in front. The thread that runs its callbacks sends reports through a pipe, also
+while there is nothing to do: a process that sends none hangs.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -16,10 +17,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes import environment
-from uav_dc_ros.nodes.mission_node import HEARTBEAT, SUPERVISED
+from uav_dc_ros.nodes import control, environment
+from uav_dc_ros.nodes.control import REPORTS, SUPERVISED, NodeReport
 
-HEARTBEATS_MAX = 4096  # that are read at a time
+READ_MAX = 1 << 16  # bytes; no pipe holds more
 
 
 class NodeProcess:
@@ -39,7 +40,8 @@ class NodeProcess:
         name: of the module that it runs.
         who: it, in words.
         failure: why it was killed; empty if it was not.
-        silent_s: time since its last heartbeat, or its start.
+        reports: the last report of each of its nodes, by name; empty until it has started.
+        silent_s: time since its last report, or its start, seconds.
     """
 
     def __init__(
@@ -60,9 +62,9 @@ class NodeProcess:
             file.write_text(json.dumps(of_nodes, ensure_ascii=False), "utf-8")
         except (OSError, UnicodeEncodeError) as error:
             raise NodeError(f"parameters of {self.who} cannot be written to {file}: {error}") from None
-        self._heartbeat, theirs = os.pipe()
-        os.set_blocking(self._heartbeat, False)
-        own = {SUPERVISED: str(restarts), HEARTBEAT: str(theirs)}
+        self._pipe, theirs = os.pipe()
+        os.set_blocking(self._pipe, False)
+        own = {SUPERVISED: str(restarts), REPORTS: str(theirs)}
         if not alone and os.environ.get(environment.LINES) == environment.LINE_OF_NODE:
             own[environment.LINES] = environment.LINE_OF_ONE_OF_MANY
         self.process = subprocess.Popen(
@@ -81,6 +83,8 @@ class NodeProcess:
         os.close(theirs)
         self.failure = ""
         self.silent_s = 0.0
+        self.reports: Mapping[str, NodeReport] = {}
+        self._unread = b""  # the beginning of a report
         self._on_line = on_line
         self.last_line = ""
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -93,12 +97,21 @@ class NodeProcess:
             self._on_line(self.name, self.last_line)
 
     def watch(self, passed_s: float) -> None:
-        """Look for heartbeats; `passed_s` seconds have passed since this was done last."""
+        """Take in reports; `passed_s` seconds have passed since this was done last."""
         try:
-            beaten = bool(os.read(self._heartbeat, HEARTBEATS_MAX))
+            received = os.read(self._pipe, READ_MAX)
         except BlockingIOError:
-            beaten = False
-        self.silent_s = 0.0 if beaten else self.silent_s + passed_s
+            received = b""
+        self.silent_s = 0.0 if received else self.silent_s + passed_s
+        *lines, self._unread = (self._unread + received).split(b"\n")
+        if lines:
+            self.reports = control.decode(lines[-1])
+
+    def command(self, transition: str, node: str) -> None:
+        """Command a transition of one of its nodes."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended, which is seen as any other end
+            os.write(self.process.stdin.fileno(), control.command(transition, node))
 
     def kill(self, why: str) -> None:
         """End a process that hangs."""
@@ -136,9 +149,9 @@ class NodeProcess:
     def close(self) -> None:
         """Let go of the pipes of a process that has ended."""
         self._reader.join(1.0)
-        if self._heartbeat >= 0:
-            os.close(self._heartbeat)
-            self._heartbeat = -1
+        if self._pipe >= 0:
+            os.close(self._pipe)
+            self._pipe = -1
         for pipe in (self.process.stdin, self.process.stdout):
             assert pipe is not None
             pipe.close()

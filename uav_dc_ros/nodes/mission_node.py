@@ -17,14 +17,13 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from uav_dc_ros import messages, payloads, topics
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes import cdr, diagnostics, qos, rivals
+from uav_dc_ros.nodes.control import SUPERVISED
 from uav_dc_ros.nodes.diagnostics import Meter
 from uav_dc_ros.nodes.managed_node import ManagedNode
 from uav_dc_ros.nodes.table import rows
 from uav_dc_ros.topics import TOPICS, Topic
 
 CDR_HEAD = 8  # bytes before the text of a serialised std_msgs/String
-HEARTBEAT = "UAV_DC_ROS_HEARTBEAT"  # set by run_all: the file descriptor that takes the heartbeat
-SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this node has been started again
 PEERS_PERIOD_S = 0.02
 # For the last words to be acknowledged: a bad link takes a while, and a peer that was killed never does.
 ACKNOWLEDGE_S = 1.5

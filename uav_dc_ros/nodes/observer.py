@@ -177,8 +177,12 @@ class Observer(MissionNode):
         self._ended_s = 0.0  # when the last one was
         self._told = -1  # the last mission whose end was told
 
-    def look(self) -> None:
+    def look(self, have_started: bool) -> None:
         """Look for others who publish this mission's topics. Once it has begun they are told, and ignored.
+
+        Args:
+            have_started: have the nodes of this run_all started? On a machine with much to do, others are
+                found as late as those.
 
         Raises:
             AnotherMissionError: this mission has not begun, and must not.
@@ -190,7 +194,7 @@ class Observer(MissionNode):
         self._look_s = now_s + (LOOK_LATER_S if begun else LOOK_S)
         # The graph still tells of a node that was killed, for a while.
         again = self.rows if begun else [name for name, n in self.restarts_of.items() if n]
-        absent = () if self.is_alone else self._here
+        absent = () if self.is_alone and self._other_run is None else self._here
         found = rivals.find(rivals.publishers(self), self.get_namespace(), self.rows, again, absent)
         if not begun and (found or self._other_run is not None):
             self._found_s = self._found_s or now_s
@@ -200,7 +204,7 @@ class Observer(MissionNode):
         if found.foreign.keys() - self._noted:
             self._noted |= found.foreign.keys()
             self._on_note(f"{found.told()}; its payloads are ignored, its poses may be recorded")
-        self.is_alone |= now_s - self._since_s >= ALONE_S
+        self.is_alone |= have_started and now_s - self._since_s >= ALONE_S
 
     def _look_for_peers(self) -> None:
         if self.is_alone:  # otherwise another mission's nodes of these names would do

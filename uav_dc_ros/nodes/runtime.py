@@ -8,8 +8,9 @@ import signal
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -17,14 +18,14 @@ from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros import cli
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes import environment, fastdds, usage
+from uav_dc_ros.nodes import control, environment, fastdds, usage
+from uav_dc_ros.nodes.control import SUPERVISED
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.mission_node import HEARTBEAT, SUPERVISED, MissionNode
+from uav_dc_ros.nodes.mission_node import MissionNode
 
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.2  # a message that was lost on the way is sent again within a tenth
 LEAVE_S = 3.0  # for the middleware to close
-HEARTBEAT_S = 0.25  # from one heartbeat to the next
 BACKGROUND = 5  # niceness of a node that nobody waits for
 # Exit statuses. Python's own 1 is left to what nobody thought of: only that is worth another try.
 NOT_BEGUN = 2
@@ -32,14 +33,19 @@ GAVE_UP = 3
 
 
 class Stopper:
-    """Turns SIGINT, SIGTERM, SIGHUP and, under run_all, the end of standard input into a wish to stop.
+    """Turns SIGINT, SIGTERM, SIGHUP and, under run_all, the end of standard input into a request to stop.
 
     A waiting executor sleeps in C, where Python's handlers do not run: signals arrive through a file
     descriptor in a thread that wakes it.
+
+    Attributes:
+        requested: was it requested to stop?
+        commands: lines of run_all, in the order in which they came, that are still to be obeyed.
     """
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self.requested = False
+        self.commands: deque[str] = deque()
         self._wake = wake
         self._ours, theirs = socket.socketpair()
         theirs.setblocking(False)
@@ -48,21 +54,27 @@ class Stopper:
         signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         threading.Thread(target=self._watch, daemon=True).start()
 
+    @property
+    def is_due(self) -> bool:
+        """Is there anything to be done: a stop, or a command."""
+        return self.requested or bool(self.commands)
+
     def close(self) -> None:
         """Wake no more: nothing waits, and what would be woken is to end."""
         self._wake = lambda: None
 
     def _watch(self) -> None:
-        sources: list[Any] = [self._ours]
-        if SUPERVISED in os.environ:
-            sources.append(open(0, "rb", buffering=0, closefd=False))  # noqa: SIM115  (for life)
+        sources = [self._ours.fileno(), *([0] if SUPERVISED in os.environ else [])]
+        line = b""
         while True:
             for source in select.select(sources, [], [])[0]:
-                told = source.recv(1) if source is self._ours else source.read(1)
-                if source is self._ours or not told:
-                    self.requested = True
+                received = os.read(source, 4096)
+                *lines, line = (line + received).split(b"\n") if source == 0 else (line,)
+                self.commands.extend(each.decode() for each in lines)
+                self.requested |= source != 0 or not received
+                if self.is_due:
                     self._wake()
-                if not told:
+                if not received:
                     sources.remove(source)
 
 
@@ -120,13 +132,15 @@ def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> 
             executor.add_node(node)
             node.serve = executor.spin_once
         stopper = Stopper(executor.wake)
-        _send_heartbeats(nodes[0])
+        reporter = control.Reporter(nodes)
+        reporter.report()
+        nodes[0].create_timer(control.PERIOD_S, reporter.report, clock=nodes[0].steady)
         if _begin([node for node in nodes if node.values["autostart"]]):
             gc.freeze()  # what is there by now stays: no need to look at it again and again
             if rest_s:
                 os.nice(BACKGROUND)
             status = GAVE_UP
-            status = _run(nodes, executor, stopper)
+            status = _run(nodes, executor, stopper, reporter)
         stopper.close()
     except UavDcError as error:
         cli.complain(f"error: {error}")
@@ -148,23 +162,6 @@ def _made(makes: Iterable[Callable[[], MissionNode]], arguments: list[str]) -> l
         raise ParameterError(f"{error}; expected ROS arguments after --ros-args") from None
 
 
-def _send_heartbeats(node: MissionNode) -> None:
-    """Under run_all, show it that the executor's thread turns, by a timer: a callback that hangs stops it."""
-    if HEARTBEAT not in os.environ:
-        return
-    pipe = int(os.environ[HEARTBEAT])
-    os.set_blocking(pipe, False)
-
-    def beat() -> None:
-        with contextlib.suppress(
-            OSError
-        ):  # full: run_all itself hangs; closed: it is gone, which Stopper sees
-            os.write(pipe, b".")
-
-    beat()
-    node.create_timer(HEARTBEAT_S, beat, clock=node.steady)
-
-
 def _begin(nodes: Sequence[MissionNode]) -> bool:
     """Configure and activate nodes that start by themselves; did all come so far."""
     for node in nodes:
@@ -178,10 +175,15 @@ def _begin(nodes: Sequence[MissionNode]) -> bool:
     return True
 
 
-def _run(nodes: Sequence[MissionNode], executor: DirectExecutor, stopper: Stopper) -> int:
+def _run(
+    nodes: Sequence[MissionNode], executor: DirectExecutor, stopper: Stopper, reporter: control.Reporter
+) -> int:
     """Spin until the nodes are asked to stop, and stop them safely, also when a callback failed."""
     try:
-        executor.spin(lambda: stopper.requested)
+        while not stopper.requested:
+            executor.spin(lambda: stopper.is_due)
+            while stopper.commands and not stopper.requested:
+                reporter.obey(stopper.commands.popleft())
         if any(node.drains and node.state == "active" for node in nodes):
             deadline_s = time.monotonic() + DRAIN_S
             executor.spin(lambda: time.monotonic() > deadline_s, DRAIN_QUIET_S)

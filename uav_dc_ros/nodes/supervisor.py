@@ -5,36 +5,33 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
-
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
-from rclpy.node import Node
+from typing import Self
 
 from uav_dc_ros.errors import NodeError
+from uav_dc_ros.nodes.control import ACTIVATE, CONFIGURE
 from uav_dc_ros.nodes.launcher import NodeProcess
 from uav_dc_ros.nodes.runtime import GAVE_UP, NOT_BEGUN
 from uav_dc_ros.nodes.table import NODES
 
 RESTART_WINDOW_S = 60.0  # deaths longer ago are forgiven
 BACK_OFF_S = 0.2  # before the first restart; twice as long before each further one
-ANSWER_S = 1.0  # for an answer of a node; a dead one's service may stand in the graph for a while
 BEGIN_S = 25.0  # a process may be silent for so long while it starts, or its nodes configure and activate
-PASSED_MAX_S = 0.5  # from one look at heartbeats to the next: more was a pause of this process itself
+PASSED_MAX_S = 0.5  # from one look at reports to the next: more was a pause of this process itself
 STOP_S = 10.0  # for a node to end after it was asked to: a bridge waits for its vehicle to obey
 UP = ("unconfigured", "inactive", "active")  # the way up; each transition leads to the next
-TRANSITIONS = {"unconfigured": Transition.TRANSITION_CONFIGURE, "inactive": Transition.TRANSITION_ACTIVATE}
+TRANSITIONS = {"unconfigured": CONFIGURE, "inactive": ACTIVATE}
 
 
 class Supervised:
     """One node: its process, which others may share, and how far it has come.
 
     Attributes:
-        state: of its life cycle, as last told; none before its process has answered.
+        state: of its life cycle, as reported last; none before its process has reported. Once it is active,
+            others may change it by the services of the life cycle: that is not undone.
         restarts: how often it was started again.
     """
 
-    def __init__(self, name: str, parameters: Mapping[str, object], asker: Node) -> None:
+    def __init__(self, name: str, parameters: Mapping[str, object]) -> None:
         self.row = NODES[name]
         self.parameters = dict(parameters)
         self.state: str | None = None
@@ -42,84 +39,40 @@ class Supervised:
         self.process: NodeProcess | None = None
         self.start_s = 0.0  # when to start it, while there is no process
         self.deaths_s: deque[float] = deque()
-        self._get = asker.create_client(GetState, f"{name}/get_state")
-        self._change = asker.create_client(ChangeState, f"{name}/change_state")
-        self._forget()
-
-    def _forget(self) -> None:
-        self._state_reply: Any = None  # that is awaited
-        self._change_reply: Any = None  # that is awaited
-        self._asked_s = 0.0  # when the last request was sent
-        self._refused_in: str | None = None  # state in which the node refused a transition
-        self._unmoved = 0  # replies with the state from which the transition was requested
+        self._commanded: str | None = None  # the last transition
 
     def begin(self, process: NodeProcess) -> None:
         """Take charge of a new process."""
-        self.process, self.state = process, None
-        self._forget()
+        self.process, self.state, self._commanded = process, None, None
 
-    def climb(self, may_activate: bool) -> None:
-        """Go on with the way up.
-
-        What counts is the state that the node reports, not the reply to a transition: that one may be lost or
-        late, and a request may be served twice.
+    def bring_up(self, may_activate: bool) -> None:
+        """Command the next transition on the way up, once.
 
         Raises:
-            NodeError: the node refuses a transition.
+            NodeError: the node refuses it, or is in a state from which no way leads up.
         """
-        now_s = time.monotonic()
-        if self._change_reply is not None and self._change_reply.done():
-            refused = not self._change_reply.result().success
-            self._refused_in, self._change_reply = self.state if refused else None, None
-            self._request_state(now_s)
-        elif self._state_reply is not None and self._state_reply.done():
-            self._take_state(self._state_reply.result().current_state.label)
-        elif self._change_reply is not None or self._state_reply is not None:
-            if now_s - self._asked_s > ANSWER_S:
-                self._request_state(now_s)
-        elif self.state is None or self._refused_in is not None:
-            self._request_state(now_s)
-        else:
-            self._request_transition(now_s, may_activate)
-
-    def _take_state(self, state: str) -> None:
-        """Note the state that the node reports.
-
-        Raises:
-            NodeError: it is the one in which it refused a transition, or none on the way up.
-        """
-        self._state_reply = None
-        if state not in UP or state == self._refused_in:
-            assert self.process is not None
-            wanted = {"unconfigured": "configured", "inactive": "activated"}.get(state, f"used as {state}")
-            raise NodeError(f"node {self.row.name} could not be {wanted}: {self.process.last_line}")
-        self._unmoved = self._unmoved + 1 if state == self.state else 0
-        if self._change_reply is not None and self._unmoved != 1:  # served; or its request or reply was lost
-            self._change.remove_pending_request(self._change_reply)
-            self._change_reply = None
-        self.state, self._refused_in = state, None
-
-    def _request_state(self, now_s: float) -> None:
-        if not self._get.service_is_ready():
+        assert self.process is not None, "otherwise there is nobody to command"
+        report = self.process.reports.get(self.row.name)
+        if report is None:
             return
-        if self._state_reply is not None:
-            self._get.remove_pending_request(self._state_reply)
-        self._asked_s, self._state_reply = now_s, self._get.call_async(GetState.Request())
-
-    def _request_transition(self, now_s: float, may_activate: bool) -> None:
-        assert self.state is not None, "otherwise the state is requested"
-        allowed = self.state != "inactive" or may_activate
-        if self.state in TRANSITIONS and allowed and self._change.service_is_ready():
-            request = ChangeState.Request(transition=Transition(id=TRANSITIONS[self.state]))
-            self._asked_s, self._change_reply = now_s, self._change.call_async(request)
-            self._unmoved = 0
+        self.state = report.state
+        if report.refused is not None:
+            wanted = {CONFIGURE: "configured", ACTIVATE: "activated"}[self._commanded or CONFIGURE]
+            raise NodeError(f"node {self.row.name} could not be {wanted}: {report.refused}")
+        if report.state not in UP:
+            raise NodeError(f"node {self.row.name} is {report.state}; expected some of {', '.join(UP)}")
+        transition = TRANSITIONS.get(report.state)
+        if transition in (None, self._commanded) or (transition == ACTIVATE and not may_activate):
+            return
+        self._commanded = transition
+        self.process.command(transition, self.row.name)
 
 
 class Supervisor:
     """The nodes of a mission on this host; a context manager that leaves no process behind.
 
     Args:
-        asker: a node of this process, in the mission's namespace, that somebody spins.
+        namespace: of the mission.
         parameters: ROS parameters of each node to run, by name.
         together: names of those that share a process. After its end each gets one of its own: the one that
             was to blame shows itself, and takes nobody with it.
@@ -130,17 +83,17 @@ class Supervisor:
 
     def __init__(
         self,
-        asker: Node,
+        namespace: str,
         parameters: Mapping[str, Mapping[str, object]],
         together: Collection[str],
         folder: Path,
         on_line: Callable[[str, str], None],
         on_note: Callable[[str], None],
     ) -> None:
-        self._namespace = asker.get_namespace()
+        self._namespace = namespace
         self._together, self._folder = together, folder
         self._on_line, self._on_note = on_line, on_note
-        self.nodes = [Supervised(name, values, asker) for name, values in parameters.items()]
+        self.nodes = [Supervised(name, values) for name, values in parameters.items()]
         self._brought_up = False
         self._ticked_s = time.monotonic()
 
@@ -163,6 +116,11 @@ class Supervisor:
         """How often each node was started again."""
         return {node.row.name: node.restarts for node in self.nodes}
 
+    @property
+    def have_started(self) -> bool:
+        """Has every node started so far that it reports."""
+        return all(node.process is not None and bool(node.process.reports) for node in self.nodes)
+
     def _start(self, nodes: Sequence[Supervised]) -> None:
         """Start a process of these nodes."""
         parameters = {
@@ -177,27 +135,30 @@ class Supervisor:
         for node in nodes:
             node.begin(process)
 
-    def tick(self) -> None:
+    def tick(self, may_begin: bool) -> None:
         """Go on with whatever is to be done; to be called often.
+
+        Args:
+            may_begin: may the nodes be configured and activated by now?
 
         Raises:
             NodeError: a node that is needed refuses to start, gave up, or keeps dying.
         """
-        self._watch_heartbeats()
+        self._watch_reports()
         for node in list(self.nodes):
             if node.process is None:
                 if time.monotonic() >= node.start_s:
                     self._start([node])
             elif node.process.ended:
                 self._bury(node.process)
-            elif node.state != "active":
+            elif may_begin and node.state != "active":
                 try:
-                    node.climb(self._brought_up or self._lower_ranks_are_active(node))
+                    node.bring_up(self._brought_up or self._lower_ranks_are_active(node))
                 except NodeError as error:
                     self._lose(node, str(error))
         self._brought_up = self._brought_up or all(node.state == "active" for node in self.nodes)
 
-    def _watch_heartbeats(self) -> None:
+    def _watch_reports(self) -> None:
         """Kill processes that hang: their ends are seen as any other."""
         now_s, before_s = time.monotonic(), self._ticked_s
         self._ticked_s = now_s

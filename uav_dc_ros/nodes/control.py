@@ -1,0 +1,87 @@
+"""How run_all controls the processes of its nodes: commands through standard input, reports through a pipe.
+
+The services of the life cycle are there for everybody else. run_all does not use them: ROS finds a service by
+its name, so that beside another mission in the same namespace a request may reach that mission's node, too. A
+pipe has no other end than the process that was started with it, and loses and repeats nothing.
+"""
+
+import contextlib
+import os
+from collections.abc import Mapping, Sequence
+
+import msgspec
+
+from uav_dc_ros.nodes.managed_node import ManagedNode
+
+SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this process has been restarted
+REPORTS = "UAV_DC_ROS_REPORTS"  # set by run_all: the file descriptor that takes the reports
+PERIOD_S = 0.25  # from one report to the next
+CONFIGURE, ACTIVATE = "configure", "activate"
+REASON_MAX = 1000  # characters; a report is shorter than what a pipe takes in one piece
+
+
+class NodeReport(msgspec.Struct, frozen=True):
+    """How far a node has come.
+
+    Attributes:
+        state: of its life cycle.
+        refused: why it refused the last transition; None if it did not.
+    """
+
+    state: str
+    refused: str | None = None
+
+
+_decoder = msgspec.json.Decoder(dict[str, NodeReport])
+
+
+def command(transition: str, node: str) -> bytes:
+    """A line that commands a transition of a node."""
+    return f"{transition} {node}\n".encode()
+
+
+def decode(line: bytes) -> Mapping[str, NodeReport]:
+    """Reports by name of the node, from a line."""
+    return _decoder.decode(line)
+
+
+class Reporter:
+    """The nodes' end: makes the transitions that are commanded, and reports.
+
+    A report is also a heartbeat: the executor's own thread sends one every `PERIOD_S`. A callback that hangs
+    stops them.
+
+    Args:
+        nodes: of this process.
+    """
+
+    def __init__(self, nodes: Sequence[ManagedNode]) -> None:
+        self._nodes = {node.row.name: node for node in nodes}
+        self._refused: dict[str, str] = {}
+        self._pipe: int | None = int(os.environ[REPORTS]) if REPORTS in os.environ else None
+        if self._pipe is not None:
+            os.set_blocking(self._pipe, False)
+
+    def report(self) -> None:
+        """Report all nodes."""
+        if self._pipe is None:
+            return
+        reports = {
+            name: NodeReport(node.state, self._refused.get(name)) for name, node in self._nodes.items()
+        }
+        # The pipe is full while run_all is suspended, and closed when it is gone, which Stopper notices.
+        with contextlib.suppress(OSError):
+            os.write(self._pipe, msgspec.json.encode(reports) + b"\n")
+
+    def obey(self, line: str) -> None:
+        """Make the transition that a line commands, and report."""
+        transition, name = line.split()
+        node = self._nodes[name]
+        self._refused.pop(name, None)
+        if transition == CONFIGURE:
+            node.trigger_configure()
+        else:
+            node.trigger_activate()
+        if node.state != {CONFIGURE: "inactive", ACTIVATE: "active"}[transition]:
+            self._refused[name] = str(node.failure or "it failed; see its log")[:REASON_MAX]
+        self.report()
