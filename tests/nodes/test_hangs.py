@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.autopilot.flight import fake
+from tests.conftest import Ros, finish, read_bag, until, wait_for
 
 NODES = ("world", "channel_monitor", "policy", "recorder", "visualizer")
 AT_A_PACE = ("--pace", 15)  # twenty seconds: longer than the recorder is waited for
@@ -56,3 +57,19 @@ def test_each_node_in_turn(ros: Ros, options: list[object], name: str, how: tupl
 @pytest.mark.long
 def test_a_container(ros: Ros, options: list[object]) -> None:
     flown_with_hangs(ros, options, ("container",), *IN_LOCKSTEP)
+
+
+@pytest.mark.long
+def test_a_bridge_takes_the_mission_up_again(ros: Ros, low: tuple[object, ...]) -> None:
+    """The vehicle hovers where it was sent last, meanwhile."""
+    with fake("ardupilot", speed=4.0) as autopilot:
+        options = ("--vehicle", "mavlink", "--connect", autopilot.address, "--datum", "here", "--arm")
+        flight = ros.start("uav_dc_ros.run_all", *low, *options, "--bag", "bag", "--summary", "summary.json")
+        until(lambda: any(sent["ned"][1] > 50.0 for sent in autopilot.all("setpoint")))
+        os.kill(ros.node("bridge"), signal.SIGSTOP)
+        status, output = finish(flight)
+        arms = [sent for sent in autopilot.all("command") if sent["command"] == 400]
+    assert status == 0, output
+    assert "note: node bridge gave no sign of life for " in output, output
+    assert len(arms) == 1, "never armed a second time"
+    assert json.loads((ros.folder / "summary.json").read_text())["outcome"] == "landed"
