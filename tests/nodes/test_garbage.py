@@ -11,7 +11,7 @@ from uav_dc_ros.nodes.table import NODES
 
 TIMES = 5
 
-# topic -> (node that hears it, payloads with the reason for which each is refused)
+# topic -> (node that hears it, payloads with the reason for which each is refused); RUN: of the missions
 GARBAGE = {
     "move": ("world", {'{"mission":0': "malformed", '{"mission":0,"step":0}': "invalid"}),
     "ready": ("world", {"": "malformed", '{"node":7}': "invalid"}),
@@ -19,8 +19,8 @@ GARBAGE = {
         "channel_monitor",
         {
             "null": "invalid",
-            '{"mission":0,"step":3,"stamp_ns":0,"cluster":[0],"x_m":[NaN],"y_m":[0]}': "malformed",
-            '{"mission":0,"step":3,"stamp_ns":0,"cluster":[0],"x_m":[1],"y_m":[2]}': "layout",
+            '{"run":"RUN","mission":0,"step":3,"stamp_ns":0,"cluster":[0],"x_m":[NaN],"y_m":[]}': "malformed",
+            '{"run":"RUN","mission":0,"step":3,"stamp_ns":0,"cluster":[0],"x_m":[1],"y_m":[2]}': "layout",
         },
     ),
     "rates": ("policy", {"[]": "invalid", "\x00": "malformed"}),
@@ -30,6 +30,7 @@ GARBAGE = {
             "{}": "invalid",
             json.dumps(
                 {
+                    "run": "RUN",
                     "mission": 0,
                     "step": 3,
                     "phase": "ready",
@@ -60,8 +61,11 @@ def test_a_broken_message_changes_nothing(
     probe = ros.stranger("probe")
     assert probe.stdin is not None
     output = wait_for(flight.stdout, "mission: step 0/30")
+    run = ros.run_id()
     commands = [
-        {"topic": topic, "data": data} for topic, (_, payloads) in GARBAGE.items() for data in payloads
+        {"topic": topic, "data": data.replace("RUN", run)}
+        for topic, (_, payloads) in GARBAGE.items()
+        for data in payloads
     ]
     commands += [{"topic": "pose", "pose": x, "frame": frame} for x, frame in (("nan", "map"), ("1", "odom"))]
     for command in commands:
