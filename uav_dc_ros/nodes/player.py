@@ -125,7 +125,7 @@ class Player:
         Raises:
             BagError: the bag is damaged somewhere.
             NodeError: a topic got no subscriber in time.
-            AnotherMissionError: a mission is being flown on topics that are played.
+            AnotherMissionError: a mission is being flown on topics that are played, also once it plays.
         """
         self.clock.jump(self._start_ns)
         with self._keys:
@@ -226,6 +226,16 @@ class Player:
             self._tick(now_s, 0.0)
             time.sleep(ROOM_S)
 
+    def _check_no_mission(self) -> None:
+        """Refuse to play on the topics of a mission.
+
+        Raises:
+            AnotherMissionError: one is being flown on topics that are played.
+        """
+        beside = () if self.plan.clock_hz is None else (CLOCK_TOPIC,)
+        if (mission := self._audience.mission(beside)) is not None:
+            raise AnotherMissionError(mission)
+
     # Time.
 
     def _wait_until_due(self, log_time_ns: int) -> bool:
@@ -256,6 +266,7 @@ class Player:
         self._show(idle_s)
         if idle_s >= GRAPH_IDLE_S and now_s >= self._graph_at_s:
             self._graph_at_s = now_s + GRAPH_S
+            self._check_no_mission()  # on a busy computer the first look may have come too early
             for told in self._audience.deaf():
                 self.display.note(told)
         self._tick_at_s = now_s + period_s
@@ -313,8 +324,6 @@ class Player:
             self._tick(now_s, GRAPH_IDLE_S)
             self._heed(self._keys.wait(TICK_S))
         self._waits = False
-        beside = () if self.plan.clock_hz is None else (CLOCK_TOPIC,)
-        if (mission := self._audience.mission(beside)) is not None:
-            raise AnotherMissionError(mission)
+        self._check_no_mission()
         for told in (*self._audience.others(), *self._audience.deaf()):
             self.display.note(told)
