@@ -11,23 +11,30 @@ from typing import Any
 import pytest
 
 from tests.conftest import Ros, but_run, finish, read_bag, wait_for
+from tests.nodes.conftest import SMALL
+from tests.small_worlds import saved
+from uav_dc_ros import scenarios
 
 TRIES = [1, pytest.param(20, marks=pytest.mark.long)]
 COMPARED = ("/users", "/rates", "/mission", "/move")
 
 
-@pytest.fixture
-def options(small_scenario: Path, small_policy: Path) -> list[object]:
+@pytest.fixture(scope="module")
+def options(module_ros: Ros) -> list[object]:
     """A small mission with seed 0."""
-    return ["--scenario", small_scenario, "--policy", small_policy]
+    scenario = module_ros.folder / "small.toml"
+    scenario.write_text(SMALL)
+    policy = saved(module_ros.folder / "untrained", scenarios.load(scenario), name="untrained")
+    return ["--scenario", scenario, "--policy", policy]
 
 
-@pytest.fixture
-def bag(ros: Ros, options: list[object]) -> Path:
+@pytest.fixture(scope="module")
+def bag(module_ros: Ros, options: list[object]) -> Path:
     """A bag of that mission, flown alone."""
-    status, output = ros.run_all(*options, "--pace", "lockstep", "--bag", "alone", "--summary", "alone.json")
+    given = ("--pace", "lockstep", "--bag", "alone", "--summary", "alone.json")
+    status, output = module_ros.run_all(*options, *given)
     assert status == 0, output
-    return ros.folder / "alone"
+    return module_ros.folder / "alone"
 
 
 def payloads(bag: Path) -> dict[tuple[str, int], list[Any]]:
@@ -98,7 +105,7 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
     assert payloads(ros.folder / "first") == payloads(bag)
     assert {m["run"] for topic, m in read_bag(ros.folder / "first") if topic in COMPARED} == {run}
     summaries = json.loads((ros.folder / "first.json").read_text())
-    expected = json.loads((ros.folder / "alone.json").read_text())
+    expected = json.loads((bag.parent / "alone.json").read_text())
     assert summaries[0] == expected | {"bag": str(ros.folder / "first")}
     assert summaries[-1]["reason"] == "run_all was interrupted"
 
