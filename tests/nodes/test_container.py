@@ -131,7 +131,7 @@ def test_alone_it_flies_a_mission(ros: Ros, small_scenario: Path, small_policy: 
     container = ros.start("uav_dc_ros.nodes.container", *given, "-r", "/clock:=clock")
     seen = ("--namespace", "/uav1", "--nodes", "recorder", "--pace", "lockstep", "--bag", "bag")
     given = ("--scenario", small_scenario, "--policy", small_policy, *seen)
-    status, output = ros.run_fork("uav_dc_ros.run_all", *given)
+    status, output = ros.run_all(*given)
     assert status == 0, output
     container.send_signal(signal.SIGTERM)
     status, output = finish(container)
@@ -157,7 +157,7 @@ def test_one_node_that_cannot_begin_lets_none_begin(ros: Ros, small_policy: Path
 
 def test_a_line_of_a_shared_process_says_whose_it_is(ros: Ros, flight: list[object]) -> None:
     given = (*flight, *ONLY_COMPOSED, "--pace", "lockstep", "--set", "channel_monitor.journal=/dev/full")
-    status, output = ros.run_fork("uav_dc_ros.run_all", *given)
+    status, output = ros.run_all(*given)
     assert status == 1, output
     told = "ERROR: channel_monitor: journal /dev/full: it is no file; expected one, or a new one"
     assert f"container: {told}" in output

@@ -121,7 +121,7 @@ def test_poses_that_are_offered_best_effort_are_recorded_as_well(
     world = ros.start("uav_dc_ros.nodes.world", "--ros-args", *given, "-p", override)
     given = ("--nodes", "channel_monitor,policy,recorder", "--compose", "--bag", "bag")
     given = ("--scenario", small_scenario, "--policy", small_policy, *given)
-    status, output = ros.run_fork("uav_dc_ros.run_all", *given)
+    status, output = ros.run_all(*given)
     assert status == 0, output
     assert "does not match" not in output
     world.send_signal(signal.SIGTERM)
