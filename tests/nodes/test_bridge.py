@@ -105,7 +105,7 @@ def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) 
     """
     scenario = scenarios.load(name)
     steps = scenario.mission.max_steps
-    with fake(kind, wire, speed=100.0) as autopilot:
+    with fake(kind, wire, speed=200.0 if kind == "ardupilot" else 100.0) as autopilot:
         autopilot.do("second_vehicle 7")
         summary = ros.folder / "summary.json"
         given = ("--compose", "--scenario", name, "--seed", 3, "--bag", "bag", "--summary", summary)

@@ -128,7 +128,7 @@ def loses_nothing(ros: Ros, folder: Path, qos: Qos, n: int, each_s: float) -> No
 
 def test_a_reliable_subscriber_that_falls_behind_loses_nothing(ros: Ros, tmp_path: Path) -> None:
     """It stands still for a while, in which all could be published, and more than any history holds."""
-    n = 30_000
+    n = 15_000
     bag = made(tmp_path / "bag", {"/a": VOLATILE}, numbers("/a", n, 0.001))
     listens = listener(ros, "/a")
     player = ros.start(BAG, PLAY, bag, "--rate", "max", *WAIT)
