@@ -1,11 +1,19 @@
-"""Small worlds and policies that fit them, for tests that are not about flying well."""
+"""Small worlds and policies for them, where it is not about flying well, and flights that tests share."""
 
+import fcntl
+import json
+import os
 import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.conftest import PATIENCE_S, Ros, ros_in
 from tests.small_worlds import config, saved
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import network
@@ -97,3 +105,104 @@ def low(tmp_path: Path) -> tuple[object, ...]:
     zeros["advantage.bias"][int(Action.RIGHT)] = 1.0
     policies.save(tmp_path / "eastward", made, zeros, lambda _: "# test\n")
     return "--scenario", path, "--policy", tmp_path / "eastward"
+
+
+def flown_once(factory: pytest.TempPathFactory, name: str, fly: Callable[[Ros], None]) -> Path:
+    """Folder of a flight that the workers share: whoever is the first to need it has it flown."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "flown").exists():
+            for ros in ros_in(folder):
+                fly(ros)
+            (folder / "flown").touch()
+    return folder
+
+
+def small_in(folder: Path) -> tuple[Path, Path]:
+    """The small world and the untrained policy, in a folder: files that are there stay as they are."""
+    scenario, policy = folder / "small.toml", folder / "untrained"
+    if not policy.exists():
+        scenario.write_text(SMALL)
+        saved(policy, scenarios.load(scenario), name="untrained")
+    return scenario, policy
+
+
+@dataclass(frozen=True)
+class Alone:
+    """Missions of the small world in lockstep, which nobody disturbed: that of seed i is the i-th."""
+
+    scenario: Path
+    policy: Path
+    bag: Path
+
+
+@pytest.fixture(scope="session")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Alone:
+    """Four missions, one after another."""
+
+    def fly(ros: Ros) -> None:
+        scenario, policy = small_in(ros.folder)
+        given = ("--scenario", scenario, "--policy", policy, "--pace", "lockstep", "--missions", 4)
+        nodes = "world,channel_monitor,policy,recorder"
+        status, output = ros.run_all(*given, "--nodes", nodes, "--bag", "bag")
+        assert status == 0, output
+
+    folder = flown_once(tmp_path_factory, "alone", fly)
+    return Alone(*small_in(folder), folder / "bag")
+
+
+CLOCKS = 15  # of the thirty that a mission has: a busy machine's listener finds it late
+LISTENER = """
+import json, sys, time
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+rclpy.init()
+node = rclpy.create_node("listener")
+told = []
+qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+node.create_subscription(
+    Clock, sys.argv[1], lambda m: told.append((time.monotonic(), m.clock.sec + m.clock.nanosec * 1e-9)), qos
+)
+end = time.monotonic() + 90
+while time.monotonic() < end and len(told) < int(sys.argv[2]):
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(json.dumps(told))
+"""
+
+
+def python(ros: Ros, program: str, *arguments: object) -> subprocess.Popen[str]:
+    """Run a program of a few lines beside the nodes."""
+    return subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        env=ros.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a flight in a namespace left: its bag, and when a listener beside it heard which time."""
+
+    bag: Path
+    times: list[tuple[float, float]]
+
+
+@pytest.fixture(scope="session")
+def observed(tmp_path_factory: pytest.TempPathFactory) -> Observed:
+    """A mission of three seconds of the small world, with every node: steps of a tenth of a second."""
+
+    def fly(ros: Ros) -> None:
+        scenario, policy = small_in(ros.folder)
+        listener = python(ros, LISTENER, "/uav1/clock", CLOCKS)
+        given = ("--scenario", scenario, "--policy", policy, "--pace", 100, "--namespace", "uav1")
+        status, output = ros.run_all(*given, "--bag", "bag")
+        assert status == 0, output
+        (ros.folder / "times.json").write_text(listener.communicate(timeout=PATIENCE_S)[0])
+
+    folder = flown_once(tmp_path_factory, "observed", fly)
+    return Observed(folder / "bag", json.loads((folder / "times.json").read_text()))

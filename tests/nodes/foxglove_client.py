@@ -39,8 +39,10 @@ class FoxgloveClient:
 
     def __init__(self, port: int, n_channels: int) -> None:
         self._stack = ExitStack()
+        # When it leaves while messages wait to be read, it does not see the server's farewell: by itself it
+        # would wait for that for ten seconds.
         self._socket = self._stack.enter_context(
-            connect(f"ws://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], max_size=None)
+            connect(f"ws://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], max_size=None, close_timeout=0.5)
         )
         self.server: dict[str, Any] = json.loads(self._socket.recv(5))
         self.channels: dict[str, dict[str, Any]] = {}

@@ -8,6 +8,7 @@ constants, in their order, without what is not used. It needs compilers for C an
 """
 
 import contextlib
+import functools
 import io
 import logging
 import os
@@ -193,6 +194,7 @@ def _generate(folder: Path) -> None:
     from rosidl_cli.command.translate.api import translate
     from rosidl_generator_c.cli import GenerateC
     from rosidl_generator_py.cli import GeneratePython
+    from rosidl_parser import parser
     from rosidl_typesupport_c.cli import GenerateCTypesupport
     from rosidl_typesupport_fastrtps_c.cli import GenerateFastRTPSCTypesupport
     from rosidl_typesupport_introspection_c.cli import GenerateIntrospectionCTypesupport
@@ -215,10 +217,14 @@ def _generate(folder: Path) -> None:
         "introspection": GenerateIntrospectionCTypesupport("introspection"),
         "dispatch": GenerateCTypesupport("dispatch", typesupport_implementations=supports),
     }
-    for name, generator in generators.items():
-        out = folder / name / PACKAGE
-        out.mkdir(parents=True)
-        generator.generate(PACKAGE, files, [], out)
+    # Each generator would parse every file again, and each time it takes as long as all the rest.
+    with mock.patch.object(
+        parser, "get_ast_from_idl_string", functools.cache(parser.get_ast_from_idl_string)
+    ):
+        for name, generator in generators.items():
+            out = folder / name / PACKAGE
+            out.mkdir(parents=True)
+            generator.generate(PACKAGE, files, [], out)
 
 
 def _compile(folder: Path) -> None:

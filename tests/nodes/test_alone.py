@@ -130,7 +130,7 @@ def test_help_tells_the_parameters(ros: Ros) -> None:
 
 
 def test_arguments_that_ros_would_ignore_are_refused(ros: Ros) -> None:
-    status, output = ros.run("uav_dc_ros.nodes.world", "--seed", "3", "--ros-args", "-p", "seed:=4")
+    status, output = ros.run_fork("uav_dc_ros.nodes.world", "--seed", "3", "--ros-args", "-p", "seed:=4")
     assert status == 2, output
     assert output == (
         "python -m uav_dc_ros.nodes.world: '--seed 3'; expected --ros-args first, and -p PARAMETER:=VALUE\n"

@@ -25,10 +25,11 @@ from tests.conftest import Ros, finish, read_bag, wait_for
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.crowd import Crowd
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.registration import ENV_ID
 
-FIVE = scenarios.load("five_clusters")
 STEPS = 7  # of the low world's missions
+NODES = ("--nodes", "bridge,world,channel_monitor,policy,recorder")  # nobody looks at the drawings
 
 
 def beside(autopilot: Fake, *options: object) -> tuple[object, ...]:
@@ -76,34 +77,39 @@ def flies_east(autopilot: Fake, step: int) -> bool:
 # Whole missions.
 
 
-def simulated_cells(seed: int) -> list[list[int]]:
+def simulated_cells(scenario: Scenario, seed: int) -> list[list[int]]:
     """The cells of the same mission in the environment."""
-    policy = policies.load("five_clusters_dueling")
-    env = gymnasium.make(ENV_ID, scenario=FIVE).unwrapped
+    policy = policies.load(f"{scenario.name}_dueling")
+    env = gymnasium.make(ENV_ID, scenario=scenario).unwrapped
     _, info = env.reset(seed=seed)
     cells, over = [info["cell"].tolist()], False
     while not over:
         seen = {name: info[name] for name in ("cell", "step", "data_bits", "collected")}
-        _, _, terminated, truncated, info = env.step(policy.act(policy.observe(FIVE, **seen)))
+        _, _, terminated, truncated, info = env.step(policy.act(policy.observe(scenario, **seen)))
         over = terminated or truncated
         cells.append(info["cell"].tolist())
     return cells
 
 
 @pytest.mark.parametrize(
-    ("kind", "wire"), [("ardupilot", "tcp"), pytest.param("px4", "udp", marks=pytest.mark.long)]
+    ("kind", "wire", "name", "least"),
+    [
+        ("ardupilot", "tcp", "three_clusters", 25),
+        pytest.param("px4", "udp", "five_clusters", 40, marks=pytest.mark.long),
+    ],
 )
-def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
+def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) -> None:
     """It takes off, flies the cells of the simulation with that seed among the same users, and lands.
 
     Another aircraft is on the same link, and left alone.
     """
-    with fake(kind, wire, speed=100.0) as autopilot:
+    scenario = scenarios.load(name)
+    steps = scenario.mission.max_steps
+    with fake(kind, wire, speed=200.0 if kind == "ardupilot" else 100.0) as autopilot:
         autopilot.do("second_vehicle 7")
         summary = ros.folder / "summary.json"
-        status, output = ros.run_all(
-            *beside(autopilot, "--arm", "--seed", 3, "--bag", "bag", "--summary", summary, "--system", 1)
-        )
+        given = ("--compose", "--scenario", name, "--seed", 3, "--bag", "bag", "--summary", summary)
+        status, output = ros.run_all(*beside(autopilot, "--arm", "--system", 1, *given, *NODES))
         report = autopilot.report()
     assert not [told for told in autopilot.events if told["event"].startswith("second ")]
     assert status == 0, output
@@ -111,28 +117,28 @@ def test_a_mission_of_five_clusters(ros: Ros, kind: str, wire: str) -> None:
     kept = json.loads(next((ros.folder / "state").rglob("*.json")).read_text())
     assert f"the grid's corner lies at {kept['datum']}, from where the vehicle stands; no earlier" in output
     told = json.loads(summary.read_text())
-    assert (told["outcome"], told["steps"], told["seed"]) == ("landed", FIVE.mission.max_steps, 3)
-    assert told["reason"].startswith("step 60: at the dock")
+    assert (told["outcome"], told["steps"], told["seed"]) == ("landed", steps, 3)
+    assert told["reason"].startswith(f"step {steps}: at the dock")
     assert not report["armed"]
-    dock = np.subtract(FIVE.mission.dock_m, FIVE.mission.start_m[:2])
+    dock = np.subtract(scenario.mission.dock_m, scenario.mission.start_m[:2])
     assert report["ned"][:2] == pytest.approx([dock[1], dock[0]], abs=2.0)  # north, east
     bag = read_bag(ros.folder / "bag")
     ready = {p["step"]: p["cell"] for t, p in bag if t == "/mission" and p["phase"] in ("ready", "landed")}
-    assert [ready[step] for step in range(61)] == simulated_cells(3)
+    assert [ready[step] for step in range(steps + 1)] == simulated_cells(scenario, 3)
     phases = [phase for phase, _ in itertools.groupby(p["phase"] for t, p in bag if t == "/mission")]
     assert phases[:5] == ["idle", "connecting", "preflight", "takeoff", "ready"]
-    assert phases[5:-2] == ["moving", "ready"] * 59 + ["moving"]
+    assert phases[5:-2] == ["moving", "ready"] * (steps - 1) + ["moving"]
     assert phases[-2:] == ["landing", "landed"]
     assert all(p["reason"] for t, p in bag if t == "/mission")
-    crowd = Crowd(FIVE, 3)
+    crowd = Crowd(scenario, 3)
     users = {p["step"]: p for t, p in bag if t == "/users"}
-    assert users.keys() == set(range(61))
-    for step in range(61):
+    assert users.keys() == set(range(steps + 1))
+    for step in range(steps + 1):
         crowd.walk(step - crowd.step)
         assert np.array_equal(np.asarray([users[step]["x_m"], users[step]["y_m"]]).T, crowd.positions_m)
     rates = [p for t, p in bag if t == "/rates"]
-    assert sorted({p["step"] for p in rates}) == list(range(61))
-    assert sum(rates[-1]["collected"]) == told["users_collected"] >= 40
+    assert sorted({p["step"] for p in rates}) == list(range(steps + 1))
+    assert sum(rates[-1]["collected"]) == told["users_collected"] >= least
     told = [p for t, p in bag if t == "/mission"]
     changes = [
         pair.value
@@ -190,30 +196,27 @@ def test_the_second_flight_has_the_grid_of_the_first(ros: Ros, low: tuple[object
 # What dies.
 
 
-def test_a_killed_policy_makes_the_vehicle_hold(ros: Ros, low: tuple[object, ...]) -> None:
-    """It flies on to its cell; the policy is started again, and the mission goes on."""
-    with fake("ardupilot", speed=8.0) as autopilot:
-        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
-        until(lambda: flies_east(autopilot, 3), process)
-        killed(ros, "policy")
-        status, output = finish(process)
-        assert status == 0, output
-        check_steps(ros.folder / "bag")
-        assert "policy: was killed by SIGKILL" in output or "policy was killed by SIGKILL" in output
-
-
 @pytest.mark.parametrize("kind", ["ardupilot", pytest.param("px4", marks=pytest.mark.long)])
-def test_a_killed_bridge_takes_the_mission_up_again(ros: Ros, low: tuple[object, ...], kind: str) -> None:
-    """ArduCopter hovers meanwhile; PX4 misses the stream, and returns: then the mission is over."""
+def test_a_killed_policy_makes_the_vehicle_hold_and_a_killed_bridge_takes_the_mission_up_again(
+    ros: Ros, low: tuple[object, ...], kind: str
+) -> None:
+    """It flies on to its cell; the policy is started again, and the mission goes on.
+
+    Without a bridge ArduCopter hovers; PX4 misses the stream, and returns: then the mission is over.
+    """
     with fake(kind, speed=16.0) as autopilot:
-        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
-        until(lambda: flies_east(autopilot, 3), process)
+        process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag", *NODES))
+        until(lambda: flies_east(autopilot, 2), process)
+        killed(ros, "policy")
+        until(lambda: flies_east(autopilot, 4), process)
         killed(ros, "bridge")
         status, output = finish(process)
         arms = [told for told in autopilot.all("command") if told["command"] == 400]
         assert len(arms) == 1, "never armed a second time"
         assert not autopilot.report()["armed"]
-    assert "it is started again (1 of 3" in output
+    assert "node policy was killed by SIGKILL" in output
+    assert "node bridge was killed by SIGKILL" in output
+    assert output.count("it is started again (1 of 3") == 2
     if kind == "ardupilot":
         assert status == 0, output
         check_steps(ros.folder / "bag")
@@ -250,8 +253,8 @@ def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object,
 def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
     ros: Ros, low: tuple[object, ...], number: signal.Signals, wanted: int
 ) -> None:
-    with fake("ardupilot", speed=8.0) as autopilot:
-        options = beside(autopilot, "--arm", "--bag", "bag", "--summary", "summary.json")
+    with fake("ardupilot", speed=16.0) as autopilot:
+        options = beside(autopilot, "--arm", "--bag", "bag", "--summary", "summary.json", "--compose", *NODES)
         process = ros.start("uav_dc_ros.run_all", *low, *options)
         until(lambda: flies_east(autopilot, 2), process)
         process.send_signal(number)

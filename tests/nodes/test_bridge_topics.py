@@ -10,6 +10,8 @@ from tests.conftest import Ros, finish, read_bag, wait_for
 from tests.nodes import px4_messages
 from tests.nodes.mavros_flight import fake
 
+RUN_ALL = "uav_dc_ros.run_all"
+
 
 def phases(bag: Path) -> list[str]:
     told = [payload["phase"] for topic, payload in read_bag(bag) if topic == "/mission"]
@@ -43,7 +45,7 @@ def test_a_mission_beside_mavros(ros: Ros, low: tuple[object, ...]) -> None:
 
 
 def test_arming_through_mavros_needs_its_messages(ros: Ros) -> None:
-    status, output = ros.run_all("--vehicle", "mavros", "--arm", "--datum", "here", "--no-record")
+    status, output = ros.run_fork(RUN_ALL, "--vehicle", "mavros", "--arm", "--datum", "here", "--no-record")
     assert status == 2, output
     assert len(output.splitlines()) == 1
     assert "mavros_msgs" in output
@@ -75,7 +77,7 @@ def test_a_mission_on_px4_s_topics(
 
 
 def test_px4_s_topics_need_its_messages(ros: Ros) -> None:
-    status, output = ros.run_all("--vehicle", "px4", "--no-record")
+    status, output = ros.run_fork(RUN_ALL, "--vehicle", "px4", "--no-record")
     assert status == 2, output
     assert len(output.splitlines()) == 1
     assert "px4_msgs" in output

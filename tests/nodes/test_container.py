@@ -1,7 +1,7 @@
 """Several nodes in one process: what run_all puts there, and the container by itself.
 
 That such a mission is the same as one with a process for each node, to the last bit, and what happens when
-the container is killed: test_flight and test_kills.
+the container is killed: test_flight and test_kills. That a lockstep has one by default: test_faults, too.
 """
 
 import json
@@ -17,6 +17,7 @@ from tests.conftest import Ros, finish, read_bag, wait_for
 from tests.nodes.test_options import refused
 
 COMPOSED = ("world", "channel_monitor", "policy")
+ONLY_COMPOSED = ("--no-record", "--nodes", ",".join(COMPOSED))
 
 
 @pytest.fixture
@@ -48,7 +49,7 @@ def flying(ros: Ros, *options: object) -> tuple[subprocess.Popen[str], set[str]]
     ("options", "shares"),
     [
         pytest.param(("--pace", 100), False, marks=pytest.mark.long),
-        (("--pace", "lockstep", "--missions", 200), True),
+        pytest.param(("--pace", "lockstep", "--missions", 200), True, marks=pytest.mark.long),
         pytest.param(("--pace", 100, "--compose"), True, marks=pytest.mark.long),
         pytest.param(
             ("--pace", "lockstep", "--missions", 200, "--no-compose"), False, marks=pytest.mark.long
@@ -129,7 +130,8 @@ def test_alone_it_flies_a_mission(ros: Ros, small_scenario: Path, small_policy: 
     given = ("policy", "world", "channel_monitor", "--ros-args", "--params-file", file, "-r", "__ns:=/uav1")
     container = ros.start("uav_dc_ros.nodes.container", *given, "-r", "/clock:=clock")
     seen = ("--namespace", "/uav1", "--nodes", "recorder", "--pace", "lockstep", "--bag", "bag")
-    status, output = ros.run_all("--scenario", small_scenario, "--policy", small_policy, *seen)
+    given = ("--scenario", small_scenario, "--policy", small_policy, *seen)
+    status, output = ros.run_all(*given)
     assert status == 0, output
     container.send_signal(signal.SIGTERM)
     status, output = finish(container)
@@ -154,7 +156,8 @@ def test_one_node_that_cannot_begin_lets_none_begin(ros: Ros, small_policy: Path
 
 
 def test_a_line_of_a_shared_process_says_whose_it_is(ros: Ros, flight: list[object]) -> None:
-    status, output = ros.run_all(*flight, "--pace", "lockstep", "--set", "channel_monitor.journal=/dev/full")
+    given = (*flight, *ONLY_COMPOSED, "--pace", "lockstep", "--set", "channel_monitor.journal=/dev/full")
+    status, output = ros.run_all(*given)
     assert status == 1, output
     told = "journal /dev/full: it is no file; expected one, or a new one"
     assert f"container: ERROR: channel_monitor: {told}" in output
@@ -165,7 +168,7 @@ def test_a_node_that_gives_up_takes_the_others_with_it(ros: Ros, flight: list[ob
     """The channel monitor's journal comes to a limit on the size of files; no recorder meets it first."""
     process = ros.start(
         "uav_dc_ros.run_all",
-        *(*flight, "--pace", "lockstep", "--no-record"),
+        *(*flight, *ONLY_COMPOSED, "--pace", "lockstep"),
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, 8_000)),
     )
     status, output = finish(process)

@@ -154,6 +154,7 @@ import os, signal, subprocess, sys, time
 from pathlib import Path
 missions, kills = int(sys.argv[1]), int(sys.argv[2])
 run_all = [sys.executable, "-m", "uav_dc_ros.run_all", "--scenario", "three_clusters", "--no-record"]
+run_all += ["--nodes", "world,channel_monitor,policy"]
 def shared(): return sorted(n for n in os.listdir("/dev/shm") if "lttng" not in n)
 before = shared()
 for _ in range(missions):

@@ -11,10 +11,14 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Ros, each_once, finish, read_bag, wait_for
+from tests.nodes.test_container import modules
 
 # Each fixture `ros` asserts at its end that no process of the test is left.
 
 FLYING = "mission: step 5/30"
+
+
+COMPOSED = ("--compose",)  # where it is not about one of the nodes: fewer processes to start
 
 
 @pytest.fixture
@@ -30,7 +34,7 @@ def arguments(small_scenario: Path, small_policy: Path, tmp_path: Path) -> list[
 def test_ctrl_c_stops_everything_and_leaves_a_readable_bag(
     ros: Ros, arguments: list[object], tmp_path: Path
 ) -> None:
-    process = ros.start("uav_dc_ros.run_all", *arguments)
+    process = ros.start("uav_dc_ros.run_all", *arguments, *COMPOSED)
     assert process.stdout is not None
     wait_for(process.stdout, FLYING)
     process.send_signal(signal.SIGINT)
@@ -59,7 +63,7 @@ def test_ctrl_c_stops_everything_and_leaves_a_readable_bag(
 def test_a_node_that_is_killed_is_started_again_and_the_vehicle_hovers_meanwhile(
     ros: Ros, arguments: list[object], tmp_path: Path, node: str
 ) -> None:
-    process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", 40)  # steps of a quarter of a second
+    process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", 60)  # steps of a sixth of a second
     assert process.stdout is not None
     wait_for(process.stdout, FLYING)
     os.kill(ros.node(node), signal.SIGKILL)
@@ -115,7 +119,7 @@ def test_a_second_mission_on_the_same_network_is_refused_or_unharmed(
 
 
 def test_ctrl_c_while_the_nodes_start(ros: Ros, arguments: list[object]) -> None:
-    process = ros.start("uav_dc_ros.run_all", *arguments)
+    process = ros.start("uav_dc_ros.run_all", *arguments, *COMPOSED)
     ros.node("recorder")
     time.sleep(0.1)
     process.send_signal(signal.SIGINT)
@@ -162,19 +166,22 @@ def test_a_summary_names_no_bag_that_was_never_made(
     assert (summary["bag"] is not None) == (tmp_path / "bag").is_dir()
 
 
-@pytest.mark.parametrize("who", ["recorder", "run_all"])
-def test_a_lockstep_waits_for_who_is_held_up(
-    ros: Ros, arguments: list[object], tmp_path: Path, who: str
-) -> None:
-    """Stopped for as long as it takes to fly more steps than messages are kept."""
-    missions = 50
+def test_a_lockstep_waits_for_who_is_held_up(ros: Ros, arguments: list[object], tmp_path: Path) -> None:
+    """The recorder, then run_all, stopped for as long as it takes to fly more steps than messages are kept.
+
+    While the recorder stands still, who shares a process can be seen: the flight cannot end meanwhile.
+    """
+    missions = 80
     process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", "lockstep", "--missions", missions)
     assert process.stdout is not None
-    wait_for(process.stdout, "mission 5 of")
-    held_up = process.pid if who == "run_all" else ros.node(who)
-    os.kill(held_up, signal.SIGSTOP)
-    time.sleep(0.8)
-    os.kill(held_up, signal.SIGCONT)
+    recorder = ros.node("recorder")
+    for mission, held_up in ((5, recorder), (40, process.pid)):
+        wait_for(process.stdout, f"mission {mission} of")
+        os.kill(held_up, signal.SIGSTOP)
+        time.sleep(0.8)
+        running = modules(ros)
+        os.kill(held_up, signal.SIGCONT)
+        assert running == {"container", "recorder"}
     status, output = finish(process)
     assert status == 0, output
     # Of the drawings only the newest is kept.

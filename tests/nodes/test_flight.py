@@ -205,9 +205,10 @@ def test_the_same_seed_gives_the_same_payloads_also_from_a_process_for_each_node
     flown: Flown, module_ros: Ros
 ) -> None:
     bag = module_ros.folder / "again"
-    given = ("--missions", 2, "--pace", "lockstep", "--no-compose", "--bag", bag)
+    names = ("world", "channel_monitor", "policy", "recorder")
+    given = ("--missions", 2, "--pace", "lockstep", "--no-compose", "--nodes", ",".join(names), "--bag", bag)
     process = module_ros.start("uav_dc_ros.run_all", *given)
-    ids = {module_ros.node(name) for name in ("world", "channel_monitor", "policy", "recorder")}
+    ids = {module_ros.node(name) for name in names}
     status, output = finish(process)
     assert len(ids) == 4
     assert status == 0, output

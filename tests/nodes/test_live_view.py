@@ -103,7 +103,7 @@ def test_topics_are_called_as_in_the_graph_and_the_server_ends_with_the_mission(
 def test_a_port_in_use_is_one_line_and_status_2(ros: Ros) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        status, output = ros.run("uav_dc_ros.nodes.live_view", "--ros-args", "-p", f"port:={port}")
+        status, output = ros.run_fork("uav_dc_ros.nodes.live_view", "--ros-args", "-p", f"port:={port}")
     assert status == 2, output
     assert len(output.splitlines()) == 1, output
     assert f"port: {port} at address '127.0.0.1': " in output

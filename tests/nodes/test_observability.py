@@ -1,39 +1,15 @@
 """What the nodes tell about themselves: diagnostics, the clock, peers that do not match."""
 
 import json
-import subprocess
-import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import PATIENCE_S, Ros, finish, read_bag, ros_in, wait_for
-from tests.nodes.conftest import SMALL
-from tests.small_worlds import saved
-from uav_dc_ros import scenarios
+from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.nodes.conftest import CLOCKS, Observed, python
 from uav_dc_ros.nodes.table import NODES
 
-LISTENER = """
-import json, sys, time
-import rclpy
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
-rclpy.init()
-node = rclpy.create_node("listener")
-told = []
-qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-node.create_subscription(
-    Clock, sys.argv[1], lambda m: told.append((time.monotonic(), m.clock.sec + m.clock.nanosec * 1e-9)), qos
-)
-end = time.monotonic() + 90
-while time.monotonic() < end and len(told) < int(sys.argv[2]):
-    rclpy.spin_once(node, timeout_sec=0.1)
-print(json.dumps(told))
-"""
-CLOCKS = 15  # of the thirty that a mission has: a busy machine's listener finds it late
 CLOCK = """
 import time
 import rclpy
@@ -70,16 +46,6 @@ def options(small_scenario: Path, small_policy: Path) -> list[object]:
     return ["--scenario", small_scenario, "--policy", small_policy, "--pace", 100]
 
 
-def python(ros: Ros, program: str, *arguments: object) -> subprocess.Popen[str]:
-    """Run a program of a few lines beside the nodes."""
-    return subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, arguments)],
-        env=ros.environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
 def diagnostics(bag: Path) -> dict[str, list[tuple[Any, dict[str, str]]]]:
     """Statuses and values by node."""
     found: dict[str, list[tuple[Any, dict[str, str]]]] = {}
@@ -91,31 +57,8 @@ def diagnostics(bag: Path) -> dict[str, list[tuple[Any, dict[str, str]]]]:
     return found
 
 
-@dataclass
-class Flown:
-    """What a flight in a namespace left: its bag, and when a listener beside it heard which time."""
-
-    bag: Path
-    times: list[tuple[float, float]]
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
-    """A small mission of three seconds: steps of a tenth of a second."""
-    folder = tmp_path_factory.mktemp("observed")
-    scenario = folder / "small.toml"
-    scenario.write_text(SMALL)
-    policy = saved(folder / "untrained", scenarios.load(scenario), name="untrained")
-    for ros in ros_in(folder):
-        listener = python(ros, LISTENER, "/uav1/clock", CLOCKS)
-        given = ("--scenario", scenario, "--policy", policy, "--pace", 100, "--namespace", "uav1")
-        status, output = ros.run_all(*given, "--bag", folder / "bag")
-        assert status == 0, output
-        yield Flown(folder / "bag", json.loads(listener.communicate(timeout=PATIENCE_S)[0]))
-
-
-def test_every_node_tells_of_itself_once_a_second(flown: Flown) -> None:
-    told = diagnostics(flown.bag)
+def test_every_node_tells_of_itself_once_a_second(observed: Observed) -> None:
+    told = diagnostics(observed.bag)
     assert set(told) == {f"uav1/{name}" for name, row in NODES.items() if not row.on_request}
     assert all(len(each) >= 2 for each in told.values()), {n: len(e) for n, e in told.items()}
     for each in told.values():
@@ -142,14 +85,14 @@ def test_every_node_tells_of_itself_once_a_second(flown: Flown) -> None:
     assert told["uav1/observer"][-1][1]["restarts of policy"] == "0"
 
 
-def test_the_clock_is_mission_time_and_the_nodes_go_by_it(flown: Flown) -> None:
-    assert len(flown.times) == CLOCKS
-    times_s = [time_s for _, time_s in flown.times]
+def test_the_clock_is_mission_time_and_the_nodes_go_by_it(observed: Observed) -> None:
+    assert len(observed.times) == CLOCKS
+    times_s = [time_s for _, time_s in observed.times]
     assert times_s == sorted(times_s)
-    passed_s, flown_s = flown.times[-1][0] - flown.times[0][0], times_s[-1] - times_s[0]
+    passed_s, flown_s = observed.times[-1][0] - observed.times[0][0], times_s[-1] - times_s[0]
     # A listener on a busy core hears in bursts: this tells mission time from the wall's, not a late clock.
     assert flown_s / passed_s > 20.0
-    messages = read_bag(flown.bag, "/uav1/diagnostics")
+    messages = read_bag(observed.bag, "/uav1/diagnostics")
     stamps = {
         name: [status_time(message) for topic, message in messages if is_of(topic, message, name)]
         for name in ("policy", "world")
@@ -191,7 +134,8 @@ def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[ob
     peer = python(ros, DEMANDING)
     assert peer.stdout is not None
     wait_for(peer.stdout, "listening")
-    status, output = ros.run_all(*options, "--no-record", "--pace", 40)  # the second look tells it
+    given = ("--no-record", "--nodes", "world,channel_monitor,policy")
+    status, output = ros.run_all(*options, *given, "--pace", 40)  # the second look tells it
     peer.kill()
     peer.communicate()
     assert status == 0, output

@@ -3,12 +3,14 @@
 import os
 import shutil
 import signal
+from datetime import datetime, tzinfo
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import Ros
 from uav_dc_ros import cli
+from uav_dc_ros.nodes import options
 
 NODES = "world,channel_monitor,policy,recorder"
 
@@ -140,21 +142,36 @@ def test_help_and_version_need_no_ros(ros: Ros) -> None:
     assert ros.run_all("--version")[0] == 0
 
 
-def test_the_default_bag_is_dated_and_never_overwritten(
-    ros: Ros, small_scenario: Path, small_policy: Path
-) -> None:
+def test_the_default_bag_is_dated(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
     """A policy's folder may lie anywhere, and the policy may have learnt in another world: that is told."""
     folder = ros.folder / "a b 'c'" / "my policy"
     shutil.copytree(small_policy, folder)
-    options = ("--scenario", small_scenario, "--policy", folder, "--pace", "lockstep", "--nodes", NODES)
-    status, output = ros.run_all(*options)
+    given = ("--scenario", small_scenario, "--policy", folder, "--pace", "lockstep", "--nodes")
+    status, output = ros.run_all(*given, NODES)
     assert status == 0, output
     assert "timeout" in output
     assert "learnt in another world" not in output
     small_scenario.write_text(small_scenario.read_text().replace("v_max_mps = 1.0", "v_max_mps = 2.0"))
-    status, output = ros.run_all(*options)
+    without_recorder = (NODES.removesuffix(",recorder"), "--no-record")
+    status, output = ros.run_all(*given, *without_recorder)
     assert status == 0, output
     assert "note: policy untrained learnt in another world" in output
-    bags = sorted((ros.folder / "bags").iterdir())
-    assert len(bags) == 2
-    assert all(bag.name.startswith("20") and (bag / "metadata.yaml").is_file() for bag in bags)
+    (bag,) = (ros.folder / "bags").iterdir()
+    assert bag.name.startswith("20")
+    assert (bag / "metadata.yaml").is_file()
+
+
+def test_no_bag_is_overwritten_by_another_of_the_same_second(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Still(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> "Still":
+            return cls(2026, 11, 22, 3, 52, 10, tzinfo=tz)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(options, "datetime", Still)
+    for name in ("2026-11-22_03-52-10", "2026-11-22_03-52-10_2", "2026-11-22_03-52-10_3"):
+        bag = options.new_bag(None)
+        assert bag == tmp_path / "bags" / name
+        bag.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,8 @@ from tests.conftest import Ros
 from uav_dc_ros.nodes import output
 from uav_dc_ros.nodes.output import Output
 
-MISSION = ("--pace", "lockstep", "--no-record", "--summary")
+MISSION = ("--pace", "lockstep", "--no-record", "--nodes", "world,channel_monitor,policy", "--compose")
+MISSION = (*MISSION, "--scenario", "three_clusters", "--summary")
 
 
 def test_pieces_are_written_in_their_order(tmp_path: Path) -> None:

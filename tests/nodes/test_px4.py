@@ -96,9 +96,13 @@ class Spun:
     ) -> None:
         """Spin until something is so, with a beat every few milliseconds."""
         end_s = time.monotonic() + seconds
+        beats_s = 0.0
         while not done():
-            assert time.monotonic() < end_s, "this never came to be"
-            beat()
+            now_s = time.monotonic()
+            assert now_s < end_s, "this never came to be"
+            if now_s >= beats_s:
+                beats_s = now_s + 0.004
+                beat()
             self.executor.spin_once(0.004)
 
     def pass_time(self, seconds: float, beat: Callable[[], object] = lambda: None) -> None:

@@ -119,8 +119,9 @@ def test_poses_that_are_offered_best_effort_are_recorded_as_well(
     given = ("-p", f"scenario:={small_scenario}", "-p", peers, "-p", "pace:=100", "-r", "/clock:=clock")
     override = "qos_overrides./pose.publisher.reliability:=best_effort"
     world = ros.start("uav_dc_ros.nodes.world", "--ros-args", *given, "-p", override)
-    nodes = ("--nodes", "channel_monitor,policy,recorder", "--bag", "bag")
-    status, output = ros.run_all("--scenario", small_scenario, "--policy", small_policy, *nodes)
+    given = ("--nodes", "channel_monitor,policy,recorder", "--compose", "--bag", "bag")
+    given = ("--scenario", small_scenario, "--policy", small_policy, *given)
+    status, output = ros.run_all(*given)
     assert status == 0, output
     assert "does not match" not in output
     world.send_signal(signal.SIGTERM)

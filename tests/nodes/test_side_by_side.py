@@ -2,17 +2,14 @@
 
 import json
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, each_once, finish, read_bag, ros_in, wait_for
-from tests.nodes.conftest import SMALL
-from tests.small_worlds import saved
-from uav_dc_ros import scenarios
+from tests.conftest import Ros, each_once, finish, read_bag, wait_for
+from tests.nodes.conftest import Alone
 from uav_dc_ros.topics import TOPICS
 
 NODES = "world,channel_monitor,policy,recorder"
@@ -31,19 +28,11 @@ class Small:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Small]:
-    """The missions of all seeds are flown alone, one after another."""
-    folder = tmp_path_factory.mktemp("alone")
-    scenario = folder / "small.toml"
-    scenario.write_text(SMALL)
-    policy = saved(folder / "untrained", scenarios.load(scenario), name="untrained")
-    options = ["--scenario", scenario, "--policy", policy, "--pace", "lockstep"]
-    for ros in ros_in(folder):
-        given = ("--nodes", NODES, "--seed", SEEDS[0], "--missions", len(SEEDS), "--bag", "bag")
-        status, output = ros.run_all(*options, *given)
-        assert status == 0, output
-        alone = {seed: payloads(folder / "bag", mission=i) for i, seed in enumerate(SEEDS)}
-        yield Small(scenario, policy, options, alone)
+def small(alone: Alone) -> Small:
+    """The missions of all seeds as they were flown alone, one after another."""
+    options = ["--scenario", alone.scenario, "--policy", alone.policy, "--pace", "lockstep"]
+    told = {seed: payloads(alone.bag, mission=seed) for seed in SEEDS}
+    return Small(alone.scenario, alone.policy, options, told)
 
 
 def payloads(bag: Path, namespace: str = "", mission: int = 0) -> dict[str, list[Any]]:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import Ros, each_once, finish, read_bag, wait_for
+from tests.nodes.conftest import Observed
 from uav_dc_ros.nodes.drawing import UserState
 
 STEPS = 30  # of the small world
@@ -17,11 +18,11 @@ WITHOUT_VISUALIZER = ("--nodes", "world,channel_monitor,policy,recorder")
 class Bag:
     """What was said on each topic."""
 
-    def __init__(self, folder: Path) -> None:
-        self.messages = read_bag(folder)
+    def __init__(self, folder: Path, namespace: str = "") -> None:
+        self.namespace, self.messages = namespace, read_bag(folder)
 
     def __getitem__(self, topic: str) -> list[Any]:
-        return [message for name, message in self.messages if name == f"/{topic}"]
+        return [message for name, message in self.messages if name == f"{self.namespace}/{topic}"]
 
 
 def way(path: Any) -> list[tuple[int, float, float, float]]:
@@ -53,13 +54,8 @@ def check_is_the_end(bag: Bag) -> None:
     assert (body.header.stamp.sec, *vars(body.pose.position).values())[:4] == stop(bag["pose"][-1])
 
 
-def test_a_mission_is_drawn_as_it_was_flown(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
-    bag_folder = ros.folder / "bag"
-    status, output = ros.run_all(
-        *("--scenario", small_scenario, "--policy", small_policy, "--pace", 100, "--bag", bag_folder)
-    )
-    assert status == 0, output
-    bag = Bag(bag_folder)
+def test_a_mission_is_drawn_as_it_was_flown(observed: Observed) -> None:
+    bag = Bag(observed.bag, "/uav1")
     poses = [stop(pose) for pose in bag["pose"]]
     assert len(poses) == STEPS + 1
     drawn = [way(path) for path in bag["path"]]
