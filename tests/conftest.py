@@ -25,10 +25,9 @@ ROOT = Path(__file__).parents[1]
 # much else to do may take twenty times as long as a calm one.
 PATIENCE_S = 90.0
 
-# Where nothing may be written beside the sources, rewritten tests are kept here: to rewrite them takes each
-# worker as long as to import all else.
-if sys.dont_write_bytecode:
-    sys.dont_write_bytecode, sys.pycache_prefix = False, str(ROOT / ".pytest_cache" / "bytecode")
+# The tests start some hundred processes. Without bytecode each of them compiles this project anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A shell without job control, such as that of a script, ignores Ctrl-C for what it starts in the background.
 signal.signal(signal.SIGINT, signal.default_int_handler)

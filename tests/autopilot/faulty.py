@@ -41,8 +41,12 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "drop long": ("drop 1.5", "", ("", *AWAY)),
     "freeze": ("freeze 1", "", ("no position", "")),
     "freeze short": ("freeze 1", "freeze 0", ("", "no position")),
-    "jump": ("jump 300 0 0", "", ("jumped", "outside the fence", "mode AUTO.RTL: changed by", "")),
-    "jump away": ("jump 5000 0 0", "", ("jumped", "")),
+    "jump": (
+        "jump 300 0 0",
+        "",
+        ("jumped", "outside the fence", "mode AUTO.RTL: changed by", "from the dock", ""),
+    ),
+    "jump away": ("jump 5000 0 0", "", ("jumped", "from the dock", "")),
     "mode": ("pilot", "", ("changed by a pilot", "")),
     "battery": ("battery 0.1", "battery 1", ("battery 10%", "battery 9%", "")),
     # On the ground it is believed: nobody knows better there.
@@ -50,7 +54,7 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "lose": ("lose 1", "", ("position estimate", "")),
     "lose short": ("lose 1", "lose 0", ("", "position estimate")),
     "late": ("late 4", "", ("",)),
-    "disarm": ("disarm", "", ("disarmed by", "")),
+    "disarm": ("disarm", "", ("disarmed by", "disarmed in the air", "")),
     "odd messages": ("late_position 1.5; zero_time; nonsense; twice 1", "twice 0", ("",)),
     "late message": ("late_position 1.5", "", ("",)),
     "silent policy": ("policy", "", ("no move from the policy", "")),
