@@ -3,8 +3,8 @@
     python -m tests.experiments.forks
 
 It reads lines of JSON: a moment at which the child kills itself (what is called, which of its calls, before
-or after it) or null, arguments of `uav_dc_ros.train`, and a file for all that the child prints. It answers each
-with the child's process id, and with its exit status when it has ended.
+or after it) or null, arguments of `uav_dc_ros.train`, and a file for all that the child prints. It answers
+each with the child's process id, and with its exit status when it has ended.
 """
 
 import json
