@@ -78,9 +78,15 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
 
 
 def low() -> Scenario:
-    """The same world, flown near the ground: a climb of 20 m instead of 200."""
+    """The same world, flown near the ground, with a dock half-way: a climb of 20 m, and twelve steps."""
     grid = msgspec.structs.replace(SCENARIO.grid, altitude_min_m=10.0, altitude_step_m=5.0)
-    mission = msgspec.structs.replace(SCENARIO.mission, start_m=(*SCENARIO.mission.start_m[:2], 20.0))
+    start_m, dock_m = SCENARIO.mission.start_m, SCENARIO.mission.dock_m
+    mission = msgspec.structs.replace(
+        SCENARIO.mission,
+        start_m=(*start_m[:2], 20.0),
+        dock_m=((start_m[0] + dock_m[0]) / 2, (start_m[1] + dock_m[1]) / 2),
+        max_steps=12,
+    )
     return msgspec.structs.replace(SCENARIO, grid=grid, mission=mission)
 
 

@@ -363,7 +363,7 @@ def test_a_second_vehicle_that_comes_before_arming_stops_it(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_bridge_that_is_restarted_beside_a_second_vehicle_goes_on(kind: str) -> None:
-    flight = VirtualFlight(kind, scenario=short(20))
+    flight = VirtualFlight(kind, scenario=short(20), looks=1)
     moving(flight, 3)
     system = flight.hearing.telemetry(flight.now_s).system_id
     assert system == 1

@@ -194,7 +194,7 @@ FAULTS = st.lists(
 QUIET = [HealthCheck.too_slow]
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=QUIET)
+@settings(max_examples=10, deadline=None, derandomize=True, suppress_health_check=QUIET)
 @given(faults=FAULTS)
 @example(faults=[Fault("repeated", 54.8, 1e6, 0.5)])
 @example(faults=[Fault("late", 80.0, 0.2, 0.15)])

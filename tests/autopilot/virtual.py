@@ -24,6 +24,10 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 
+LOOKS = (
+    2  # after so many ticks of the vehicle the bridge looks: half as often as its node, and at each position
+)
+
 # What the autopilot sent, and now: what arrives now.
 Channel = Callable[[list[bytes], float], Iterable[bytes]]
 
@@ -54,6 +58,7 @@ class VirtualFlight:
         datum: of the grid.
         system: the vehicle that is meant.
         speed: how many times faster than the clock its time runs.
+        looks: after so many of its ticks the bridge looks; 1: as often as its node.
 
     Attributes:
         copter, autopilot: the fake; `events` is what it tells.
@@ -72,6 +77,7 @@ class VirtualFlight:
         datum: Geodetic | None = None,
         system: int | None = None,
         speed: float = 1.0,
+        looks: int = LOOKS,
         **bridge: Any,
     ) -> None:
         scenario = scenario or short()
@@ -84,7 +90,7 @@ class VirtualFlight:
         self.place = Enu(start[0], start[1], 0.0)
         self.hearing = Hearing(datum, self.place, system)
         self.session = Session(load_codec(), self.hearing, self._write)
-        self.link_is_up, self.now_s, self.speed = True, 1000.0, speed
+        self.link_is_up, self.now_s, self.speed, self.looks = True, 1000.0, speed, looks
         self._control = Control(self.autopilot)
         self.bridge = Bridge(scenario, how or Settings(arm=True), self._note, **bridge)
         self.policy: Callable[[Bridge], Action] | None = way_home
@@ -129,11 +135,12 @@ class VirtualFlight:
         return [told for told in self.events if told["event"] == event]
 
     def tick(self) -> None:
-        """A fiftieth of a second of the vehicle's time."""
-        self.now_s += TICK_S / self.speed
-        self.copter.tick()
-        self.autopilot.answer()
-        self.autopilot.speak()
+        """Until the bridge has looked once more."""
+        for _ in range(self.looks):
+            self.now_s += TICK_S / self.speed
+            self.copter.tick()
+            self.autopilot.answer()
+            self.autopilot.speak()
         out = bytes(self.autopilot.out)
         self.autopilot.out.clear()
         for data in self.channel(list(_split(out)) if self.link_is_up else [], self.now_s):
@@ -158,7 +165,7 @@ class VirtualFlight:
 
     def run(self, seconds: float) -> None:
         """Fly for a while."""
-        for _ in range(round(seconds / TICK_S)):
+        for _ in range(round(seconds / (self.looks * TICK_S))):
             self.tick()
 
     def until_over(self, limit_s: float = 900.0) -> str:

@@ -1,5 +1,6 @@
 """Results of sweeps that were never flown: what each setting reached is made up."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 from zlib import crc32
@@ -10,7 +11,7 @@ import numpy as np
 from uav_dc_ros import scenarios
 from uav_dc_ros.experiments.paper.plan import runs
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results, World
-from uav_dc_ros.experiments.paper.setting import FULL, Scale, Setting
+from uav_dc_ros.experiments.paper.setting import FULL, Planned, Scale, Setting
 
 SHORT = msgspec.structs.replace(FULL, episodes=400)
 WORLDS = {name: World.of(scenarios.load(name)) for name in ("three_clusters", "five_clusters")}
@@ -22,6 +23,12 @@ LEVELS = {
     "landing_rate": 0.8,
     "arrival_step": 40.0,
 }
+
+
+@functools.cache
+def planned_runs(scale: Scale) -> tuple[Planned, ...]:
+    """The plan of a scale."""
+    return tuple(runs(scale))
 
 
 def sweep(
@@ -39,21 +46,26 @@ def sweep(
         noise: relative standard deviation of points and greedy figures.
         between: relative change of all levels of a setting in an environment.
     """
-    planned = tuple(runs(scale))
+    planned = planned_runs(scale)
     episode = np.arange(1, scale.n_points + 1) * scale.episodes_per_point
     curves = {metric: np.zeros((len(planned), len(episode)), np.float32) for metric in METRICS}
     greedy = {metric: np.zeros(len(planned), np.float32) for metric in GREEDY}
     ups_and_downs = np.where(np.arange(len(episode)) % 2, 1.0, -1.0)
     rng = np.random.default_rng(0)
+    shapes: dict[tuple[float, float], Any] = {}
     for i, run in enumerate(planned):
         setting = run.setting
         made = {"reward": setting.beta + setting.zeta, "tau": 0.1 * scale.episodes, "jitter": 0.0}
         made |= LEVELS | levels(setting)
         here = 1 + 0.02 * run.environment + between(setting, run.environment)
-        rise = 1 - np.exp(-(episode - episode[0]) / made["tau"])
+        if (made["tau"], made["jitter"]) not in shapes:
+            rise = 1 - np.exp(-(episode - episode[0]) / made["tau"])
+            shapes[made["tau"], made["jitter"]] = (0.2 + 0.8 * rise) * (1 + made["jitter"] * ups_and_downs)
+        shape = shapes[made["tau"], made["jitter"]]
         for metric in METRICS:
-            curve = made[metric] * here * (0.2 + 0.8 * rise) * (1 + made["jitter"] * ups_and_downs)
-            curves[metric][i] = curve * (1 + noise * rng.standard_normal(len(episode)))
+            curves[metric][i] = made[metric] * here * shape
+            if noise:
+                curves[metric][i] *= 1 + noise * rng.standard_normal(len(episode))
             shown = f"greedy_{metric.replace('episode_return', 'return')}"
             greedy[shown][i] = made.get(shown, made[metric]) * here * (1 + noise * rng.standard_normal())
     return Results(

@@ -1,17 +1,17 @@
 """`python -m uav_dc_ros.train`, as a user runs it."""
 
 import itertools
-import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
+from tests.conftest import PATIENCE_S, until
+from tests.experiments.forks import Forks
 from tests.small_worlds import tiny
 from uav_dc_ros.agents import policy
 from uav_dc_ros.experiments.evaluate import evaluate, rows
@@ -79,20 +79,24 @@ def refused(capsys, *arguments):
     return err
 
 
-def start(*arguments):
-    return subprocess.Popen(
+def command(*arguments):
+    done = subprocess.run(
         [sys.executable, "-m", "uav_dc_ros.train", *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        capture_output=True,
         text=True,
+        check=False,
+        timeout=PATIENCE_S,
         env=os.environ | {"COLUMNS": "200"},
     )
+    return done.returncode, done.stdout, done.stderr
 
 
-def command(*arguments):
-    process = start(*arguments)
-    out, err = process.communicate(timeout=90)
-    return process.returncode, out, err
+@pytest.fixture(scope="module")
+def forks(tmp_path_factory):
+    """Starts trainings in processes of their own, and imports torch for all of them once."""
+    forks = Forks(tmp_path_factory.mktemp("outputs"))
+    yield forks
+    forks.close()
 
 
 def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
@@ -192,16 +196,13 @@ def test_without_torch_there_is_one_line_that_helps(tmp_path, field):
     assert 'pip install "uav_dc_ros[train]"' in done.stderr
 
 
-def test_ctrl_c_keeps_the_best_checkpoint(tmp_path, field):
-    process = start(
-        "--scenario", field, "--algo", "dqn", "--out", tmp_path / "made", "--episodes", 100_000,
-        "--checkpoint-every", 2,
-    )  # fmt: skip
-    process.stderr.readline()  # the first checkpoint may still be being written
-    process.stderr.readline()
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=90)
-    assert process.returncode == 130
+def test_ctrl_c_keeps_the_best_checkpoint(tmp_path, field, forks):
+    arguments = ["--scenario", field, "--algo", "dqn", "--out", tmp_path / "made", "--episodes", 100_000]
+    child = forks.start([str(argument) for argument in [*arguments, "--checkpoint-every", 2]])
+    until(lambda: child.output.count("\n") >= 2)  # the first checkpoint may still be being written
+    os.kill(child.process_id, signal.SIGINT)
+    assert child.wait() == 130, child.output
+    err = child.output
     last = err.splitlines()[-1]
     assert "stopped; the best policy until now is" in last
     folder, _, hint = last.rpartition(" is ")[-1].partition("; ")
@@ -245,42 +246,6 @@ MOMENTS = {
     ),
     "in the midst of writing the result": (("uav_dc_ros.experiments.train_cli._draw", 1, "before"), []),
 }
-# Runs commands in children of one process, to import torch once; prints the status after each.
-FORKS = """
-import json, os, pkgutil, signal, sys
-import matplotlib.figure, torch.utils.tensorboard, torch._dynamo
-from uav_dc_ros.experiments import pictures, train_cli, training
-
-
-def kill_at(path, call, when):
-    owner, name = path.rsplit(".", 1)
-    owner, calls = pkgutil.resolve_name(owner), []
-    function = getattr(owner, name)
-
-    def killing(*arguments, **values):
-        calls.append(None)
-        if len(calls) == call and when == "before":
-            os.kill(os.getpid(), signal.SIGKILL)
-        result = function(*arguments, **values)
-        if len(calls) == call:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return result
-
-    setattr(owner, name, killing)
-
-
-for moment, arguments in json.loads(sys.argv[1]):
-    child = os.fork()
-    if child == 0:
-        if moment:
-            kill_at(*moment)
-        try:
-            train_cli.main(arguments)
-        except SystemExit as exit:
-            sys.stderr.flush()
-            os._exit(exit.code)
-    print("status", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
 
 
 def learns(folder, **others):
@@ -298,7 +263,7 @@ OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(MOMENTS)[1
 
 
 @pytest.fixture(scope="module")
-def killed(tmp_path_factory, request):
+def killed(tmp_path_factory, request, forks):
     """A folder for each moment: `killed` as a kill left it, `made` as `--resume` then ended."""
     root = tmp_path_factory.mktemp("killed")
     (root / "tiny.toml").write_text(TINY)
@@ -306,36 +271,19 @@ def killed(tmp_path_factory, request):
         item.callspec.params.get("moment") for item in request.session.items if hasattr(item, "callspec")
     }
     moments = {name: MOMENTS[name] for name in MOMENTS if name == "never" or name in asked}
-    jobs, expected = [], []
     for moment, (kill, checkpoints) in moments.items():
         (root / moment).mkdir()
         arguments = learns(root / moment, **{"--tensorboard": root / moment / "scalars"})
         if kill:
-            jobs.append((kill, arguments))
-            expected.append((-signal.SIGKILL, None))
-        jobs.append((None, [*arguments, "--resume"]))
-        expected.append((0, checkpoints))
+            child = forks.start(arguments, kill)
+            assert child.wait() == -signal.SIGKILL, child.output
+        child = forks.start([*arguments, "--resume"])
+        assert child.wait() == 0, child.output
+        told = [line.split() for line in child.output.splitlines()]
+        assert [int(words[1]) for words in told if words[0] == "episode"] == checkpoints, child.output
     (root / "left").mkdir()
-    jobs.append((MOMENTS["between two checkpoints"][0], learns(root / "left")))
-    expected.append((-signal.SIGKILL, None))
-    done = subprocess.run(
-        [sys.executable, "-c", FORKS, json.dumps(jobs)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        check=False,
-        env=os.environ | {"COLUMNS": "200"},
-    )
-    found, checkpoints = [], []
-    for word, number, *_ in (line.split() for line in done.stdout.splitlines() if " " in line):
-        if word == "episode":
-            checkpoints.append(int(number))
-        elif word == "status":
-            found.append((int(number), checkpoints))
-            checkpoints = []
-    assert [status for status, _ in found] == [status for status, _ in expected], done.stdout
-    for (_, seen), (_, wanted) in zip(found, expected, strict=True):
-        assert wanted is None or seen == wanted, done.stdout
+    child = forks.start(learns(root / "left"), MOMENTS["between two checkpoints"][0])
+    assert child.wait() == -signal.SIGKILL, child.output
     return root
 
 
@@ -373,22 +321,18 @@ def scalars(folder):
     return {tag: [(event.step, event.value) for event in read.Scalars(tag)] for tag in read.Tags()["scalars"]}
 
 
-def test_a_process_killed_from_outside_goes_on_to_the_same_result(killed, tmp_path, capsys):
+def test_a_process_killed_from_outside_goes_on_to_the_same_result(killed, tmp_path, forks):
     (tmp_path / "tiny.toml").write_text(TINY)
     arguments = learns(tmp_path / "run")
     state = tmp_path / "run" / "made.checkpoints" / "training.safetensors"
-    process = start(*arguments)
-    deadline_s = time.monotonic() + 60.0
-    while not state.exists() and time.monotonic() < deadline_s:
-        time.sleep(0.001)
-    process.kill()
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
+    child = forks.start(arguments)
+    until(state.exists)
+    os.kill(child.process_id, signal.SIGKILL)
+    assert child.wait() == -signal.SIGKILL, child.output
     assert state.exists()
-    with pytest.raises(SystemExit) as exit:
-        main([*arguments, "--resume"])
-    err = capsys.readouterr().err
-    assert exit.value.code == 0, err
+    child = forks.start([*arguments, "--resume"])
+    assert child.wait() == 0, child.output
+    err = child.output
     assert "episode 10 " not in err, "the first ten episodes are not flown again"
     assert "episode 30 " in err
     assert result(tmp_path / "run" / "made") == result(killed / "never" / "made")

@@ -25,7 +25,7 @@ from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 
-TICK_S = 0.05
+TICK_S = 0.1  # from one position to the next: ten a second
 LATENCY_NS = 700_000
 DEAD_S = 2.0  # a bridge that was killed is missing for so long
 LIMIT_S = 6000.0
@@ -44,6 +44,7 @@ class Flight:
         policy: decides; None: straight to the dock.
         patience_s: how long the policy thinks about a move.
         speed: how much faster than time the vehicle is.
+        tick_s: vehicle time from one position to the next.
         begun_ns: when.
 
     Attributes:
@@ -63,9 +64,10 @@ class Flight:
         policy: Policy | None = None,
         patience_s: float = 0.0,
         speed: float = 1.0,
+        tick_s: float = TICK_S,
         begun_ns: int = BEGUN_NS,
     ) -> None:
-        self.scenario, self.seed, self.speed = scenario, seed, speed
+        self.scenario, self.seed, self.speed, self.tick_s = scenario, seed, speed, tick_s
         self.settings = settings or Settings(arm=True)
         self.told: list[BagMessage] = []
         self.executed: list[int] = []
@@ -120,14 +122,14 @@ class Flight:
         if bridge is None:
             if vehicle.now_s >= self._dead_until_s:
                 self.bridge = self._bridge(standing=self._standing)
-            vehicle.pass_time(TICK_S, self._setpoint)
+            vehicle.pass_time(self.tick_s, self._setpoint)
             return
         for wish in bridge.tick(vehicle.now_s, vehicle.told):
             vehicle.ask(wish)
         if vehicle.told.position is not None and vehicle.told.position_s == vehicle.now_s:
             self._say_pose(vehicle.told.position)
         self._decide(bridge)
-        vehicle.pass_time(TICK_S, bridge.setpoint)
+        vehicle.pass_time(self.tick_s, bridge.setpoint)
 
     def _say(self, topic: str, payload: messages.Payload | bytes) -> None:
         sent_ns = self._sent_ns = max(self.now_ns, self._sent_ns + 1000)
