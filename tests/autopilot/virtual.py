@@ -24,9 +24,7 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 
-LOOKS = (
-    2  # after so many ticks of the vehicle the bridge looks: half as often as its node, and at each position
-)
+LOOKS = 2  # after so many ticks of the vehicle the bridge looks: half as often as its node does
 
 # What the autopilot sent, and now: what arrives now.
 Channel = Callable[[list[bytes], float], Iterable[bytes]]
