@@ -173,6 +173,38 @@ def test_a_message_that_comes_late_or_twice_changes_nothing() -> None:
     assert known.discarded == {"late": 2, "repeated": 1}
 
 
+def test_a_message_that_was_overtaken_by_others_is_news() -> None:
+    """On a link that reorders, a heartbeat would otherwise be late for ever."""
+    radio = met()
+    for second in range(5):
+        heartbeat = radio.make("heartbeat", 2, 3, 0, 5, 4)
+        radio.now_s += 1.0
+        radio.position(600.0 + second)
+        radio.hearing.hear(heartbeat, radio.now_s)
+        radio.hearing.hear(heartbeat, radio.now_s)
+        assert radio.hearing.telemetry(radio.now_s).heartbeat_s == radio.now_s
+    assert radio.hearing.discarded == {"late": 5}, "the second time"
+
+
+def test_a_mode_that_was_just_left_is_believed_at_the_second_heartbeat() -> None:
+    """The first may be seconds old: numbers begin anew after 256."""
+    radio = met()
+    guided = radio.send("heartbeat", 2, 3, 0, 4, 4)
+    radio.now_s += 1.0
+    landing = radio.send("heartbeat", 2, 3, 0, 9, 4)
+    assert (guided.mode_name, landing.mode_name) == ("GUIDED", "LAND")
+    radio.now_s += 1.0
+    assert radio.send("heartbeat", 2, 3, 0, 4, 4).mode_name == "LAND"
+    assert radio.hearing.doubts_mode(radio.now_s), "nothing is commanded until that is clear"
+    radio.now_s += 1.0
+    assert radio.send("heartbeat", 2, 3, 0, 4, 4).mode_name == "GUIDED"
+    assert not radio.hearing.doubts_mode(radio.now_s)
+    radio.now_s += 10.0
+    assert radio.send("heartbeat", 2, 3, 0, 9, 4).mode_name == "LAND", "at once, after a while"
+    radio.now_s += 1.0
+    assert radio.send("heartbeat", 2, 3, 0, 5, 4).mode_name == "LOITER", "at once, if it is another"
+
+
 def test_a_position_that_was_overtaken_is_as_old_as_it_is() -> None:
     """The only one for a while: it is taken, and not taken for fresh."""
     radio = met()

@@ -38,6 +38,7 @@ TIMED = frozenset({"LOCAL_POSITION_NED", "SYSTEM_TIME", "ATTITUDE", "POSITION_TA
 ONCE = frozenset({"GPS_GLOBAL_ORIGIN"})  # PX4 sends it when it changes, or is asked for this one
 ESTIMATE_HZ = 5.0
 ADVICE = ("PreArm", "Preflight", "Arm:")
+BACK_S = 4.0  # a state that was left for so short a time is believed when two heartbeats report it
 SEEN = 64  # texts that are kept
 
 
@@ -90,6 +91,8 @@ class Hearing:
         self.landed_state: int | None = None
         self.heard: dict[str, float] = {}
         self._custom_mode, self._armed = 0, False
+        self._left_s: dict[tuple[int, bool], float] = {}  # when such a state was reported no more
+        self._back_s: float | None = None  # when the last heartbeat came, if it reported such a state
         self._flags, self._health = 0, 0
         self._battery: float | None = None
         self._battery_v: float | None = None
@@ -119,6 +122,10 @@ class Hearing:
         """Its own time, seconds; goes on where it starts anew."""
         return self._clock.vehicle_s
 
+    def doubts_mode(self, now_s: float) -> bool:
+        """Does the last heartbeat report a mode that was left a moment ago: an old message, or a pilot."""
+        return self._back_s is not None and now_s - self._back_s < STALE_S
+
     def hear(self, message: Any, now_s: float) -> bool:
         """Take in a message of pymavlink's, at a steady time; was it the vehicle's, and news."""
         name, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
@@ -141,7 +148,7 @@ class Hearing:
 
     def _discards(self, name: str, message: Any, now_s: float) -> Discard | None:
         """Why a message of the vehicle is ignored; None: it is not."""
-        if (why := self._sequence.take(message.get_seq(), message.get_crc(), now_s)) is not None:
+        if (why := self._sequence.take(name, message.get_seq(), message.get_crc(), now_s)) is not None:
             return why
         if not IS_POSSIBLE.get(name, lambda _: True)(message):
             return Discard.IMPOSSIBLE
@@ -236,7 +243,17 @@ class Hearing:
     # What it says.
 
     def _on_heartbeat(self, message: Any, now_s: float) -> None:
-        self._custom_mode, self._armed = message.custom_mode, bool(message.base_mode & ARMED)
+        state = message.custom_mode, bool(message.base_mode & ARMED)
+        if state != (self._custom_mode, self._armed):
+            # A heartbeat that was late for seconds, and whose number is news again, tells of a state before.
+            is_back = state in self._left_s and now_s - self._left_s[state] < BACK_S
+            if is_back and self._back_s is None:
+                self._back_s = now_s
+                self.discarded[Discard.LATE] += 1
+                return
+            self._left_s[self._custom_mode, self._armed] = now_s
+        self._back_s = None
+        self._custom_mode, self._armed = state
         if self._armed:
             self.granted("arming")
 

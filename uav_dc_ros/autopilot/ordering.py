@@ -10,6 +10,7 @@ from enum import StrEnum
 SILENT_S = 0.5  # after so long without a message any number is news, steady clock
 SAME_COUNT = 16  # messages in a row, behind the newest, that make another count of the same sender
 NUMBERS = 256  # of MAVLink's messages, which then begin anew
+REORDERED = 16  # a message that many numbers behind the newest is news, if it is the newest of its name
 
 LAG_S = 1.0  # a message that is further behind the newest is late, vehicle time
 LEAP_S = 1.0  # a message that is further ahead needs others to confirm it, vehicle time
@@ -34,24 +35,34 @@ class Sequence:
     def __init__(self) -> None:
         self._newest: int | None = None
         self._newest_s, self._checksum = 0.0, 0
+        self._count = 0  # of the newest: its number, but ever on
+        self._count_of: dict[str, int] = {}  # of the newest by name
         self._behind: int | None = None  # the last number that was not news,
         self._in_a_row = 0  # and how many before it make one count with it
 
-    def take(self, number: int, checksum: int, now_s: float) -> Discard | None:
-        """Is a message with this number, at a steady time, no news, and why; None: it is news.
+    def take(self, name: str, number: int, checksum: int, now_s: float) -> Discard | None:
+        """Is a message with this name and number, at a steady time, no news, and why; None: it is news.
 
         Other messages with the same number, one after the other, are those of a router that does not count.
+        One that was overtaken by a few of other names is news.
         """
         ahead = 0 if self._newest is None else (number - self._newest) % NUMBERS
+        behind = (NUMBERS - ahead) % NUMBERS
         news = 0 < ahead < NUMBERS // 2 or (ahead == 0 and checksum != self._checksum)
         news = news or self._newest is None or now_s - self._newest_s > SILENT_S
         if not news:
+            count = self._count - behind
+            if 0 < behind <= REORDERED and count > self._count_of.get(name, -NUMBERS):
+                self._count_of[name] = count
+                return None
             follows = self._behind is not None and 0 < (number - self._behind) % NUMBERS < SAME_COUNT
             self._in_a_row = self._in_a_row + 1 if follows else 1
             self._behind = number
         if not news and self._in_a_row < SAME_COUNT:
             return Discard.LATE if ahead else Discard.REPEATED
         self._newest, self._newest_s, self._checksum = number, now_s, checksum
+        self._count += ahead or NUMBERS
+        self._count_of[name] = self._count
         self._behind, self._in_a_row = None, 0
         return None
 

@@ -90,7 +90,7 @@ class Session:
             self._ask_s = following(self._ask_s, ASK_S, now_s)
             self._ask_for_messages(now_s)
         wishes, self._wishes = self._wishes, []
-        for wish in wishes:
+        for wish in () if hearing.doubts_mode(now_s) else wishes:  # not against a pilot; they are repeated
             self._send_wish(wish, now_s)
         streamed, streamed_vehicle_s = self._streamed
         due = now_s >= self.stream_s or self._setpoint != streamed
