@@ -79,12 +79,12 @@ class Bench:
         node.trigger_activate()
         return node
 
-    def looks(self, node: Observer, seconds: float) -> None:
+    def looks(self, node: Observer, seconds: float, *, have_started: bool = True) -> None:
         """Look for others as often as run_all does."""
         until_s = self.now_s + seconds
         while self.now_s < until_s:
             self.now_s += 0.05
-            node.look()
+            node.look(have_started)
 
 
 @pytest.fixture
@@ -122,6 +122,15 @@ def test_nodes_begin_once_nobody_else_was_found_for_a_while(bench: Bench) -> Non
     bench.looks(node, ALONE_S / 2)
     assert not node.is_alone
     bench.looks(node, ALONE_S)
+    assert node.is_alone
+
+
+def test_nodes_that_start_slowly_are_waited_for(bench: Bench) -> None:
+    """Where they take long, others are found late, too."""
+    node = bench.observer()
+    bench.looks(node, 10 * ALONE_S, have_started=False)
+    assert not node.is_alone
+    bench.looks(node, 0.2)
     assert node.is_alone
 
 
