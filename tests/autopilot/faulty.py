@@ -46,7 +46,7 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "",
         ("jumped", "outside the fence", "mode AUTO.RTL: changed by", "from the dock", ""),
     ),
-    "jump away": ("jump 5000 0 0", "", ("jumped", "from the dock", "")),
+    "jump away": ("jump 5000 0 0", "", ("jumped", "from the dock", "no position for", "")),
     "mode": ("pilot", "", ("changed by a pilot", "")),
     "battery": ("battery 0.1", "battery 1", ("battery 10%", "battery 9%", "")),
     # On the ground it is believed: nobody knows better there.
