@@ -202,6 +202,7 @@ class Bridge:
             return []
         self._known = known = self._watched.see(now_s, known)
         self._now_s, self._steady_s = known.vehicle_s, now_s
+        self._asked.pass_time(known.vehicle_s, now_s, stands=self._watched.clock_stands(now_s))
         self._tracking.send(self.setpoint, now_s)
         if self.phase is Phase.IDLE:
             self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
@@ -225,7 +226,7 @@ class Bridge:
             Phase.MOVING: self._fly,
             Phase.LANDING: self._land,
         }[self.phase](now_s, known)
-        uttered = [wish for wish in wishes if self._asked.may(wish, known.vehicle_s)]
+        uttered = [wish for wish in wishes if self._asked.may(wish)]
         self._descent.tries += sum(isinstance(wish, SetMode) for wish in uttered)
         return uttered
 
@@ -404,8 +405,8 @@ class Bridge:
             self._descend(self.settings.then, Phase.TIMEOUT, why)
 
     def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
-        asked_s = self._asked.last_s.get(SetMode(Mode.RETURN))
-        return self._follow(self._descent.look(now_s, known, self.setpoint, asked_s))
+        waited_s = self._asked.waited_s(SetMode(Mode.RETURN))
+        return self._follow(self._descent.look(now_s, known, self.setpoint, waited_s))
 
     # Small change.
 
