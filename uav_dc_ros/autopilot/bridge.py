@@ -278,8 +278,9 @@ class Bridge:
                 self._change(f"holds: {self.fault}")
             case "passes":
                 self._change(f"goes on after: {self.reason}")
-            case "ends":
-                self._give_up_for(self._hold.fault, now_s, known)
+            case "ends" if (lasting := self._hold.fault) is not None:
+                blind_since_s = self._hold.since_s[0] if lasting.kind is FaultKind.POSITION else None
+                self._give_up(lasting.why, None, blind_since_s)
 
     def _strays(self, known: Telemetry) -> Fault | None:
         """Does it not fly to where a move has sent it."""
@@ -306,19 +307,12 @@ class Bridge:
             self._change(f"goes on after: {self.reason}")
         return not self.policy_is_gone
 
-    def _give_up_for(self, fault: Fault | None, now_s: float, known: Telemetry) -> None:
-        """End the mission for a fault that lasts. A vehicle that does not know where it is cannot return."""
-        if fault is None:
-            return
-        blind_since_s = self._hold.since_s[0] if fault.kind is FaultKind.POSITION else None
-        how = Mode.LAND if self._watched.estimate_is_lost(now_s, known) else None
-        self._give_up(fault.why, how, blind_since_s)
-
     def _give_up(self, why: str, how: Mode | None = None, blind_since_s: float | None = None) -> None:
         """End the mission: bring the vehicle down."""
         self._hold.fault = None
         why = why if self._reported is None else f"{why}; {self._reported}"  # which may be why
-        self._descend(how or self.settings.then, Phase.ABORTED, why, blind_since_s)
+        how = how or self._watched.way_down(self._steady_s, self._known)
+        self._descend(how, Phase.ABORTED, why, blind_since_s)
 
     # What is to be done in each phase.
 
