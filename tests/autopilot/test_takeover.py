@@ -1,5 +1,7 @@
 """Who has the vehicle: a pilot's switch on the ground, another system, a bridge that is stopped anywhere."""
 
+import dataclasses
+
 import msgspec
 import pytest
 
@@ -237,6 +239,18 @@ def test_a_bridge_that_is_stopped_lets_a_pilot_s_vehicle_alone() -> None:
         flight.run(1.0)
         assert vehicle.asked == []
         assert flight.bridge.phase is Phase.ABORTED
+
+
+def test_a_bridge_that_is_stopped_lets_one_of_several_vehicles_alone() -> None:
+    """The first one that it heard on the link flies, commanded by somebody else."""
+    vehicle = Vehicle(position=ALOFT, mode=Mode.COMMANDED, armed=True, missing="2 autopilots on this link")
+    vehicle.pass_time(0.1, None)
+    flight = Flight(vehicle=vehicle)
+    for _ in range(20):
+        flight.tick(known=dataclasses.replace(vehicle.told, is_meant=False))
+    flight.bridge.stop("the bridge was stopped")
+    flight.run(1.0)
+    assert (vehicle.asked, flight.bridge.phase) == ([], Phase.ABORTED)
 
 
 def test_a_mission_in_the_air_that_cannot_be_taken_up_has_an_end() -> None:

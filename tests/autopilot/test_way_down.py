@@ -4,12 +4,29 @@ import dataclasses
 
 import pytest
 
-from tests.autopilot.simulated import START, fly_to_step
+from tests.autopilot.simulated import START, Flight, Vehicle, fly_to_step
 from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Mode
+from uav_dc_ros.autopilot.vehicle import Mode, SetMode
+from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
+
+
+@pytest.mark.parametrize("phase", [Phase.MOVING, Phase.PREFLIGHT])
+def test_a_vehicle_without_an_estimate_is_not_told_to_return_when_the_bridge_is_stopped(phase: Phase) -> None:
+    if phase is Phase.MOVING:
+        flight = fly_to_step(3)
+    else:
+        vehicle = Vehicle(position=START, mode=Mode.COMMANDED, armed=True)
+        flight = Flight(Settings(), vehicle)
+    flight.vehicle.estimate_ok = False
+    flight.vehicle.refused = (Mode.RETURN,)
+    flight.run(1.0)
+    flight.bridge.stop("the bridge was stopped")
+    flight.vehicle.asked.clear()
+    flight.run(1.0)
+    assert flight.vehicle.asked == [SetMode(Mode.LAND)]
 
 
 @pytest.mark.parametrize(("lost_s", "mode"), [(7.0, Mode.RETURN), (20.0, Mode.LAND)])

@@ -179,10 +179,16 @@ class Bridge:
         known = known or self._known
         if self.phase in STEERED:
             self._give_up(why)
-        elif self.phase in GROUND and known.armed and known.mode is Mode.COMMANDED and not self._taken:
-            self._descend(Mode.LAND if known.on_ground else self.settings.then, Phase.ABORTED, why)
+        elif self.phase in GROUND and self._is_to_come_down(known):
+            self._known = known
+            how = Mode.LAND if known.on_ground else self._watched.way_down(self._steady_s, known)
+            self._descend(how, Phase.ABORTED, why)
         elif self.phase is not Phase.LANDING and not self.is_over:
             self._end(Phase.ABORTED, why)
+
+    def _is_to_come_down(self, known: Telemetry) -> bool:
+        """Is a vehicle before its mission one that nobody would have then. Of several it may be anybody's."""
+        return known.armed and known.is_meant and known.mode is Mode.COMMANDED and not self._taken
 
     def is_done_with(self, known: Telemetry) -> bool:
         """Does the vehicle come to its end without any further word."""
