@@ -13,6 +13,31 @@ from uav_dc_ros.messages import Phase
 GROUND = Enu(START.east_m, START.north_m, 0.0)
 
 
+def drifting() -> Flight:
+    """It was asked to return, and the wind is stronger than it flies."""
+    flight = fly_to_step(3)
+    flight.vehicle.battery = 0.1
+    flight.run(1.0)
+    assert flight.vehicle.mode is Mode.RETURN
+    flight.vehicle.stuck = True
+    flight.run(20.0)
+    return flight
+
+
+def test_a_pilot_may_return_a_vehicle_that_lands_instead_of_returning() -> None:
+    flight = drifting()
+    vehicle = flight.vehicle
+    flight.run(20.0)
+    assert vehicle.mode is Mode.LAND
+    vehicle.asked.clear()
+    vehicle.mode = Mode.RETURN  # the pilot's: there is water below
+    flight.run(10.0)
+    assert (vehicle.asked, vehicle.mode) == ([], Mode.RETURN)
+    vehicle.stuck = False
+    flight.until(Phase.ABORTED)
+    assert vehicle.asked == []
+
+
 @pytest.mark.parametrize("phase", [Phase.MOVING, Phase.PREFLIGHT])
 def test_a_vehicle_without_an_estimate_is_not_told_to_return_when_the_bridge_is_stopped(phase: Phase) -> None:
     if phase is Phase.MOVING:

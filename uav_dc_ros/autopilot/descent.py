@@ -77,6 +77,7 @@ class Descent:
     def obeys(self, known: Telemetry) -> bool:
         """Does it come down, as it was told or as its own failsafe or a pilot knows better."""
         self.obeyed = self.obeyed or known.mode in DOWN
+        self._instead = self._instead and known.mode is not Mode.LAND  # who returns it then is a pilot
         return self.obeyed and not (self._instead and known.mode is Mode.RETURN)
 
     def is_ours(self, mode: Mode) -> bool:
