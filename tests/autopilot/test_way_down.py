@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 
-from tests.autopilot.simulated import START, Flight, Vehicle, fly_to_step
+from tests.autopilot.simulated import SCENARIO, START, Flight, Vehicle, fly_to_step
+from uav_dc_ros.autopilot.bridge import Standing
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Mode, SetMode
 from uav_dc_ros.autopilot.watch import Settings
@@ -71,3 +72,15 @@ def test_a_vehicle_whose_clock_stands_is_asked_again(lost_s: float, mode: Mode) 
     vehicle.deaf = False
     run(5.0)
     assert vehicle.mode is mode
+
+
+@pytest.mark.parametrize("up_m", [3.0, 250.0 - 40.0])
+@pytest.mark.parametrize("again", [True, False])
+def test_a_vehicle_that_flies_goes_straight_up_or_down_then_across(up_m: float, again: bool) -> None:
+    vehicle = Vehicle(position=Enu(300.0, 300.0, up_m), mode=Mode.COMMANDED, armed=True)
+    standing = Standing(step=0, cell=SCENARIO.start_cell, flies=True) if again else None
+    flight = Flight(Settings(), vehicle, standing=standing)
+    while abs(vehicle.position.up_m - START.up_m) > 3.0:
+        assert vehicle.position[:2] == (300.0, 300.0)
+        flight.tick()
+    flight.until(Phase.MOVING)

@@ -352,8 +352,8 @@ class Bridge:
         if known.vehicle_s - self._since_s > self.settings.takeoff_s:
             self._give_up(f"not at the start after {self.settings.takeoff_s:g} s")
             return []
-        if position is not None and position.up_m >= start.up_m - self.settings.tolerance_m:
-            self.setpoint = start  # high enough to fly across
+        if position is not None and abs(position.up_m - start.up_m) <= self.settings.tolerance_m:
+            self.setpoint = start  # at the altitude to fly across
         if self._dwell.is_there(start, known):
             self._arrive_first()
             return []

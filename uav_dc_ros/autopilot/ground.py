@@ -87,7 +87,7 @@ class Ground:
                 why = "it flew already when the bridge came"
                 return Next(phase=Phase.LANDING, why=why, setpoint=known.position, down=settings.then)
             why = "it flies already: to the cell where the mission stands"
-            return Next(phase=Phase.TAKEOFF, why=why, setpoint=self.course.target)
+            return Next(phase=Phase.TAKEOFF, why=why, setpoint=self._above(known))
         # An autopilot may want to see setpoints before it follows any.
         why = f"connected to {known.system}" if known.system else "connected"
         return Next(phase=Phase.PREFLIGHT, why=why, setpoint=known.position)
@@ -159,14 +159,18 @@ class Ground:
 
     def _take_it(self, known: Telemetry) -> Next:
         """Begin with a vehicle that is armed, in the commanded mode."""
-        here, target = known.position, self.course.target
-        above = Enu(here.east_m, here.north_m, target.up_m) if here is not None else target
+        above = self._above(known)
         breach = self.fence.breach(above)
         why = f"the target is outside the fence: {breach}" if breach is not None else self._misfit(known)
         if why is not None:
             down = Mode.LAND if known.on_ground else self.settings.then
             return Next(phase=Phase.LANDING, why=why, down=down)
         return Next(phase=Phase.TAKEOFF, why="armed, in the commanded mode", setpoint=above)
+
+    def _above(self, known: Telemetry) -> Enu:
+        """Straight up or down at the goal's altitude: from there, the vehicle flies across."""
+        here, target = known.position, self.course.target
+        return target if here is None else target._replace(east_m=here.east_m, north_m=here.north_m)
 
     def warnings(self, known: Telemetry) -> list[str]:
         """What a user should know, though it is no reason not to fly."""
