@@ -28,13 +28,14 @@ class Ground:
         allowed_mode: with `Settings.arm`, the one mode besides the commanded one that the vehicle may be in:
             that in which it was when the commanded mode was requested. The commanded mode's name: the vehicle
             was in that already. None: neither has happened yet, and every mode is allowed.
-        is_a_pilots: had somebody else it armed? Who lands it does not want it to start again.
+        is_a_pilots: had somebody else it armed, or disarmed it? Then it is not to start again by itself.
     """
 
     def __init__(self, course: Course, settings: Settings, fence: Fence, watch: Watch) -> None:
         self.course, self.settings, self.fence, self.watch = course, settings, fence, watch
         self.allowed_mode = course.standing.allowed_mode
         self.is_a_pilots = course.standing.is_a_pilots
+        self._was_armed = False
         self._unplaced_since_s: float | None = None  # steady clock: it flies, and nobody knows where
 
     def takeover(self, now_s: float, known: Telemetry) -> str | None:
@@ -43,6 +44,8 @@ class Ground:
         Who chooses another mode after the commanded one was requested, or entered, takes the vehicle back.
         Without `Settings.arm` nothing is requested, and a pilot is free to change modes until take-off.
         """
+        self.is_a_pilots |= self._was_armed and not known.armed  # by whoever disarmed it
+        self._was_armed = known.armed
         if not self.settings.arm or self.is_a_pilots or self.watch.link_is_lost(now_s, known):
             return None
         mode = _name(known)
@@ -132,6 +135,8 @@ class Ground:
         self.is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
         here, fault = known.position, self.watch.fault(now_s, known)
         ours = known.armed and known.mode is Mode.COMMANDED
+        if not ours and self.course.standing.flies and (left := self._left_alone(known, None)) is not None:
+            return left  # it was armed once
         if not ours and (why := self.refusal(known)) is not None:
             return Next(phase=Phase.ABORTED, why=why)
         if known.missing is not None:
