@@ -2,9 +2,10 @@
 
 import dataclasses
 
+import msgspec
 import pytest
 
-from tests.autopilot.simulated import SCENARIO, START, Flight, Vehicle, fly_to_step
+from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
 from uav_dc_ros.autopilot.bridge import Standing
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Mode, SetMode
@@ -12,6 +13,12 @@ from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
+
+
+def restarted(flight: Flight) -> Flight:
+    """Another bridge beside the same vehicle, that knows what the journal tells."""
+    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Standing)
+    return Flight(flight.bridge.settings, flight.vehicle, standing=standing)
 
 
 def drifting() -> Flight:
@@ -37,6 +44,31 @@ def test_a_pilot_may_return_a_vehicle_that_lands_instead_of_returning() -> None:
     vehicle.stuck = False
     flight.until(Phase.ABORTED)
     assert vehicle.asked == []
+
+
+@pytest.mark.parametrize("refused", ["rival", "outside", "unplaced", "stopped"])
+def test_what_was_left_alone_is_let_alone_by_a_bridge_that_is_started_anew(refused: str) -> None:
+    """With the journal of a flight that was refused, or stopped while a pilot had the vehicle."""
+    vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
+    flight = Flight(ARMING, vehicle)
+    if refused == "rival":
+        vehicle.other_controller = "component 191 of system 254 sends heartbeats"
+    elif refused == "outside":
+        vehicle.position = Enu(3000.0, 300.0, 150.0)
+    elif refused == "unplaced":
+        vehicle.unplaced = True
+    else:
+        vehicle.mode = Mode.OTHER
+    vehicle._tell()
+    flight.run(8.0)
+    flight.bridge.stop("the bridge was stopped")
+    assert flight.bridge.is_over
+    vehicle.mode = Mode.COMMANDED
+    vehicle.unplaced, vehicle.other_controller = False, None
+    vehicle._tell()
+    again = restarted(flight)
+    again.run(5.0)
+    assert (vehicle.asked, again.bridge.phase) == ([], Phase.ABORTED)
 
 
 @pytest.mark.parametrize("phase", [Phase.MOVING, Phase.PREFLIGHT])

@@ -184,6 +184,7 @@ class Bridge:
             how = Mode.LAND if known.on_ground else self._watched.way_down(self._steady_s, known)
             self._descend(how, Phase.ABORTED, why)
         elif self.phase is not Phase.LANDING and not self.is_over:
+            self._taken = True  # nothing was requested, and nothing will be
             self._end(Phase.ABORTED, why)
 
     def _is_to_come_down(self, known: Telemetry) -> bool:
@@ -336,6 +337,8 @@ class Bridge:
         """Do what a look at a vehicle led to that is not steered."""
         self.setpoint = advice.setpoint
         if advice.phase.is_over:
+            lost = self._watched.link_is_lost(self._steady_s, self._known)
+            self._taken |= self.phase in GROUND and not lost  # it is left alone
             self._end(advice.phase, advice.why)
         elif advice.phase is self.phase:
             self._change(advice.why)
