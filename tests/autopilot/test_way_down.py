@@ -46,6 +46,48 @@ def test_a_pilot_may_return_a_vehicle_that_lands_instead_of_returning() -> None:
     assert vehicle.asked == []
 
 
+def test_a_return_that_does_not_come_home_is_ended_by_a_bridge_that_is_started_anew_too() -> None:
+    again = restarted(drifting())
+    again.run(60.0)
+    assert again.vehicle.mode is Mode.LAND, again.log[-3:]
+
+
+def test_a_landing_at_the_dock_goes_on_as_one() -> None:
+    """Killed before the vehicle had heard of it."""
+    flight = fly_to_step(3)
+    flight.vehicle.deaf = True
+    flight.until(Phase.LANDING)
+    assert flight.bridge.standing.outcome is Phase.LANDED
+    flight.vehicle.deaf = False
+    again = restarted(flight)
+    again.until(Phase.LANDED)
+
+
+def test_a_vehicle_without_an_estimate_is_not_told_to_return_by_a_bridge_that_is_started_anew() -> None:
+    flight = fly_to_step(3)
+    flight.vehicle.deaf = True
+    flight.vehicle.estimate_ok = False
+    flight.until(Phase.LANDING)
+    flight.vehicle.estimate_ok = True
+    flight.vehicle.asked.clear()
+    flight.vehicle.deaf = False
+    again = restarted(flight)
+    again.until(Phase.ABORTED)
+    assert set(again.vehicle.asked) == {SetMode(Mode.LAND)}
+
+
+def test_who_takes_a_vehicle_that_comes_down_keeps_it_though_no_bridge_was_there_to_see_it() -> None:
+    flight = fly_to_step(3)
+    flight.vehicle.battery = 0.1
+    flight.run(5.0)
+    assert flight.vehicle.mode is Mode.RETURN
+    flight.vehicle.asked.clear()
+    flight.vehicle.mode = Mode.COMMANDED  # a ground station's
+    again = restarted(flight)
+    again.until(Phase.ABORTED)
+    assert again.vehicle.asked == []
+
+
 @pytest.mark.parametrize("refused", ["rival", "outside", "unplaced", "stopped"])
 def test_what_was_left_alone_is_let_alone_by_a_bridge_that_is_started_anew(refused: str) -> None:
     """With the journal of a flight that was refused, or stopped while a pilot had the vehicle."""
@@ -69,6 +111,43 @@ def test_what_was_left_alone_is_let_alone_by_a_bridge_that_is_started_anew(refus
     again = restarted(flight)
     again.run(5.0)
     assert (vehicle.asked, again.bridge.phase) == ([], Phase.ABORTED)
+
+
+def test_what_a_pilot_has_is_let_alone_also_without_a_position() -> None:
+    flight = fly_to_step(3)
+    flight.vehicle.mode = Mode.OTHER
+    flight.run(0.5)
+    flight.vehicle.mode = Mode.COMMANDED
+    flight.vehicle.asked.clear()
+    again = restarted(flight)
+    again.vehicle.unplaced = True
+    again.vehicle._tell()
+    again.until(Phase.ABORTED)
+    assert again.vehicle.asked == []
+
+
+def test_a_mode_that_was_entered_is_known_to_a_bridge_that_is_started_anew() -> None:
+    """The pilot goes back to the mode that the vehicle was in before the commanded one was requested."""
+    kept: list[Standing] = []
+    vehicle = Vehicle(position=GROUND, mode_name="STABILIZE")
+    flight = Flight(vehicle=vehicle)
+    note = flight.bridge._on_change
+
+    def keep() -> None:
+        note()
+        kept.append(flight.bridge.standing)
+
+    flight.bridge._on_change = keep
+    while vehicle.mode is not Mode.COMMANDED:
+        flight.tick()
+    flight.tick()
+    vehicle.asked.clear()
+    vehicle.armed = False
+    vehicle.mode = Mode.OTHER
+    vehicle._tell()
+    again = Flight(ARMING, vehicle, standing=kept[-1])
+    again.run(10.0)
+    assert vehicle.asked == []
 
 
 @pytest.mark.parametrize("phase", [Phase.MOVING, Phase.PREFLIGHT])

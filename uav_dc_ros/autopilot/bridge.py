@@ -87,6 +87,7 @@ class Bridge:
         self._reported: str | None = None  # another system that commands the vehicle in flight
         self._taken = self.course.standing.released  # somebody else has the vehicle
         self._ground = Ground(self.course, settings, self.fence, self._watched)
+        self._kept = self._to_keep()
 
     @property
     def is_over(self) -> bool:
@@ -151,6 +152,9 @@ class Bridge:
             released=self._taken or (self.is_over and not self._known.armed),
             outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
             reason=self.reason if over else "",
+            down=self._descent.how if over else None,
+            asked=over and self._descent.tries > 0,
+            obeyed=over and self._descent.obeyed,
         )
 
     def move(self, step: int, action: Action) -> str | None:
@@ -235,7 +239,15 @@ class Bridge:
         }[self.phase](now_s, known)
         uttered = [wish for wish in wishes if self._asked.may(wish)]
         self._descent.tries += sum(isinstance(wish, SetMode) for wish in uttered)
+        if self._to_keep() != self._kept:
+            self._kept = self._to_keep()
+            self._on_change()
         return uttered
+
+    def _to_keep(self) -> tuple[object, ...]:
+        """What a bridge that is started anew has to know before it is requested, or as soon as it is seen."""
+        ground, descent = self._ground, self._descent
+        return ground.allowed_mode, ground.is_a_pilots, descent.tries > 0, descent.obeyed
 
     # What goes wrong.
 
@@ -327,11 +339,7 @@ class Bridge:
         return self._follow(self._ground.connect(now_s, known, now_s - self._since_steady_s))
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
-        before = self._ground.allowed_mode
-        wishes = self._follow(self._ground.prepare(now_s, known))
-        if self._ground.allowed_mode != before:
-            self._on_change()  # a bridge that is started anew has to know it, before it is requested
-        return wishes
+        return self._follow(self._ground.prepare(now_s, known))
 
     def _follow(self, advice: Next) -> list[Wish]:
         """Do what a look at a vehicle led to that is not steered."""
@@ -344,6 +352,7 @@ class Bridge:
             self._change(advice.why)
         elif advice.phase is Phase.LANDING:
             self._descend(advice.down, advice.outcome, advice.why)
+            self._descent.tries += advice.asked
         elif advice.phase is Phase.TAKEOFF and self.course.is_done:
             self._finish("when the bridge came back")
         else:
@@ -416,6 +425,7 @@ class Bridge:
     def _descend(self, how: Mode, outcome: Phase, why: str, blind_since_s: float | None = None) -> None:
         """Bring it down; until it obeys, the setpoint holds it where it is."""
         self._descent = Descent(self.course, self._watched, how, outcome, why, blind_since_s)
+        self._descent.obeys(self._known)  # it may come down already
         self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:

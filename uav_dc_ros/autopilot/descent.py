@@ -26,6 +26,7 @@ class Next:
         wish: to utter; None: none.
         down: how to descend.
         outcome: of a mission that descends.
+        asked: did an earlier bridge request that way down?
     """
 
     phase: Phase
@@ -34,6 +35,7 @@ class Next:
     wish: Wish | None = None
     down: Mode = Mode.LAND
     outcome: Phase = Phase.ABORTED
+    asked: bool = False
 
 
 class Descent:

@@ -102,21 +102,38 @@ class Ground:
         since_s = self._unplaced_since_s = (self._unplaced_since_s or now_s) if unplaced else None
         if self.course.standing.flies:
             if waited_s > self.settings.lost_s:
-                phase = Phase.ABORTED if lost or not known.armed else Phase.LANDING
-                return Next(phase=phase, why=f"{why}; waited {waited_s:.0f} s", down=self.settings.then)
+                why = f"{why}; waited {waited_s:.0f} s"
+                left_alone = lost or not known.armed or self._is_anothers(known)
+                return Next(phase=Phase.ABORTED, why=why) if left_alone else self._down(known, why)
         elif since_s is not None and now_s - since_s > UNPLACED_S:
             why = f"the vehicle flies, and its place on the grid is not known ({why})"
             return Next(phase=Phase.ABORTED, why=f"{why}; expected --datum=LAT,LON,ALT, or it on the ground")
         return Next(phase=Phase.CONNECTING, why=why)
+
+    def _is_anothers(self, known: Telemetry) -> bool:
+        """Has somebody else the vehicle of a mission that was in the air, who flies it."""
+        before = self.course.standing
+        if before.released:
+            return known.mode not in DOWN
+        return before.obeyed and known.mode is Mode.COMMANDED  # an earlier bridge saw it coming down
+
+    def _down(self, known: Telemetry, why: str, outcome: Phase = Phase.ABORTED) -> Next:
+        """Go on coming down as it did before, or as it is told to."""
+        before = self.course.standing
+        down = known.mode if known.mode in DOWN else before.down or self.settings.then
+        asked = before.asked and before.down is known.mode
+        return Next(phase=Phase.LANDING, why=why, down=down, outcome=outcome, asked=asked)
 
     def _left_alone(self, known: Telemetry, breach: str | None) -> Next | None:
         """Why a mission that was in the air is not taken up again, or goes on coming down; None: it is."""
         before = self.course.standing
         if before.released and not (known.armed and known.mode in DOWN):
             return Next(phase=before.outcome or Phase.ABORTED, why=before.reason)
+        if known.armed and self._is_anothers(known):
+            why = f"{before.reason}; in mode {_name(known)} when the bridge came back"
+            return Next(phase=Phase.ABORTED, why=why)
         if before.outcome is not None and (known.armed or before.outcome is Phase.LANDED):
-            down = known.mode if known.mode in DOWN else self.settings.then
-            return Next(phase=Phase.LANDING, why=before.reason, down=down, outcome=before.outcome)
+            return self._down(known, before.reason, before.outcome)
         if not known.armed:  # it is never armed a second time
             why = before.reason or "on the ground and disarmed when the bridge came back"
             return Next(phase=before.outcome or Phase.ABORTED, why=why)
