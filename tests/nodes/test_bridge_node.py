@@ -223,6 +223,33 @@ def test_the_journal_keeps_which_vehicle_flies(
     assert given == [None, 7 if flies else None]
 
 
+def test_a_bridge_that_was_killed_before_it_knew_where_the_grid_lies_goes_by_the_datum_that_was_given(
+    made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Behind MAVROS that takes a fix; the grid must not lie under the vehicle because of a restart."""
+    given: list[Any] = []
+
+    def make(*values: Any) -> Stub:
+        given.append(values[3:5])
+        return made.vehicle
+
+    monkeypatch.setattr(vehicles, "make", make)
+    node, made.vehicle.known = made.node, Telemetry()
+    node.trigger_configure()
+    node.journal, node.values["datum"] = Journal(str(tmp_path / "journal")), str(DATUM)
+    node.trigger_activate()
+    made.until(lambda: node._begun)
+    assert made.values["phase"] == "connecting"
+    for _ in range(2):
+        node._open.close()  # it is killed
+        node.bridge.phase = Phase.ABORTED
+        node.trigger_deactivate()
+        node.trigger_activate()
+        made.vehicle.datum = DATUM  # by the next time, it has taken off
+        node._on_change()
+    assert given == [(DATUM, ""), (DATUM, ""), (None, str(DATUM))]
+
+
 def test_steps_that_were_not_reached_are_told(made: Made) -> None:
     activate(made)
     made.node.bridge.course.steps_not_reached = 3

@@ -93,7 +93,7 @@ class AutopilotBridge(MissionNode):
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
         self._grid = ""  # where it lies, as logged last
-        self._grid_is_kept, self._is_restarted = False, standing is not None
+        self._grid_is_kept, self._is_restarted = False, bool(anchor)
         self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
         self._policy = Lease(self, TOPICS["move"])
         for close in (self._policy.close, self.journal.close, self.vehicle.close):
@@ -152,7 +152,8 @@ class AutopilotBridge(MissionNode):
         Raises:
             UavDcError: there is no such place.
         """
-        if self._restore() is not None:
+        kept = self._restore()
+        if kept is not None and kept.anchor:
             return None
         values = self.values
         return datums.parse(values["datum"], self.scenario, values["vehicle"], arm=values["arm"])
