@@ -19,7 +19,7 @@ from uav_dc_ros.autopilot.mavlink import Mavlink
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import bridge, datums, vehicles
+from uav_dc_ros.nodes import bridge, cdr, datums, vehicles
 from uav_dc_ros.nodes.bridge import AutopilotBridge
 from uav_dc_ros.nodes.journal import Journal
 
@@ -248,6 +248,26 @@ def test_a_bridge_that_was_killed_before_it_knew_where_the_grid_lies_goes_by_the
         made.vehicle.datum = DATUM  # by the next time, it has taken off
         node._on_change()
     assert given == [(DATUM, ""), (DATUM, ""), (None, str(DATUM))]
+
+
+def test_a_position_that_cannot_be_true_is_not_published(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The users' data would be that of a place where the vehicle was not."""
+    activate(made)
+    said: list[float] = []
+    publish = made.node.publish
+
+    def note(name: str, message: Any) -> None:
+        if name == "pose":
+            said.append(float(cdr.Pose(message).position_m[0]))
+        publish(name, message)
+
+    monkeypatch.setattr(made.node, "publish", note)
+    made.until(lambda: len(said) > 3)
+    made.vehicle.known = replace(FLIES, position=Enu(400.0, 0.0, 100.0))
+    made.until(lambda: made.node.bridge.discarded.get("impossible position", 0) > 3)
+    made.vehicle.known = replace(FLIES, position=Enu(1.0, 0.0, 100.0))
+    made.until(lambda: said[-1] == 1.0)
+    assert set(said) == {0.0, 1.0}
 
 
 def test_steps_that_were_not_reached_are_told(made: Made) -> None:

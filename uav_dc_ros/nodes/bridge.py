@@ -17,6 +17,7 @@ from uav_dc_ros import messages, scenarios
 from uav_dc_ros.autopilot.bridge import Bridge, Standing
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.plausibility import Plausibility
 from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.autopilot.watch import Settings
@@ -89,6 +90,7 @@ class AutopilotBridge(MissionNode):
         self._told: messages.Mission | None = None
         self._news: list[str] = []  # changes since the last diagnostics
         self._changes = 0
+        self._plausible = Plausibility(self.settings.fastest_mps, self.settings.jump_m)
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
@@ -219,6 +221,7 @@ class AutopilotBridge(MissionNode):
             self._timer.timer_period_ns = round(period_s * 1e9)
 
     def _publish_pose(self, known: Telemetry) -> None:
+        known = self._plausible.filter(time.monotonic(), known)
         if known.position is None or known.position_s is None or known.position_s == self._position_s:
             return
         self._position_s = known.position_s
