@@ -204,7 +204,7 @@ def test_the_journal_keeps_which_vehicle_flies(
     given: list[Any] = []
 
     def make(*values: Any) -> Stub:
-        given.append(values[-1])
+        given.append(values[5])
         return made.vehicle
 
     monkeypatch.setattr(vehicles, "make", make)
@@ -228,9 +228,11 @@ def test_a_bridge_that_was_killed_before_it_knew_where_the_grid_lies_goes_by_the
 ) -> None:
     """Behind MAVROS that takes a fix; the grid must not lie under the vehicle because of a restart."""
     given: list[Any] = []
+    restarted: list[bool] = []
 
     def make(*values: Any) -> Stub:
         given.append(values[3:5])
+        restarted.append(values[6])
         return made.vehicle
 
     monkeypatch.setattr(vehicles, "make", make)
@@ -248,6 +250,7 @@ def test_a_bridge_that_was_killed_before_it_knew_where_the_grid_lies_goes_by_the
         made.vehicle.datum = DATUM  # by the next time, it has taken off
         node._on_change()
     assert given == [(DATUM, ""), (DATUM, ""), (None, str(DATUM))]
+    assert restarted == [False, True, True], "the graph still tells of the one that was killed"
 
 
 def test_a_position_that_cannot_be_true_is_not_published(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,8 @@ class AutopilotBridge(MissionNode):
         datum = self._datum()
         self.run = self.values["run"] or (self.run if kept is None else kept.run)
         self.bridge = Bridge(self.scenario, self.settings, self._on_change, standing, self.fence)
-        self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, datum, anchor, system)
+        way = self.scenario, datum, anchor, system, kept is not None
+        self.vehicle: Vehicle = vehicles.make(self, self.values, *way)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
         self._begun = standing is not None and standing.flies
