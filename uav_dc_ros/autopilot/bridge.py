@@ -43,7 +43,7 @@ class Bridge:
     Args:
         scenario: the world that is flown.
         settings: how carefully.
-        on_change: called after each change of phase or step.
+        on_change: called after each change of phase, step or reason, or of what is to be kept.
         standing: of a mission that is taken up again.
         fence: around targets and poses; None: the one around the scenario.
 
