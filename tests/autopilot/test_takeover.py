@@ -1,5 +1,7 @@
 """Who has the vehicle: a pilot's switch on the ground, another system, a bridge that is stopped anywhere."""
 
+import dataclasses
+
 import msgspec
 import pytest
 
@@ -239,6 +241,18 @@ def test_a_bridge_that_is_stopped_lets_a_pilot_s_vehicle_alone() -> None:
         assert flight.bridge.phase is Phase.ABORTED
 
 
+def test_a_bridge_that_is_stopped_lets_one_of_several_vehicles_alone() -> None:
+    """The first one that it heard on the link flies, commanded by somebody else."""
+    vehicle = Vehicle(position=ALOFT, mode=Mode.COMMANDED, armed=True, missing="2 autopilots on this link")
+    vehicle.pass_time(0.1, None)
+    flight = Flight(vehicle=vehicle)
+    for _ in range(20):
+        flight.tick(known=dataclasses.replace(vehicle.told, is_meant=False))
+    flight.bridge.stop("the bridge was stopped")
+    flight.run(1.0)
+    assert (vehicle.asked, flight.bridge.phase) == ([], Phase.ABORTED)
+
+
 def test_a_mission_in_the_air_that_cannot_be_taken_up_has_an_end() -> None:
     """The position never comes back, though the link does."""
     flight = fly_to_step(3)
@@ -248,3 +262,41 @@ def test_a_mission_in_the_air_that_cannot_be_taken_up_has_an_end() -> None:
     again.until(Phase.ABORTED, 1500.0)
     assert again.bridge.reason.startswith("no position for 0.5 s; waited 300 s")
     assert SetMode(Mode.RETURN) in flight.vehicle.asked
+
+
+def test_a_vehicle_that_was_armed_and_disarmed_before_take_off_is_not_armed_again() -> None:
+    """Somebody disarmed it, while the bridge waited for what was missing."""
+    flight = Flight(vehicle=Stubborn(position=GROUND))
+    vehicle = flight.vehicle
+    flight.run(3.0)
+    vehicle.missing, vehicle.armed = "2 autopilots on this link", True
+    vehicle._tell()
+    flight.run(3.0)
+    vehicle.armed = vehicle.stick_is_up = False  # type: ignore[attr-defined]
+    vehicle.missing = None
+    vehicle._tell()
+    vehicle.asked.clear()
+    flight.run(10.0)
+    assert vehicle.asked == []
+    assert flight.bridge.reason == "a pilot had it: waiting for a pilot to set the mode and arm"
+    again = restarted(flight)
+    again.run(10.0)
+    assert vehicle.asked == []
+
+
+def test_a_vehicle_that_is_disarmed_as_a_bridge_comes_back_is_not_armed_again() -> None:
+    """It had not left the ground when that one was killed."""
+    flight = Flight(vehicle=Stubborn(position=GROUND, stuck=True))
+    flight.vehicle.stick_is_up = False  # type: ignore[attr-defined]
+    flight.until(Phase.TAKEOFF)
+    again = restarted(flight)
+    again.until(Phase.PREFLIGHT)
+    again.vehicle.armed = False
+    again.vehicle._tell()
+    again.vehicle.asked.clear()
+    again.run(5.0)
+    assert again.vehicle.asked == []
+    assert (again.bridge.phase, again.bridge.reason) == (
+        Phase.ABORTED,
+        "on the ground and disarmed when the bridge came back",
+    )

@@ -247,6 +247,14 @@ def test_hidden_files_are_no_parts(tmp_path: Path) -> None:
     assert (bag / "._bag_0.mcap").exists()
 
 
+def test_what_an_export_into_the_bag_s_folder_left_does_not_keep_it_from_being_mended(tmp_path: Path) -> None:
+    """Killed, it leaves a folder that ends like a mending's file."""
+    bag = folder_of(tmp_path / "bag", made("zstd", finished=False))
+    (bag / ".tables.123.partial").mkdir()
+    assert mend(bag).mended
+    assert (bag / ".tables.123.partial").is_dir()
+
+
 @pytest.mark.parametrize("left", [b"", b"\x89MCA", b"\x89MCAP0\r\n"])
 def test_a_part_without_anything_becomes_an_empty_part(tmp_path: Path, left: bytes) -> None:
     bag = folder_of(tmp_path / "bag", left)

@@ -19,7 +19,7 @@ from uav_dc_ros.autopilot.mavlink import Mavlink
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import bridge, datums, vehicles
+from uav_dc_ros.nodes import bridge, cdr, datums, vehicles
 from uav_dc_ros.nodes.bridge import AutopilotBridge
 from uav_dc_ros.nodes.journal import Journal
 
@@ -204,7 +204,7 @@ def test_the_journal_keeps_which_vehicle_flies(
     given: list[Any] = []
 
     def make(*values: Any) -> Stub:
-        given.append(values[-1])
+        given.append(values[5])
         return made.vehicle
 
     monkeypatch.setattr(vehicles, "make", make)
@@ -221,6 +221,56 @@ def test_the_journal_keeps_which_vehicle_flies(
     node.trigger_deactivate()
     node.trigger_activate()
     assert given == [None, 7 if flies else None]
+
+
+def test_a_bridge_that_was_killed_before_it_knew_where_the_grid_lies_goes_by_the_datum_that_was_given(
+    made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Behind MAVROS that takes a fix; the grid must not lie under the vehicle because of a restart."""
+    given: list[Any] = []
+    restarted: list[bool] = []
+
+    def make(*values: Any) -> Stub:
+        given.append(values[3:5])
+        restarted.append(values[6])
+        return made.vehicle
+
+    monkeypatch.setattr(vehicles, "make", make)
+    node, made.vehicle.known = made.node, Telemetry()
+    node.trigger_configure()
+    node.journal, node.values["datum"] = Journal(str(tmp_path / "journal")), str(DATUM)
+    node.trigger_activate()
+    made.until(lambda: node._begun)
+    assert made.values["phase"] == "connecting"
+    for _ in range(2):
+        node._open.close()  # it is killed
+        node.bridge.phase = Phase.ABORTED
+        node.trigger_deactivate()
+        node.trigger_activate()
+        made.vehicle.datum = DATUM  # by the next time, it has taken off
+        node._on_change()
+    assert given == [(DATUM, ""), (DATUM, ""), (None, str(DATUM))]
+    assert restarted == [False, True, True], "the graph still tells of the one that was killed"
+
+
+def test_a_position_that_cannot_be_true_is_not_published(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The users' data would be that of a place where the vehicle was not."""
+    activate(made)
+    said: list[float] = []
+    publish = made.node.publish
+
+    def note(name: str, message: Any) -> None:
+        if name == "pose":
+            said.append(float(cdr.Pose(message).position_m[0]))
+        publish(name, message)
+
+    monkeypatch.setattr(made.node, "publish", note)
+    made.until(lambda: len(said) > 3)
+    made.vehicle.known = replace(FLIES, position=Enu(400.0, 0.0, 100.0))
+    made.until(lambda: made.node.bridge.discarded.get("impossible position", 0) > 3)
+    made.vehicle.known = replace(FLIES, position=Enu(1.0, 0.0, 100.0))
+    made.until(lambda: said[-1] == 1.0)
+    assert set(said) == {0.0, 1.0}
 
 
 def test_steps_that_were_not_reached_are_told(made: Made) -> None:

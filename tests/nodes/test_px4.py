@@ -718,7 +718,9 @@ class Flight:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and self.log[-1][0] is not Phase.MOVING:
             self.cells.append(bridge.goal)
-        self.log.append((bridge.phase, bridge.step, bridge.reason))
+        told = bridge.phase, bridge.step, bridge.reason
+        if told not in self.log[-1:]:  # what is to be kept may change without
+            self.log.append(told)
 
     def tick(self) -> None:
         bridge, vehicle = self.bridge, self.vehicle

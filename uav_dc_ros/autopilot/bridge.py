@@ -43,7 +43,7 @@ class Bridge:
     Args:
         scenario: the world that is flown.
         settings: how carefully.
-        on_change: called after each change of phase or step.
+        on_change: called after each change of phase, step or reason, or of what is to be kept.
         standing: of a mission that is taken up again.
         fence: around targets and poses; None: the one around the scenario.
 
@@ -87,6 +87,7 @@ class Bridge:
         self._reported: str | None = None  # another system that commands the vehicle in flight
         self._taken = self.course.standing.released  # somebody else has the vehicle
         self._ground = Ground(self.course, settings, self.fence, self._watched)
+        self._kept = self._to_keep()
 
     @property
     def is_over(self) -> bool:
@@ -151,6 +152,9 @@ class Bridge:
             released=self._taken or (self.is_over and not self._known.armed),
             outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
             reason=self.reason if over else "",
+            down=self._descent.how if over else None,
+            asked=over and self._descent.tries > 0,
+            obeyed=over and self._descent.obeyed,
         )
 
     def move(self, step: int, action: Action) -> str | None:
@@ -179,10 +183,17 @@ class Bridge:
         known = known or self._known
         if self.phase in STEERED:
             self._give_up(why)
-        elif self.phase in GROUND and known.armed and known.mode is Mode.COMMANDED and not self._taken:
-            self._descend(Mode.LAND if known.on_ground else self.settings.then, Phase.ABORTED, why)
+        elif self.phase in GROUND and self._is_to_come_down(known):
+            self._known = known
+            how = Mode.LAND if known.on_ground else self._watched.way_down(self._steady_s, known)
+            self._descend(how, Phase.ABORTED, why)
         elif self.phase is not Phase.LANDING and not self.is_over:
+            self._taken = True  # nothing was requested, and nothing will be
             self._end(Phase.ABORTED, why)
+
+    def _is_to_come_down(self, known: Telemetry) -> bool:
+        """Is a vehicle before its mission one that nobody would have then. Of several it may be anybody's."""
+        return known.armed and known.is_meant and known.mode is Mode.COMMANDED and not self._taken
 
     def is_done_with(self, known: Telemetry) -> bool:
         """Does the vehicle come to its end without any further word."""
@@ -202,6 +213,7 @@ class Bridge:
             return []
         self._known = known = self._watched.see(now_s, known)
         self._now_s, self._steady_s = known.vehicle_s, now_s
+        self._asked.pass_time(known.vehicle_s, now_s, stands=self._watched.clock_stands(now_s))
         self._tracking.send(self.setpoint, now_s)
         if self.phase is Phase.IDLE:
             self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
@@ -225,9 +237,17 @@ class Bridge:
             Phase.MOVING: self._fly,
             Phase.LANDING: self._land,
         }[self.phase](now_s, known)
-        uttered = [wish for wish in wishes if self._asked.may(wish, known.vehicle_s)]
+        uttered = [wish for wish in wishes if self._asked.may(wish)]
         self._descent.tries += sum(isinstance(wish, SetMode) for wish in uttered)
+        if self._to_keep() != self._kept:
+            self._kept = self._to_keep()
+            self._on_change()
         return uttered
+
+    def _to_keep(self) -> tuple[object, ...]:
+        """What a bridge that is started anew has to know before it is requested, or as soon as it is seen."""
+        ground, descent = self._ground, self._descent
+        return ground.allowed_mode, ground.is_a_pilots, descent.tries > 0, descent.obeyed
 
     # What goes wrong.
 
@@ -277,8 +297,9 @@ class Bridge:
                 self._change(f"holds: {self.fault}")
             case "passes":
                 self._change(f"goes on after: {self.reason}")
-            case "ends":
-                self._give_up_for(self._hold.fault, now_s, known)
+            case "ends" if (lasting := self._hold.fault) is not None:
+                blind_since_s = self._hold.since_s[0] if lasting.kind is FaultKind.POSITION else None
+                self._give_up(lasting.why, None, blind_since_s)
 
     def _strays(self, known: Telemetry) -> Fault | None:
         """Does it not fly to where a move has sent it."""
@@ -305,19 +326,12 @@ class Bridge:
             self._change(f"goes on after: {self.reason}")
         return not self.policy_is_gone
 
-    def _give_up_for(self, fault: Fault | None, now_s: float, known: Telemetry) -> None:
-        """End the mission for a fault that lasts. A vehicle that does not know where it is cannot return."""
-        if fault is None:
-            return
-        blind_since_s = self._hold.since_s[0] if fault.kind is FaultKind.POSITION else None
-        how = Mode.LAND if self._watched.estimate_is_lost(now_s, known) else None
-        self._give_up(fault.why, how, blind_since_s)
-
     def _give_up(self, why: str, how: Mode | None = None, blind_since_s: float | None = None) -> None:
         """End the mission: bring the vehicle down."""
         self._hold.fault = None
         why = why if self._reported is None else f"{why}; {self._reported}"  # which may be why
-        self._descend(how or self.settings.then, Phase.ABORTED, why, blind_since_s)
+        how = how or self._watched.way_down(self._steady_s, self._known)
+        self._descend(how, Phase.ABORTED, why, blind_since_s)
 
     # What is to be done in each phase.
 
@@ -325,21 +339,20 @@ class Bridge:
         return self._follow(self._ground.connect(now_s, known, now_s - self._since_steady_s))
 
     def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
-        before = self._ground.allowed_mode
-        wishes = self._follow(self._ground.prepare(now_s, known))
-        if self._ground.allowed_mode != before:
-            self._on_change()  # a bridge that is started anew has to know it, before it is requested
-        return wishes
+        return self._follow(self._ground.prepare(now_s, known))
 
     def _follow(self, advice: Next) -> list[Wish]:
         """Do what a look at a vehicle led to that is not steered."""
         self.setpoint = advice.setpoint
         if advice.phase.is_over:
+            lost = self._watched.link_is_lost(self._steady_s, self._known)
+            self._taken |= self.phase in GROUND and not lost  # it is left alone
             self._end(advice.phase, advice.why)
         elif advice.phase is self.phase:
             self._change(advice.why)
         elif advice.phase is Phase.LANDING:
             self._descend(advice.down, advice.outcome, advice.why)
+            self._descent.tries += advice.asked
         elif advice.phase is Phase.TAKEOFF and self.course.is_done:
             self._finish("when the bridge came back")
         else:
@@ -351,8 +364,8 @@ class Bridge:
         if known.vehicle_s - self._since_s > self.settings.takeoff_s:
             self._give_up(f"not at the start after {self.settings.takeoff_s:g} s")
             return []
-        if position is not None and position.up_m >= start.up_m - self.settings.tolerance_m:
-            self.setpoint = start  # high enough to fly across
+        if position is not None and abs(position.up_m - start.up_m) <= self.settings.tolerance_m:
+            self.setpoint = start  # at the altitude to fly across
         if self._dwell.is_there(start, known):
             self._arrive_first()
             return []
@@ -404,14 +417,15 @@ class Bridge:
             self._descend(self.settings.then, Phase.TIMEOUT, why)
 
     def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
-        asked_s = self._asked.last_s.get(SetMode(Mode.RETURN))
-        return self._follow(self._descent.look(now_s, known, self.setpoint, asked_s))
+        waited_s = self._asked.waited_s(SetMode(Mode.RETURN))
+        return self._follow(self._descent.look(now_s, known, self.setpoint, waited_s))
 
     # Small change.
 
     def _descend(self, how: Mode, outcome: Phase, why: str, blind_since_s: float | None = None) -> None:
         """Bring it down; until it obeys, the setpoint holds it where it is."""
         self._descent = Descent(self.course, self._watched, how, outcome, why, blind_since_s)
+        self._descent.obeys(self._known)  # it may come down already
         self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:

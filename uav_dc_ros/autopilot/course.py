@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Telemetry
+from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.grid import Action
@@ -29,6 +29,9 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
         home: where the vehicle was armed, in the grid's ENU frame; None: not known.
         outcome: of a mission that was on its way down, or over; None: it goes on.
         reason: why it was.
+        down: how it was to come down, of a mission with an outcome; None: not told.
+        asked: was that requested?
+        obeyed: was it seen coming down? Who has it fly again is somebody else.
         at_rest_v: voltage of the battery before take-off; None: not told.
     """
 
@@ -43,6 +46,9 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
     home: tuple[float, float, float] | None = None
     outcome: Phase | None = None
     reason: str = ""
+    down: Mode | None = None
+    asked: bool = False
+    obeyed: bool = False
     at_rest_v: float | None = None
 
 

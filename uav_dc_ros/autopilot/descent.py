@@ -26,6 +26,7 @@ class Next:
         wish: to utter; None: none.
         down: how to descend.
         outcome: of a mission that descends.
+        asked: did an earlier bridge request that way down?
     """
 
     phase: Phase
@@ -34,6 +35,7 @@ class Next:
     wish: Wish | None = None
     down: Mode = Mode.LAND
     outcome: Phase = Phase.ABORTED
+    asked: bool = False
 
 
 class Descent:
@@ -77,20 +79,21 @@ class Descent:
     def obeys(self, known: Telemetry) -> bool:
         """Does it come down, as it was told or as its own failsafe or a pilot knows better."""
         self.obeyed = self.obeyed or known.mode in DOWN
+        self._instead = self._instead and known.mode is not Mode.LAND  # who returns it then is a pilot
         return self.obeyed and not (self._instead and known.mode is Mode.RETURN)
 
     def is_ours(self, mode: Mode) -> bool:
         """Is a vehicle that shall come down in a mode that nobody else has chosen for something else."""
         return mode in DOWN or (mode is Mode.COMMANDED and not self.obeyed)
 
-    def look(self, now_s: float, known: Telemetry, setpoint: Enu | None, asked_s: float | None) -> Next:
+    def look(self, now_s: float, known: Telemetry, setpoint: Enu | None, waited_s: float | None) -> Next:
         """Look at a vehicle that is to come down.
 
         Args:
             now_s: steady clock.
             known: of the vehicle.
             setpoint: that is streamed; until the vehicle obeys, it holds it where it is.
-            asked_s: when it was asked to return last, vehicle time; None: never.
+            waited_s: since it was asked to return last, see `Asked`; None: it was not.
         """
         if self._watch.link_is_lost(now_s, known):
             return self._wait_for_link(now_s, known, setpoint)
@@ -107,7 +110,7 @@ class Descent:
             self._land_instead(now_s, f"{stall}: lands")
         if self.obeys(known):
             return Next(phase=Phase.LANDING, why=self.why)
-        if self._refuses_to_return(known, asked_s):
+        if self._refuses_to_return(waited_s):
             self.how = Mode.LAND
             self.why += f"; it does not return ({known.refusal or 'no answer'}): lands"
         refused = f"; {known.refusal}" if known.refusal and self.tries else ""
@@ -157,9 +160,9 @@ class Descent:
         fresh = known.position_s is not None and now_s - known.position_s <= self._settings.position_age_s
         return known.position if fresh else None
 
-    def _refuses_to_return(self, known: Telemetry, asked_s: float | None) -> bool:
+    def _refuses_to_return(self, waited_s: float | None) -> bool:
         settings = self._settings
-        answered = asked_s is None or known.vehicle_s - asked_s >= settings.retry_s
+        answered = waited_s is None or waited_s >= settings.retry_s
         return self.how is Mode.RETURN and self.tries >= settings.returning_tries and answered
 
     def _land_instead(self, now_s: float, why: str) -> None:

@@ -28,13 +28,14 @@ class Ground:
         allowed_mode: with `Settings.arm`, the one mode besides the commanded one that the vehicle may be in:
             that in which it was when the commanded mode was requested. The commanded mode's name: the vehicle
             was in that already. None: neither has happened yet, and every mode is allowed.
-        is_a_pilots: had somebody else it armed? Who lands it does not want it to start again.
+        is_a_pilots: had somebody else it armed, or disarmed it? Then it is not to start again by itself.
     """
 
     def __init__(self, course: Course, settings: Settings, fence: Fence, watch: Watch) -> None:
         self.course, self.settings, self.fence, self.watch = course, settings, fence, watch
         self.allowed_mode = course.standing.allowed_mode
         self.is_a_pilots = course.standing.is_a_pilots
+        self._was_armed = False
         self._unplaced_since_s: float | None = None  # steady clock: it flies, and nobody knows where
 
     def takeover(self, now_s: float, known: Telemetry) -> str | None:
@@ -43,6 +44,8 @@ class Ground:
         Who chooses another mode after the commanded one was requested, or entered, takes the vehicle back.
         Without `Settings.arm` nothing is requested, and a pilot is free to change modes until take-off.
         """
+        self.is_a_pilots |= self._was_armed and not known.armed  # by whoever disarmed it
+        self._was_armed = known.armed
         if not self.settings.arm or self.is_a_pilots or self.watch.link_is_lost(now_s, known):
             return None
         mode = _name(known)
@@ -87,7 +90,7 @@ class Ground:
                 why = "it flew already when the bridge came"
                 return Next(phase=Phase.LANDING, why=why, setpoint=known.position, down=settings.then)
             why = "it flies already: to the cell where the mission stands"
-            return Next(phase=Phase.TAKEOFF, why=why, setpoint=self.course.target)
+            return Next(phase=Phase.TAKEOFF, why=why, setpoint=self._above(known))
         # An autopilot may want to see setpoints before it follows any.
         why = f"connected to {known.system}" if known.system else "connected"
         return Next(phase=Phase.PREFLIGHT, why=why, setpoint=known.position)
@@ -99,21 +102,38 @@ class Ground:
         since_s = self._unplaced_since_s = (self._unplaced_since_s or now_s) if unplaced else None
         if self.course.standing.flies:
             if waited_s > self.settings.lost_s:
-                phase = Phase.ABORTED if lost or not known.armed else Phase.LANDING
-                return Next(phase=phase, why=f"{why}; waited {waited_s:.0f} s", down=self.settings.then)
+                why = f"{why}; waited {waited_s:.0f} s"
+                left_alone = lost or not known.armed or self._is_anothers(known)
+                return Next(phase=Phase.ABORTED, why=why) if left_alone else self._down(known, why)
         elif since_s is not None and now_s - since_s > UNPLACED_S:
             why = f"the vehicle flies, and its place on the grid is not known ({why})"
             return Next(phase=Phase.ABORTED, why=f"{why}; expected --datum=LAT,LON,ALT, or it on the ground")
         return Next(phase=Phase.CONNECTING, why=why)
+
+    def _is_anothers(self, known: Telemetry) -> bool:
+        """Has somebody else the vehicle of a mission that was in the air, who flies it."""
+        before = self.course.standing
+        if before.released:
+            return known.mode not in DOWN
+        return before.obeyed and known.mode is Mode.COMMANDED  # an earlier bridge saw it coming down
+
+    def _down(self, known: Telemetry, why: str, outcome: Phase = Phase.ABORTED) -> Next:
+        """Go on coming down as it did before, or as it is told to."""
+        before = self.course.standing
+        down = known.mode if known.mode in DOWN else before.down or self.settings.then
+        asked = before.asked and before.down is known.mode
+        return Next(phase=Phase.LANDING, why=why, down=down, outcome=outcome, asked=asked)
 
     def _left_alone(self, known: Telemetry, breach: str | None) -> Next | None:
         """Why a mission that was in the air is not taken up again, or goes on coming down; None: it is."""
         before = self.course.standing
         if before.released and not (known.armed and known.mode in DOWN):
             return Next(phase=before.outcome or Phase.ABORTED, why=before.reason)
+        if known.armed and self._is_anothers(known):
+            why = f"{before.reason}; in mode {_name(known)} when the bridge came back"
+            return Next(phase=Phase.ABORTED, why=why)
         if before.outcome is not None and (known.armed or before.outcome is Phase.LANDED):
-            down = known.mode if known.mode in DOWN else self.settings.then
-            return Next(phase=Phase.LANDING, why=before.reason, down=down, outcome=before.outcome)
+            return self._down(known, before.reason, before.outcome)
         if not known.armed:  # it is never armed a second time
             why = before.reason or "on the ground and disarmed when the bridge came back"
             return Next(phase=before.outcome or Phase.ABORTED, why=why)
@@ -132,6 +152,8 @@ class Ground:
         self.is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
         here, fault = known.position, self.watch.fault(now_s, known)
         ours = known.armed and known.mode is Mode.COMMANDED
+        if not ours and self.course.standing.flies and (left := self._left_alone(known, None)) is not None:
+            return left  # it was armed once
         if not ours and (why := self.refusal(known)) is not None:
             return Next(phase=Phase.ABORTED, why=why)
         if known.missing is not None:
@@ -159,14 +181,18 @@ class Ground:
 
     def _take_it(self, known: Telemetry) -> Next:
         """Begin with a vehicle that is armed, in the commanded mode."""
-        here, target = known.position, self.course.target
-        above = Enu(here.east_m, here.north_m, target.up_m) if here is not None else target
+        above = self._above(known)
         breach = self.fence.breach(above)
         why = f"the target is outside the fence: {breach}" if breach is not None else self._misfit(known)
         if why is not None:
             down = Mode.LAND if known.on_ground else self.settings.then
             return Next(phase=Phase.LANDING, why=why, down=down)
         return Next(phase=Phase.TAKEOFF, why="armed, in the commanded mode", setpoint=above)
+
+    def _above(self, known: Telemetry) -> Enu:
+        """Straight up or down at the goal's altitude: from there, the vehicle flies across."""
+        here, target = known.position, self.course.target
+        return target if here is None else target._replace(east_m=here.east_m, north_m=here.north_m)
 
     def warnings(self, known: Telemetry) -> list[str]:
         """What a user should know, though it is no reason not to fly."""

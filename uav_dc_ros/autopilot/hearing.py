@@ -201,6 +201,7 @@ class Hearing:
             other_controller=self.rivals.found(self.vehicle_s),
             system=str(self.systems),
             system_id=self.system,
+            is_meant=self.systems.is_meant(now_s),
             discarded=dict(self.discarded),
         )
 

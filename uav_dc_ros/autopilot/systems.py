@@ -51,14 +51,22 @@ class Systems:
             self.number, self.dialect, self._stranger = system, dialect, None
         self._heartbeats += system == self.number
 
+    def is_meant(self, now_s: float) -> bool:
+        """Is the vehicle surely the one that is meant: it is named, or there is no other."""
+        return self.named is not None or len(self._vehicles(now_s)) <= 1
+
+    def _vehicles(self, now_s: float) -> list[str]:
+        """The vehicles on the link."""
+        return [text for seen_s, text in self._present.values() if now_s - seen_s <= PRESENT_S]
+
     def missing(self, now_s: float) -> str | None:
         """Why nobody knows yet which vehicle is meant; None: it is known."""
-        present = [text for seen_s, text in self._present.values() if now_s - seen_s <= PRESENT_S]
+        present = self._vehicles(now_s)
         if self.dialect is None:
             others = f" (there is {'; '.join(present)})" if present else ""
             whose = "" if self.named is None else f" of system {self.named}"
             return self._stranger or f"no heartbeat from an autopilot{whose}{others}"
-        if self.named is None and len(present) > 1:
+        if not self.is_meant(now_s):
             listed = "; ".join(present)
             return f"{len(present)} autopilots on this link: {listed}; expected --system N, one of them"
         if self._heartbeats < self._listens:

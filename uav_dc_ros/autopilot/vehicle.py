@@ -67,6 +67,7 @@ class Telemetry:
         other_controller: another system that commands this vehicle, with the evidence; None: none was seen.
         system: the vehicle's identity on its link, such as `system 1`; empty: not known.
         system_id: its number there, for a transport that is opened again; None: not known.
+        is_meant: is it surely the vehicle that is meant? No, while there are several, and none is named.
         discarded: messages that were counted and ignored, by reason (late, repeated, impossible, ...).
     """
 
@@ -94,6 +95,7 @@ class Telemetry:
     other_controller: str | None = None
     system: str = ""
     system_id: int | None = None
+    is_meant: bool = True
     discarded: Mapping[str, int] = field(default_factory=dict)
 
 

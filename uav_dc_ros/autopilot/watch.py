@@ -153,6 +153,14 @@ class Watch:
             return True
         return known.heartbeat_s - max(known.estimate_s, self._link_since_s) > HEARTBEATS_S
 
+    def way_down(self, now_s: float, known: Telemetry) -> Mode:
+        """How a mission that cannot go on ends. A vehicle that does not know where it is cannot return."""
+        return Mode.LAND if self.estimate_is_lost(now_s, known) else self.settings.then
+
+    def clock_stands(self, now_s: float) -> bool:
+        """Has its clock stood still for too long to count by it."""
+        return self.clock_stands_for_s(now_s) > CLOCK_S
+
     def clock_stands_for_s(self, now_s: float) -> float:
         """For how long no time has passed on the vehicle, steady clock."""
         return now_s - self._clock[1] if self._clock else 0.0
@@ -169,7 +177,7 @@ class Watch:
             return Fault(FaultKind.POSITION, jump)
         if known.position is None or known.position_s is None or now_s - known.position_s > age_s:
             return Fault(FaultKind.POSITION, jump or f"no position for {age_s:g} s")
-        if self.clock_stands_for_s(now_s) > CLOCK_S:
+        if self.clock_stands(now_s):
             return Fault(FaultKind.CLOCK, f"the vehicle's clock has stood still for {CLOCK_S:g} s")
         return None
 

@@ -69,7 +69,8 @@ def mend_parts(folder: Path) -> tuple[list[Part], Mended]:
     lost_bytes = 0
     try:
         for left in folder.glob(".*.partial"):  # by a mending, or a metadata.yaml, that was killed
-            left.unlink()
+            if not left.is_dir():  # by an export into this folder
+                left.unlink()
         for path in part_paths(folder):
             with path.open("rb") as file:
                 scan = Scan(path, file)

@@ -17,6 +17,7 @@ from uav_dc_ros import messages, scenarios
 from uav_dc_ros.autopilot.bridge import Bridge, Standing
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
+from uav_dc_ros.autopilot.plausibility import Plausibility
 from uav_dc_ros.autopilot.priority import run_when_due
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.autopilot.watch import Settings
@@ -80,7 +81,8 @@ class AutopilotBridge(MissionNode):
         datum = self._datum()
         self.run = self.values["run"] or (self.run if kept is None else kept.run)
         self.bridge = Bridge(self.scenario, self.settings, self._on_change, standing, self.fence)
-        self.vehicle: Vehicle = vehicles.make(self, self.values, self.scenario, datum, anchor, system)
+        way = self.scenario, datum, anchor, system, kept is not None
+        self.vehicle: Vehicle = vehicles.make(self, self.values, *way)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
         self._begun = standing is not None and standing.flies
@@ -89,11 +91,12 @@ class AutopilotBridge(MissionNode):
         self._told: messages.Mission | None = None
         self._news: list[str] = []  # changes since the last diagnostics
         self._changes = 0
+        self._plausible = Plausibility(self.settings.fastest_mps, self.settings.jump_m)
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
         self._grid = ""  # where it lies, as logged last
-        self._grid_is_kept, self._is_restarted = False, standing is not None
+        self._grid_is_kept, self._is_restarted = False, bool(anchor)
         self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
         self._policy = Lease(self, TOPICS["move"])
         for close in (self._policy.close, self.journal.close, self.vehicle.close):
@@ -152,7 +155,8 @@ class AutopilotBridge(MissionNode):
         Raises:
             UavDcError: there is no such place.
         """
-        if self._restore() is not None:
+        kept = self._restore()
+        if kept is not None and kept.anchor:
             return None
         values = self.values
         return datums.parse(values["datum"], self.scenario, values["vehicle"], arm=values["arm"])
@@ -218,6 +222,7 @@ class AutopilotBridge(MissionNode):
             self._timer.timer_period_ns = round(period_s * 1e9)
 
     def _publish_pose(self, known: Telemetry) -> None:
+        known = self._plausible.filter(time.monotonic(), known)
         if known.position is None or known.position_s is None or known.position_s == self._position_s:
             return
         self._position_s = known.position_s

@@ -23,6 +23,7 @@ def make(
     datum: Geodetic | None,
     anchor: str,
     system: int | None = None,
+    restarted: bool = False,
 ) -> Vehicle:
     """The vehicle that a bridge's parameters name; not opened yet.
 
@@ -33,6 +34,7 @@ def make(
         datum: of the grid; None: see `scenario`.
         anchor: of the same vehicle before the bridge was started again; empty: there was none.
         system: likewise its number on the link, where the parameter names none; None: see `anchor`.
+        restarted: was a bridge killed before it? Topics may still tell of that one.
 
     Raises:
         VehicleError: there is no such way on this machine.
@@ -46,8 +48,8 @@ def make(
         named = values["system"] or system
         return Mavlink(connect, datum=datum, place=place, anchor=anchor, system=named)
     if kind == "mavros":
-        return Mavros(node, place=place, anchor=anchor, datum=datum, arms=values["arm"])
-    return Px4(node, place=place, anchor=anchor, datum=datum)
+        return Mavros(node, place=place, anchor=anchor, datum=datum, arms=values["arm"], restarted=restarted)
+    return Px4(node, place=place, anchor=anchor, datum=datum, restarted=restarted)
 
 
 def check(kind: str, connect: str, system: int, arm: bool) -> None:

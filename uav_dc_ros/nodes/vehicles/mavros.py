@@ -75,6 +75,7 @@ class Mavros:
         anchor: of the same transport before it was started again.
         datum: of the grid, for where the vehicle stands across; `place` then only gives its height.
         arms: is it to be asked to arm?
+        restarted: was a bridge killed before it, even one that had no anchor yet?
 
     Raises:
         VehicleError: the anchor is none; it is to arm, and mavros_msgs is not installed.
@@ -88,11 +89,12 @@ class Mavros:
         anchor: str = "",
         datum: Geodetic | None = None,
         arms: bool = False,
+        restarted: bool = False,
     ) -> None:
         self._node = node
         self._package = mavros_messages.load(needed_for="arming" if arms else "")
         self._hearing = Hearing(place, datum, anchor, full=self._package is not None)
-        self._other_publishers = OtherPublishers(node, restarted=bool(anchor))
+        self._other_publishers = OtherPublishers(node, restarted=restarted or bool(anchor))
         self._yaw_rad: float | None = None
         self._stream: Stream[Target] = Stream(self._publish, "mavros")
         self._publisher: Any = None

@@ -85,12 +85,21 @@ class Px4:
         place: where the vehicle stands when its first position comes, in the grid's ENU frame.
         anchor: of the same transport before it was started again: takes the place of a datum.
         datum: of the grid, for a PX4 that knows where on the Earth it is; None: see `place`.
+        restarted: was a bridge killed before it, even one that had no anchor yet?
 
     Raises:
         VehicleError: px4_msgs is missing, or the anchor is none.
     """
 
-    def __init__(self, node: Node, *, place: Enu, anchor: str = "", datum: Geodetic | None = None) -> None:
+    def __init__(
+        self,
+        node: Node,
+        *,
+        place: Enu,
+        anchor: str = "",
+        datum: Geodetic | None = None,
+        restarted: bool = False,
+    ) -> None:
         self._messages = load_messages()
         self._node = node
         self._hearing = Px4Hearing(place=place, anchor=anchor, datum=datum)
@@ -102,7 +111,7 @@ class Px4:
         self._messages_sent = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
         self._silent = set(NEEDED)
         self._looked_s, self._seen = -math.inf, ""
-        self._other_publishers = OtherPublishers(node, restarted=bool(anchor))
+        self._other_publishers = OtherPublishers(node, restarted=restarted or bool(anchor))
         self._subscriptions: list[Any] = []
         self._publishers: dict[str, Any] = {}
         self._stream: Stream[Enu] = Stream(self._send, "px4")
