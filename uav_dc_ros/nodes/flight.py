@@ -1,30 +1,28 @@
 """One run of run_all: check everything, start the nodes, follow the missions, stop, tell."""
 
-import argparse
 import signal
 import tempfile
 import time
 from pathlib import Path
 
 import msgspec
-import rclpy
-from rclpy.signals import SignalHandlerOptions
+from rclpy.context import Context
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
-from uav_dc_ros.nodes import foxglove_server, runtime
+from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes import options as run_options
 from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.observer import MissionSoFar, Observer, Summary, summary
+from uav_dc_ros.nodes.observer import MissionSoFar, Observer, summary
 from uav_dc_ros.nodes.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.rivals import AnotherMissionError
 from uav_dc_ros.nodes.supervisor import Supervisor
 from uav_dc_ros.nodes.table import rows
+from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
@@ -34,33 +32,45 @@ TICK_S = 0.02
 
 
 class Flight:
-    """A run of missions, from the command line's options (see run_all).
+    """A run of missions.
+
+    Args:
+        config: what is flown.
+        show: are progress and summary printed?
 
     Raises:
-        UavDcError: an option that cannot be flown; nothing was started or written yet.
+        UavDcError: a value that cannot be flown; nothing was started or written yet.
+
+    Attributes:
+        summaries: one for each mission that is over.
+        errors: what went wrong, in words.
+        interrupted: was it asked to stop?
     """
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.options = options
-        self.scenario = scenarios.load(options.scenario)
-        self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
+    def __init__(self, config: RunConfig, *, show: bool = True) -> None:
+        self.config = config
+        self.scenario = scenarios.load(config.scenario)
+        self.policy = policies.load(config.policy or f"{self.scenario.name}_dueling")
         self.policy.check(self.scenario)
-        self.is_simulated = options.vehicle == SIMULATED
+        self.is_simulated = config.vehicle == SIMULATED
         if self.is_simulated:
-            pace.check(self.scenario, options.pace, options.missions)
+            pace.check(self.scenario, config.factor, config.missions)
         self.rows = rows(() if self.is_simulated else ("bridge",))
-        self.nodes = run_options.nodes(options)
+        self.nodes = run_options.nodes(config)
         # Whoever starts the vehicle draws the run's identity; a run_all on another host adopts it.
         self.run_id = new_run() if ("world" if self.is_simulated else "bridge") in self.nodes else ""
-        self.together = run_options.together(options, self.nodes)
-        self._settings = run_options.settings(options, self.nodes)
-        run_options.check_vehicle(options, self.nodes, self.scenario)
-        if options.live is not None:
-            foxglove_server.check(address=str(ADDRESS.default), port=options.live)
-        self.bag = run_options.new_bag(options.bag) if "recorder" in self.nodes else None
-        if options.summary is not None:
-            run_options.check_writable(options.summary, self.bag)
-        self.display = Display(self.scenario, options.missions)
+        self.together = run_options.together(config, self.nodes)
+        self._settings = run_options.settings(config, self.nodes)
+        run_options.check_vehicle(config, self.nodes, self.scenario)
+        if config.live is not None:
+            from uav_dc_ros.nodes import foxglove_server  # brings rosbags, which only few need
+
+            foxglove_server.check(address=str(ADDRESS.default), port=config.live)
+        bag = None if config.bag is None else Path(config.bag)
+        self.bag = run_options.new_bag(bag) if "recorder" in self.nodes else None
+        if config.summary is not None:
+            run_options.check_writable(Path(config.summary), self.bag)
+        self.display = Display(self.scenario, config.missions, show=show)
         if self.policy.scenario.fingerprint != self.scenario.fingerprint:
             self.display.note(
                 f"policy {self.policy.name} learnt in another world ({self.policy.scenario.name} "
@@ -68,28 +78,30 @@ class Flight:
                 f"{self.scenario.fingerprint})"
             )
         self.summaries: list[Summary] = []
-        self._interrupted = self._aborted = False
+        self.errors: list[str] = []
+        self.interrupted = self._aborted = False
         self._why = ""  # this run ended before its missions
         self._step_s = 0.0  # when the last step came, monotonic clock
         self._status: Mission | None = None  # of the vehicle, its last word
 
     def run(self) -> int:
-        """Fly; returns the exit status of the command."""
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the terminal is gone: the mission goes on
-        cli.on_stop(self._interrupt)
+        """Fly; returns the exit status of the command.
+
+        It has a ROS context of its own, so that a caller's is as it was, and touches no signal handler.
+        """
         status = 0
-        remapped = ["--ros-args", "-r", f"__ns:={self.options.namespace}", "-r", "/clock:=clock"]
+        remapped = ["--ros-args", "-r", f"__ns:={self.config.namespace}", "-r", "/clock:=clock"]
+        context = Context()
         with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, self.display:
             folder = Path(temporary)
-            runtime.give_way()
-            rclpy.init(args=remapped, signal_handler_options=SignalHandlerOptions.NO)
+            context.init(remapped)
             parameters = self._parameters(folder)
-            seed = self.options.seed if "world" in self.nodes else None
+            seed = self.config.seed if "world" in self.nodes else None
             node = Observer(
                 *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
-                *(self._on_status, self._on_step, self._on_end, self.display.note),
+                *(self._on_status, self._on_step, self._on_end, self.display.note, context),
             )
-            executor = DirectExecutor(node.rest_s)
+            executor = DirectExecutor(node.rest_s, context)
             executor.add_node(node)
             with Supervisor(
                 *(node.get_namespace(), parameters, self.together, folder),
@@ -99,7 +111,7 @@ class Flight:
                     self._follow(supervisor, node, executor)
                 except NodeError as error:
                     self._why = str(error)
-                    self.display.error(self._why)
+                    self._error(self._why)
                     status = 1
                     if isinstance(error, AnotherMissionError):  # what was received may be its
                         self.summaries.clear()
@@ -108,10 +120,11 @@ class Flight:
                 self._hear_the_rest(executor)
             self._account_for_all(node)
             node.trigger_shutdown()
-            rclpy.try_shutdown()
+            node.destroy_node()
+            context.try_shutdown()
         status = max(status, self._mend_bag(), int(self._aborted))
         self._tell()
-        return cli.INTERRUPTED if self._interrupted else status
+        return cli.INTERRUPTED if self.interrupted else status
 
     def _follow(self, supervisor: Supervisor, node: Observer, executor: DirectExecutor) -> None:
         """Spin until all missions are over, or Ctrl-C.
@@ -123,7 +136,7 @@ class Flight:
         node.trigger_activate()
         self._step_s = time.monotonic()
         check_s = 0.0
-        while not (self._interrupted or (node.is_alone and len(self.summaries) >= self.options.missions)):
+        while not (self.interrupted or (node.is_alone and len(self.summaries) >= self.config.missions)):
             executor.spin_once(TICK_S)
             now_s = time.monotonic()
             if now_s >= check_s:
@@ -142,7 +155,7 @@ class Flight:
         """Wait for steps that are due, and for nodes that are started here; others may take their time."""
         if not self.is_simulated and self._status is not None:
             return  # the bridge itself sees to it that the mission ends; a pilot may take his time
-        patience_s = SILENCE_S + pace.period_s(self.scenario, self.options.pace)
+        patience_s = SILENCE_S + pace.period_s(self.scenario, self.config.factor)
         if now_s - self._step_s <= patience_s:
             return
         if node.mission is not None:
@@ -157,24 +170,24 @@ class Flight:
         """Tell which nodes did not end as they should; 1 if that spoilt anything: the recorder's bag."""
         odd = {name: code for name, code in statuses.items() if code not in (0, -signal.SIGTERM)}
         for name, code in odd.items():
-            self.display.error(f"node {name} ended with {code} when it was asked to stop")
+            self._error(f"node {name} ended with {code} when it was asked to stop")
         return int("recorder" in odd)
 
     def _hear_the_rest(self, executor: DirectExecutor) -> None:
         """Handle what the nodes said while they were stopped: how a mission ends that was broken off."""
-        if len(self.summaries) < self.options.missions:
+        if len(self.summaries) < self.config.missions:
             deadline_s = time.monotonic() + REST_S
             try:
                 executor.spin(lambda: time.monotonic() > deadline_s, REST_QUIET_S)
             except NodeError as error:
-                self.display.error(str(error))
+                self._error(str(error))
 
     def _account_for_all(self, node: Observer) -> None:
         """Every mission that was to be flown has its end: those without one were aborted."""
         node.close()
         flown = len(self.summaries)
-        if flown < self.options.missions:
-            not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.options.seed + flown)
+        if flown < self.config.missions:
+            not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.config.seed + flown)
             now = node.mission or not_begun
             now = now if now.mission == flown else not_begun
             status = self._status
@@ -188,10 +201,12 @@ class Flight:
         """Make a whole bag of one whose recorder did not close it; 1 if that cannot be."""
         if self.bag is None or not self.bag.is_dir() or (self.bag / "metadata.yaml").is_file():
             return 0
+        from uav_dc_ros.bags.mend import mend  # brings what reads bags, for the few that must be mended
+
         try:
             mended = mend(self.bag)
         except BagError as error:
-            self.display.error(str(error))
+            self._error(str(error))
             return 1
         self.display.note(f"the recorder did not close its bag: {mended}")
         return 0
@@ -199,7 +214,7 @@ class Flight:
     def _peers(self) -> list[str]:
         """Nodes that a mission waits for, on whichever host they run."""
         peers = [row.name for row in self.rows.values() if row.needed]
-        if self.options.no_record:
+        if not self.config.record:
             peers.remove("recorder")
         if self.is_simulated:
             peers.remove("bridge")
@@ -207,23 +222,23 @@ class Flight:
 
     def _parameters(self, folder: Path) -> dict[str, dict[str, object]]:
         """ROS parameters of the nodes to start."""
-        options = self.options
-        scenario = options.scenario
+        config = self.config
+        scenario = str(config.scenario)
         if scenario not in scenarios.names():
             scenario = str(Path(scenario).absolute())
         given: dict[str, object] = {
             "scenario": scenario,
             "policy": str(self.policy.folder.absolute()),
-            "seed": options.seed,
-            "missions": options.missions,
-            "pace": pace.text(options.pace),
+            "seed": config.seed,
+            "missions": config.missions,
+            "pace": pace.text(config.factor),
             "bag": str(self.bag),
-            "vehicle": options.vehicle,
-            "connect": options.connect or "",
-            "system": options.system or 0,
-            "arm": options.arm,
-            "datum": options.datum or "",
-            **({} if options.live is None else {"port": options.live}),
+            "vehicle": config.vehicle,
+            "connect": config.connect or "",
+            "system": config.system or 0,
+            "arm": config.arm,
+            "datum": config.datum or "",
+            **({} if config.live is None else {"port": config.live}),
         }
         started = {}
         for name in self.nodes:
@@ -241,8 +256,13 @@ class Flight:
             }
         return started
 
-    def _interrupt(self, *_: object) -> None:
-        self._interrupted = True
+    def interrupt(self, *_: object) -> None:
+        """Have the run end soon; a signal handler, too."""
+        self.interrupted = True
+
+    def _error(self, text: str) -> None:
+        self.errors.append(text)
+        self.display.error(text)
 
     def _on_status(self, status: Mission) -> None:
         self._status = status
@@ -255,17 +275,17 @@ class Flight:
     def _on_end(self, mission: MissionSoFar, outcome: Phase) -> None:
         bag = None if self.bag is None else str(self.bag)
         self._aborted |= outcome is Phase.ABORTED
-        if outcome is Phase.ABORTED and not (self._why or self._interrupted):
+        if outcome is Phase.ABORTED and not (self._why or self.interrupted):
             why = mission.reason or "the vehicle gave no reason"
-            self.display.error(f"mission {mission.mission} was aborted at step {mission.step}: {why}")
+            self._error(f"mission {mission.mission} was aborted at step {mission.step}: {why}")
         self.summaries.append(summary(mission, outcome, self.scenario, self.policy.name, bag))
 
     def _tell(self) -> None:
         """Write the summary where it was asked for, and print it."""
         if self.bag is not None and not self.bag.is_dir():  # the recorder never came so far
             self.summaries = [msgspec.structs.replace(mission, bag=None) for mission in self.summaries]
-        if self.options.summary is not None:
-            told = self.summaries[0] if self.options.missions == 1 else self.summaries
+        if self.config.summary is not None:
+            told = self.summaries[0] if self.config.missions == 1 else self.summaries
             text = msgspec.json.format(msgspec.json.encode(told), indent=2)
-            files.write(self.options.summary, text + b"\n")
+            files.write(Path(self.config.summary), text + b"\n")
         self.display.summary(self.summaries)
