@@ -128,4 +128,8 @@ class Display:
     ) -> None:
         """Leave the terminal as it was."""
         self._bar.stop()
+        self.drain()
+
+    def drain(self) -> None:
+        """Wait until everything is written."""
         self._output.drain()

@@ -75,7 +75,7 @@ class DirectExecutor:
                     heard_s = self._heard_s
                     if quiet_turns >= QUIET_TURNS and time.monotonic() - heard_s > quiet_s:
                         return
-                if self.rest_s and not self._behind:
+                if self.rest_s and not self._behind and quiet_s is None:  # to wait for quiet is a rest
                     time.sleep(self.rest_s)
                 self._behind = False
 

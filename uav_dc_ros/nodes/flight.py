@@ -1,9 +1,14 @@
 """One run of run_all: check everything, start the nodes, follow the missions, stop, tell."""
 
+import gc
 import signal
 import tempfile
+import threading
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import msgspec
 from rclpy.context import Context
@@ -15,7 +20,6 @@ from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
 from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes import options as run_options
-from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.observer import MissionSoFar, Observer, summary
 from uav_dc_ros.nodes.parameters import ADDRESS, EXTERNAL
@@ -25,10 +29,48 @@ from uav_dc_ros.nodes.table import rows
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED
 
+if TYPE_CHECKING:
+    from uav_dc_ros.nodes.display import Display
+
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
 REST_S, REST_QUIET_S = 2.0, 0.2  # longest time for what the nodes said last, and after which all of it came
-TICK_S = 0.02
+TICK_S = 0.02  # from one look at the nodes to the next
+BRING_UP_TICK_S = 0.004  # the same until all are active: each transition waits for such a look
+LEAVE_S = 3.0  # for the middleware to close, which was seen to hang
+
+
+class Network:
+    """The observer's way into ROS: a context, a node, an executor.
+
+    Args:
+        namespace: of the mission.
+        make: makes the node in a context.
+    """
+
+    def __init__(self, namespace: str, make: Callable[[Context], Observer]) -> None:
+        self._context = Context()
+        self._context.init(["--ros-args", "-r", f"__ns:={namespace}", "-r", "/clock:=clock"])
+        self.node = make(self._context)
+        self.executor = DirectExecutor(self.node.rest_s, self._context)
+        self.executor.add_node(self.node)
+        self._has_left = False
+
+    def leave(self) -> None:
+        """Leave the network, once: others would wait for a node that only ends with the process."""
+        if not self._has_left:
+            self._has_left = True
+            self.node.trigger_shutdown()
+            self.node.destroy_node()
+            del self.node, self.executor
+            leaving = threading.Thread(target=self._leave, daemon=True)
+            leaving.start()
+            leaving.join(LEAVE_S)
+
+    def _leave(self) -> None:
+        gc.collect()  # the middleware's part of a node ends with the last reference to it, and not before
+        self._context.try_shutdown()
+        self._context.destroy()
 
 
 class Flight:
@@ -70,13 +112,7 @@ class Flight:
         self.bag = run_options.new_bag(bag) if "recorder" in self.nodes else None
         if config.summary is not None:
             run_options.check_writable(Path(config.summary), self.bag)
-        self.display = Display(self.scenario, config.missions, show=show)
-        if self.policy.scenario.fingerprint != self.scenario.fingerprint:
-            self.display.note(
-                f"policy {self.policy.name} learnt in another world ({self.policy.scenario.name} "
-                f"{self.policy.scenario.fingerprint}) than it flies in ({self.scenario.name} "
-                f"{self.scenario.fingerprint})"
-            )
+        self._show, self._display, self._making = show, cast("Display | None", None), threading.Lock()
         self.summaries: list[Summary] = []
         self.errors: list[str] = []
         self.interrupted = self._aborted = False
@@ -84,47 +120,71 @@ class Flight:
         self._step_s = 0.0  # when the last step came, monotonic clock
         self._status: Mission | None = None  # of the vehicle, its last word
 
+    @property
+    def display(self) -> "Display":
+        """What the user sees; made when it is first needed, since the nodes can start meanwhile."""
+        with self._making:
+            if self._display is None:
+                from uav_dc_ros.nodes.display import Display
+
+                self._display = Display(self.scenario, self.config.missions, show=self._show)
+            return self._display
+
     def run(self) -> int:
         """Fly; returns the exit status of the command.
 
         It has a ROS context of its own, so that a caller's is as it was, and touches no signal handler.
         """
         status = 0
-        remapped = ["--ros-args", "-r", f"__ns:={self.config.namespace}", "-r", "/clock:=clock"]
-        context = Context()
-        with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, self.display:
+        with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, ExitStack() as stack:
             folder = Path(temporary)
-            context.init(remapped)
-            parameters = self._parameters(folder)
-            seed = self.config.seed if "world" in self.nodes else None
-            node = Observer(
-                *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
-                *(self._on_status, self._on_step, self._on_end, self.display.note, context),
+            network = Network(self.config.namespace, self._observer)
+            stack.callback(network.leave)
+            namespace, parameters = network.node.get_namespace(), self._parameters(folder)
+            network.node.trigger_configure()
+            network.node.trigger_activate()  # it looks for other missions while all else starts
+            on_line: Callable[[str, str], None] = lambda node, line: self.display.node_line(node, line)  # noqa: E731
+            supervisor = Supervisor(namespace, parameters, self.together, folder, on_line, self._note)
+            stack.enter_context(supervisor)
+            stack.enter_context(self.display)
+            try:
+                self._tell_of_world()
+                self._follow(supervisor, network.node, network.executor)
+            except NodeError as error:
+                self._why = str(error)
+                self._error(self._why)
+                status = 1
+                if isinstance(error, AnotherMissionError):  # what was received may be its
+                    self.summaries.clear()
+                    network.node.mission = self._status = None
+            is_complete = len(self.summaries) >= self.config.missions
+            status = max(
+                status, self._stopped(supervisor.stop(network.leave if is_complete else lambda: None))
             )
-            executor = DirectExecutor(node.rest_s, context)
-            executor.add_node(node)
-            with Supervisor(
-                *(node.get_namespace(), parameters, self.together, folder),
-                *(self.display.node_line, self.display.note),
-            ) as supervisor:
-                try:
-                    self._follow(supervisor, node, executor)
-                except NodeError as error:
-                    self._why = str(error)
-                    self._error(self._why)
-                    status = 1
-                    if isinstance(error, AnotherMissionError):  # what was received may be its
-                        self.summaries.clear()
-                        node.mission = self._status = None
-                status = max(status, self._stopped(supervisor.stop()))
-                self._hear_the_rest(executor)
-            self._account_for_all(node)
-            node.trigger_shutdown()
-            node.destroy_node()
-            context.try_shutdown()
+            if not is_complete:
+                self._hear_the_rest(network.executor)
+                self._account_for_all(network.node)
         status = max(status, self._mend_bag(), int(self._aborted))
         self._tell()
+        self.display.drain()
         return cli.INTERRUPTED if self.interrupted else status
+
+    def _observer(self, context: Context) -> Observer:
+        """The node that follows the missions."""
+        seed = self.config.seed if "world" in self.nodes else None
+        return Observer(
+            *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
+            *(self._on_status, self._on_step, self._on_end, self._note, context),
+        )
+
+    def _tell_of_world(self) -> None:
+        """Note that the policy learnt in another world."""
+        learnt, flown = self.policy.scenario, self.scenario
+        if learnt.fingerprint != flown.fingerprint:
+            self._note(
+                f"policy {self.policy.name} learnt in another world ({learnt.name} {learnt.fingerprint}) "
+                f"than it flies in ({flown.name} {flown.fingerprint})"
+            )
 
     def _follow(self, supervisor: Supervisor, node: Observer, executor: DirectExecutor) -> None:
         """Spin until all missions are over, or Ctrl-C.
@@ -132,15 +192,14 @@ class Flight:
         Raises:
             NodeError: a node gave up, no step came for too long, or somebody else's mission is flown here.
         """
-        node.trigger_configure()
-        node.trigger_activate()
         self._step_s = time.monotonic()
         check_s = 0.0
         while not (self.interrupted or (node.is_alone and len(self.summaries) >= self.config.missions)):
-            executor.spin_once(TICK_S)
+            tick_s = TICK_S if supervisor.brought_up else BRING_UP_TICK_S
+            executor.spin_once(tick_s)
             now_s = time.monotonic()
             if now_s >= check_s:
-                check_s = now_s + TICK_S
+                check_s = now_s + tick_s
                 node.look(supervisor.have_started)
                 supervisor.tick(node.is_alone)
                 if not node.is_alone:  # patience begins when the mission may
@@ -149,7 +208,7 @@ class Flight:
                     node.restarts_of, self._step_s = supervisor.restarts, now_s
                 node.close(LAST_RATES_S)
                 self._check_patience(node, now_s)
-            time.sleep(node.rest_s)
+            time.sleep(min(node.rest_s, tick_s))
 
     def _check_patience(self, node: Observer, now_s: float) -> None:
         """Wait for steps that are due, and for nodes that are started here; others may take their time."""
@@ -259,6 +318,9 @@ class Flight:
     def interrupt(self, *_: object) -> None:
         """Have the run end soon; a signal handler, too."""
         self.interrupted = True
+
+    def _note(self, text: str) -> None:
+        self.display.note(text)
 
     def _error(self, text: str) -> None:
         self.errors.append(text)

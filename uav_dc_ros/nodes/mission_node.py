@@ -86,6 +86,9 @@ class MissionNode(ManagedNode):
         self._seen_incompatible: set[tuple[str, str, str]] = set()  # at the last look: topic, peer, reason
         self._told_incompatible: set[tuple[str, str]] = set()
 
+    def prepare(self) -> None:
+        """Import what configuring needs, while the node waits to be configured: not every node has any."""
+
     # What the life cycle brings and takes.
 
     def _configure(self) -> None:
