@@ -163,7 +163,7 @@ import json
 import uav_dc_ros
 import gymnasium
 env = gymnasium.make("uav_dc_ros/DataCollection-v0", scenario="three_clusters")
-print(json.dumps([uav_dc_ros.__file__, env.reset(seed=1)[1]["step"]]))
+print(json.dumps([uav_dc_ros.__file__, int(env.reset(seed=1)[1]["step"])]))
 """
     assert run_installed(program, installed, tmp_path) == [str(installed / "uav_dc_ros" / "__init__.py"), 0]
 
