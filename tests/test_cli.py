@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.recordings import report_bags
-from uav_dc_ros import scenarios
+from uav_dc_ros import scenarios, uav_dc
 
 COMMANDS = (
     ("run_all", "--help"),
@@ -21,6 +21,8 @@ COMMANDS = (
     ("paper", "--help"),
     ("bag", "--help"),
     ("bag", "info", "--help"),
+    ("scenario", "--help"),
+    ("uav_dc", "--help"),
     ("nodes.world", "--help"),
 )
 # A command that prints `argv[1]` lines, and returns 1: of `bag verify`, that something differs.
@@ -49,6 +51,44 @@ def run(*arguments: object, env: dict[str, str] | None = None, **options: Any) -
         **({"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options),
     )
     return done.returncode, done.stdout or "", done.stderr or ""
+
+
+@pytest.mark.parametrize("verb", uav_dc.VERBS)
+def test_both_forms_of_a_command_print_the_same_help(verb: str, tmp_path: Path) -> None:
+    module = {"fly": "run_all"}.get(verb, verb)
+    told = [
+        run("-m", f"uav_dc_ros.{name}", *given, "--help", cwd=tmp_path)
+        for name, given in ((module, ()), ("uav_dc", (verb,)))
+    ]
+    assert told[0] == told[1]
+    assert told[0][0] == 0
+
+
+def test_scenarios_are_listed_shown_and_checked(tmp_path: Path) -> None:
+    def uav_dc(*arguments: object) -> tuple[int, str, str]:
+        return run("-m", "uav_dc_ros.uav_dc", "scenario", *arguments, cwd=tmp_path)
+
+    status, out, _ = uav_dc("list")
+    assert status == 0
+    assert [line.partition(":")[0] for line in out.splitlines()] == scenarios.names()
+    status, shown, _ = uav_dc("show", "three_clusters")
+    assert status == 0
+    file = tmp_path / "own.toml"
+    file.write_text(shown)
+    status, out, _ = uav_dc("check", file)
+    assert status == 0
+    assert "30 users in 3 clusters" in out
+    assert "three_clusters_dueling" in out
+    file.write_text(shown.replace("max_steps = ", "max_steps = -"))
+    status, out, err = uav_dc("check", file)
+    assert (status, out) == (2, "")
+    assert "mission.max_steps = -45; expected int >= 1" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_an_unknown_verb_is_one_line(tmp_path: Path) -> None:
+    status, _, err = run("-m", "uav_dc_ros.uav_dc", "fli", cwd=tmp_path)
+    assert (status, err) == (2, f"uav-dc: 'fli'; expected a verb: {', '.join(uav_dc.VERBS)}\n")
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)

@@ -19,6 +19,8 @@ def python(code: str) -> str:
     "code",
     [
         f"import gymnasium, uav_dc_ros; e = gymnasium.make('{NAME}', scenario='three_clusters')",
+        f"import uav_dc_ros, gymnasium; e = gymnasium.make('{NAME}', scenario='three_clusters')",
+        f"import uav_dc_ros; from gymnasium.envs.registration import make\ne = make('{NAME}')",
         f"import gymnasium; e = gymnasium.make('uav_dc_ros:{NAME}', scenario='three_clusters')",
     ],
 )
@@ -31,7 +33,58 @@ def test_the_package_alone_brings_nothing_heavy() -> None:
     assert python(f"import sys, uav_dc_ros; print(*[m for m in {heavy} if m in sys.modules])").strip() == ""
 
 
-@pytest.mark.parametrize("node", ["world", "channel_monitor", "policy", "bridge"])
+def test_without_gymnasium_its_import_fails_as_ever() -> None:
+    code = (
+        "import sys, uav_dc_ros; sys.path[:] = []; sys.path_importer_cache.clear()\n"
+        "try: import gymnasium\nexcept ModuleNotFoundError as error: print(error.name)"
+    )
+    assert python(code).strip() == "gymnasium"
+
+
+def loaded(code: str, *modules: str) -> list[str]:
+    """Those of the modules that are there after running code in a fresh Python."""
+    return python(f"import sys\n{code}\nprint(*[m for m in {modules} if m in sys.modules])").split()
+
+
+@pytest.mark.parametrize(
+    ("module", "unwanted"),
+    [
+        ("env.gym_env", ("matplotlib", "torch", "rclpy", "mcap", "rosbags")),
+        ("env.vector_env", ("matplotlib", "torch", "rclpy", "mcap", "rosbags")),
+        ("experiments.train_cli", ("matplotlib", "rclpy", "mcap", "rosbags", "ruamel")),
+        ("experiments.training", ("matplotlib", "rclpy", "mcap", "rosbags", "ruamel")),
+        ("run_all", ("numpy", "rclpy", "rich", "msgspec")),
+        (
+            "nodes.flight",
+            (
+                *("rosbags", "mcap", "ruamel", "rich", "matplotlib", "gymnasium"),
+                *("uav_dc_ros.nodes.vehicles", "uav_dc_ros.autopilot.mavlink", "pymavlink"),
+            ),
+        ),
+    ],
+)
+def test_a_module_brings_nothing_that_it_does_not_need(module: str, unwanted: tuple[str, ...]) -> None:
+    assert loaded(f"import uav_dc_ros.{module}", *unwanted) == []
+
+
+def test_a_simulated_run_brings_no_way_to_an_autopilot() -> None:
+    code = (
+        "from uav_dc_ros.nodes.flight import Flight\nfrom uav_dc_ros.run_config import RunConfig\n"
+        "Flight(RunConfig(record=False))"
+    )
+    vehicles = ("uav_dc_ros.nodes.vehicles", "uav_dc_ros.nodes.datums", "pymavlink", "pymap3d", "px4_msgs")
+    assert loaded(code, *vehicles) == []
+
+
+def test_nodes_without_ros_name_the_cure() -> None:
+    code = (
+        "import sys; sys.modules['rclpy'] = None\n"
+        "try: import uav_dc_ros.nodes\nexcept ImportError as error: print(error)"
+    )
+    assert "pip install 'uav_dc_ros[ros]'" in python(code)
+
+
+@pytest.mark.parametrize("node", ["world", "channel_monitor", "policy", "bridge", "recorder", "visualizer"])
 def test_a_node_that_flies_brings_nothing_that_it_does_not_need(node: str) -> None:
     """It may have to be started again in the air, on a small computer."""
     heavy = ("torch", "gymnasium", "matplotlib", "rich", "mcap", "rosbags", "ruamel")

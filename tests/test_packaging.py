@@ -24,6 +24,7 @@ TOP_LEVEL = {
     "README.md",
     "benchmarks",
     "docs",
+    "examples",
     "msgs_json",
     "package.xml",
     "policies",
@@ -92,8 +93,13 @@ def test_the_wheel_holds_the_package_and_its_data_and_nothing_else(wheel, reposi
         assert f"uav_dc_ros/{kind}" in wanted
     with zipfile.ZipFile(wheel) as archive:
         about = {name.partition(".dist-info/")[2] for name in archive.namelist()} - {""}
-        # No entry_points.txt: the executables `world`, `policy` ... are for ROS only.
-        assert about == {"METADATA", "RECORD", "WHEEL", "licenses/LICENSE", "top_level.txt"}
+        expected = {"METADATA", "RECORD", "WHEEL", "licenses/LICENSE", "top_level.txt", "entry_points.txt"}
+        assert about == expected
+        # The executables `world`, `policy` ... are for ROS only.
+        (commands,) = (name for name in archive.namelist() if name.endswith("entry_points.txt"))
+        assert archive.read(commands).decode().split() == [
+            *("[console_scripts]", "uav-dc", "=", "uav_dc_ros.uav_dc:main")
+        ]
         found = {name for name in archive.namelist() if ".dist-info/" not in name}
         assert found == wanted
         for name in found:
@@ -149,6 +155,17 @@ def test_the_installed_package_flies_from_an_empty_folder(installed, ros):
     assert "error" not in output.lower(), output
     (bag,) = (ros.folder / "bags").iterdir()
     assert (bag / "metadata.yaml").is_file()
+
+
+def test_gymnasium_makes_the_installed_environment(installed, tmp_path):
+    program = """
+import json
+import uav_dc_ros
+import gymnasium
+env = gymnasium.make("uav_dc_ros/DataCollection-v0", scenario="three_clusters")
+print(json.dumps([uav_dc_ros.__file__, int(env.reset(seed=1)[1]["step"])]))
+"""
+    assert run_installed(program, installed, tmp_path) == [str(installed / "uav_dc_ros" / "__init__.py"), 0]
 
 
 def test_the_core_imports_nothing_heavy():

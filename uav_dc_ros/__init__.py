@@ -1,11 +1,128 @@
-"""A UAV collects data from IoT users on the ground, steered by a dueling DQN, on ROS 2."""
+"""A UAV collects data from IoT users on the ground, steered by a dueling DQN, on ROS 2.
+
+What stands in `__all__` is what users may rely on. Each name is imported when it is first asked for, so that
+flying needs no torch, learning no ROS, and `import uav_dc_ros` next to nothing.
+"""
 
 import importlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
 import sys
+from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from uav_dc_ros.agents.policy import Policy as Policy
+    from uav_dc_ros.agents.policy import load as load_policy
+    from uav_dc_ros.agents.policy import names as policy_names
+    from uav_dc_ros.api import read_steps as read_steps
+    from uav_dc_ros.api import rollout as rollout
+    from uav_dc_ros.core.grid import Action as Action
+    from uav_dc_ros.core.scenario import Scenario as Scenario
+    from uav_dc_ros.env.gym_env import DataCollectionEnv as DataCollectionEnv
+    from uav_dc_ros.env.vector_env import DataCollectionVectorEnv as DataCollectionVectorEnv
+    from uav_dc_ros.errors import UavDcError as UavDcError
+    from uav_dc_ros.experiments.evaluate import Evaluation as Evaluation
+    from uav_dc_ros.experiments.evaluate import evaluate as evaluate_policy
+    from uav_dc_ros.experiments.fly import Missions as Missions
+    from uav_dc_ros.mission_summary import Summary as Summary
+    from uav_dc_ros.recordings.step import RecordedStep as RecordedStep
+    from uav_dc_ros.run_all import fly as fly
+    from uav_dc_ros.run_config import RunConfig as RunConfig
+    from uav_dc_ros.scenarios import load as load_scenario
+    from uav_dc_ros.scenarios import names as scenario_names
 
-# Gymnasium looks for no plug-ins: `import gymnasium, uav_dc_ros` is what makes the environment known. Without
-# Gymnasium nothing is imported, since what flies does not need it.
+__version__ = "0.2.0"
+
+# Where each public name is defined; a test holds it equal to the imports for type checkers above.
+_PUBLIC = {
+    "Action": "uav_dc_ros.core.grid:Action",
+    "DataCollectionEnv": "uav_dc_ros.env.gym_env:DataCollectionEnv",
+    "DataCollectionVectorEnv": "uav_dc_ros.env.vector_env:DataCollectionVectorEnv",
+    "Evaluation": "uav_dc_ros.experiments.evaluate:Evaluation",
+    "Missions": "uav_dc_ros.experiments.fly:Missions",
+    "Policy": "uav_dc_ros.agents.policy:Policy",
+    "RecordedStep": "uav_dc_ros.recordings.step:RecordedStep",
+    "RunConfig": "uav_dc_ros.run_config:RunConfig",
+    "Scenario": "uav_dc_ros.core.scenario:Scenario",
+    "Summary": "uav_dc_ros.mission_summary:Summary",
+    "UavDcError": "uav_dc_ros.errors:UavDcError",
+    "evaluate_policy": "uav_dc_ros.experiments.evaluate:evaluate",
+    "fly": "uav_dc_ros.run_all:fly",
+    "load_policy": "uav_dc_ros.agents.policy:load",
+    "load_scenario": "uav_dc_ros.scenarios:load",
+    "policy_names": "uav_dc_ros.agents.policy:names",
+    "read_steps": "uav_dc_ros.api:read_steps",
+    "rollout": "uav_dc_ros.api:rollout",
+    "scenario_names": "uav_dc_ros.scenarios:names",
+}
+__all__ = [  # noqa: PLE0604, RUF100
+    "Action",
+    "DataCollectionEnv",
+    "DataCollectionVectorEnv",
+    "Evaluation",
+    "Missions",
+    "Policy",
+    "RecordedStep",
+    "RunConfig",
+    "Scenario",
+    "Summary",
+    "UavDcError",
+    "evaluate_policy",
+    "fly",
+    "load_policy",
+    "load_scenario",
+    "policy_names",
+    "read_steps",
+    "rollout",
+    "scenario_names",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _PUBLIC[name].partition(":")
+    found = getattr(importlib.import_module(module), attribute)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """Public names first come into being when they are asked for."""
+    return sorted({*globals(), *__all__})
+
+
+_REGISTRATION = "uav_dc_ros.env.registration"
+
+
+class _AfterGymnasium(importlib.abc.MetaPathFinder):
+    """Makes the environment known as soon as Gymnasium is imported.
+
+    Gymnasium looks for no plug-ins since its 1.0, and this package does not import it: what flies does not
+    need it.
+    """
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+        """Find Gymnasium as the others do, once, and register when it has been imported."""
+        if name != "gymnasium":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        if spec is None or spec.loader is None:
+            return spec
+        execute = spec.loader.exec_module
+
+        def execute_and_register(module: Any) -> None:
+            execute(module)
+            importlib.import_module(_REGISTRATION)
+
+        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
+        return spec
+
+
 if sys.modules.get("gymnasium"):
-    importlib.import_module("uav_dc_ros.env.registration")
+    importlib.import_module(_REGISTRATION)
+else:
+    sys.meta_path.insert(0, _AfterGymnasium())

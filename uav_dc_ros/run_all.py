@@ -5,24 +5,30 @@ python -m uav_dc_ros.run_all --vehicle mavlink --connect tcp:127.0.0.1:5760 --ar
 """
 
 import argparse
+import os
+import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from uav_dc_ros import __version__, cli
-from uav_dc_ros.core import pace
-from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.core import pace as paces
+from uav_dc_ros.errors import NodeError, ParameterError
+from uav_dc_ros.run_config import PORT_MAX, RunConfig
 from uav_dc_ros.topics import SIMULATED, SYSTEM_MAX, VEHICLES
 
+if TYPE_CHECKING:  # a command line is read before anything heavy is imported
+    from uav_dc_ros.mission_summary import Summary
+
 PROG = "python -m uav_dc_ros.run_all"
-PORT_MAX = 65535
 LIVE_PORT = 8765  # Foxglove's own default
 
 
-def parser() -> cli.Parser:
+def parser(prog: str = PROG) -> cli.Parser:
     """The command line."""
     options = cli.Parser(
-        prog=PROG,
+        prog=prog,
         description="Fly recorded missions with a trained policy: world, channel monitor, policy and "
         "recorder as separate ROS 2 nodes.",
     )
@@ -54,7 +60,7 @@ def parser() -> cli.Parser:
     options.add_argument(
         "--pace",
         type=_pace,
-        default=pace.WATCHABLE,
+        default=paces.WATCHABLE,
         metavar="lockstep|FACTOR",
         help="as fast as the nodes can, or how many times faster than real time (default: %(default)g); a "
         "real vehicle has its own",
@@ -141,27 +147,99 @@ def parser() -> cli.Parser:
     return options
 
 
-def main(arguments: list[str] | None = None) -> NoReturn:
+def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
     """Run the command, and exit."""
+    has_flown = False
 
     def command() -> int:
-        options = parser().parse_args(arguments)
+        nonlocal has_flown
+        config = _config(parser(prog).parse_args(arguments))
         from uav_dc_ros.nodes import environment, fastdds
 
-        environment.prepare(alone=options.nodes is None)  # before ROS is imported
+        environment.prepare(alone=config.nodes is None)  # before ROS is imported
+        from uav_dc_ros.nodes import runtime
         from uav_dc_ros.nodes.flight import Flight
 
         try:
-            return Flight(options).run()
+            flight = Flight(config)
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the terminal is gone: the mission goes on
+            cli.on_stop(flight.interrupt)
+            runtime.give_way()
+            has_flown = True
+            return flight.run()
         finally:
             fastdds.remove_leftovers()  # of nodes that were killed
 
-    cli.run(command, PROG)
+    try:
+        cli.run(command, prog)
+    except SystemExit as ended:
+        if has_flown and isinstance(ended.code, int):
+            os._exit(ended.code)  # all is written, and Python takes a fifth of a second to clear up
+        raise
+
+
+def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summary, ...]":
+    """Fly missions as run_all does, from Python: start the nodes, wait for the end, close the bag.
+
+    It has a ROS context of its own: a caller's rclpy, initialised or not, stays as it is. The variables that
+    it sets for ROS in the environment are taken back at the end. In the main thread Ctrl-C stops the nodes in
+    order and closes the bag first; in another thread no signal is handled. One run at a time in a process.
+
+    Args:
+        config: what is flown; the defaults fly one mission in ten seconds.
+        show: are progress and summary printed?
+
+    Returns:
+        One summary for each mission. A mission that was aborted has the outcome `aborted`, and a reason.
+
+    Raises:
+        UavDcError: a value that cannot be flown, and nothing was started; or the missions were flown, and
+            their bag is not whole.
+        ImportError: ROS 2 is missing.
+        KeyboardInterrupt: Ctrl-C, once the bag is closed.
+    """
+    config = config or RunConfig()
+    before = dict(os.environ)
+    in_main = threading.current_thread() is threading.main_thread()
+    try:
+        from uav_dc_ros.nodes import environment, fastdds
+
+        environment.prepare(alone=config.nodes is None)  # before ROS is imported
+        from uav_dc_ros.messages import Phase
+        from uav_dc_ros.nodes.flight import Flight
+
+        flight = Flight(config, show=show)
+        handler = signal.signal(signal.SIGINT, flight.interrupt) if in_main else None
+        try:
+            status = flight.run()
+        finally:
+            if in_main:
+                signal.signal(signal.SIGINT, handler)
+            fastdds.remove_leftovers()
+    finally:
+        for name in os.environ.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
+    if flight.interrupted:
+        raise KeyboardInterrupt
+    summaries = tuple(flight.summaries)
+    if status and all(one.outcome is not Phase.ABORTED for one in summaries):
+        raise NodeError("; ".join(flight.errors))
+    return summaries
+
+
+def _config(options: argparse.Namespace) -> RunConfig:
+    """What the command line says."""
+    given = vars(options)
+    settings = {f"{node}.{name}": value for node, name, value in given.pop("settings")}
+    lockstep = paces.LOCKSTEP if options.pace is None else options.pace
+    record = not given.pop("no_record")
+    return RunConfig(**given | {"settings": settings, "pace": lockstep, "record": record})
 
 
 def _pace(text: str) -> float | None:
     try:
-        return pace.parse(text)
+        return paces.parse(text)
     except ParameterError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
@@ -174,8 +252,8 @@ def _setting(text: str) -> tuple[str, str, str]:
     return node, name, value
 
 
-def _names(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
     if not all(names) or len(set(names)) < len(names):
         raise argparse.ArgumentTypeError(f"{text!r}; expected names of nodes, each once, with ',' between")
     return names

@@ -3,10 +3,15 @@
 import logging
 import multiprocessing
 import os
+import shutil
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+import uav_dc_ros
 from tests.small_worlds import tiny
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Hyperparameters
@@ -123,6 +128,40 @@ def test_a_name_tells_the_content():
     assert shard(0).name == shard(0).name
     others = [shard(1), shard(0, episodes=41), shard(0, scenario=tiny(mission={"max_steps": 9}))]
     assert len({one.name for one in (shard(0), *others)}) == 4
+
+
+def copy_of_package(tmp_path):
+    package = Path(uav_dc_ros.__file__).parent
+    shutil.copytree(package, tmp_path / "uav_dc_ros", ignore=shutil.ignore_patterns("__pycache__", "share"))
+    assert shards.code_of(tmp_path) == shards.code()
+    return tmp_path / "uav_dc_ros"
+
+
+def changes_the_name(package, file):
+    path, before = package / file, shards.code_of(package.parent)
+    path.write_text(path.read_text("utf-8") + "# changed\n", "utf-8")
+    return shards.code_of(package.parent) != before
+
+
+def test_only_code_that_trains_changes_the_name(tmp_path):
+    package = copy_of_package(tmp_path)
+    for folder in ("nodes", "bags", "autopilot", "planners", "experiments/paper"):
+        path = next((package / folder).glob("[a-z]*.py")).relative_to(package)
+        assert not changes_the_name(package, path), path
+    for name in ("core/world", "core/radio", "agents/dqn", "env/batch", "experiments/training"):
+        assert changes_the_name(package, f"{name}.py"), name
+
+
+def test_the_closure_has_what_training_really_imports():
+    code = (
+        "import sys, uav_dc_ros.experiments.shards, uav_dc_ros.experiments.checkpoint\n"
+        "import uav_dc_ros.experiments.training, uav_dc_ros.experiments.validation\n"
+        "print(*[name for name in sys.modules if name.startswith('uav_dc_ros')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    root = Path(uav_dc_ros.__file__).parent.parent
+    real = {name for name in done.stdout.split() if shards._file(root, name).name != "__init__.py"}
+    assert real <= shards.import_closure(root, shards._ROOTS)
 
 
 @pytest.mark.parametrize("damage", [lambda b: b[:-40], lambda b: b"", lambda b: b[:8] + b"[" + b[9:]])

@@ -80,7 +80,7 @@ def flown(
 ) -> Path:
     """Two missions of three steps, 0.1 s each, 2 s between them; `without` some in mission 1, step 1."""
     told = {
-        "version": "0.1.0",
+        "version": "0.2.0",
         "scenario": "five_clusters",
         "policy": "p",
         "policy_sha256": "ab12",
@@ -139,7 +139,7 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         "p (ab12)",
         "2: 2 landed; 75.0% of the users",
         "policy 2",
-        "uav_dc_ros 0.1.0, ROS 2 jazzy",
+        "uav_dc_ros 0.2.0, ROS 2 jazzy",
         "2.000 s at 0.3 s",
         "3 of 4",
     ):

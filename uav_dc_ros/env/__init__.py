@@ -5,5 +5,6 @@ batch          worlds side by side, on numpy or torch: what trainer and vector e
 gym_env        the Gymnasium environment
 vector_env     many of them in one step
 registration   importing it makes both known to gymnasium.make and make_vec
-render         pictures of missions
+track          one mission, step by step
+render         pictures of missions; brings matplotlib
 """

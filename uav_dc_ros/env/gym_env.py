@@ -16,7 +16,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env import observations
 from uav_dc_ros.env.batch import observe
 from uav_dc_ros.env.observations import Observation
-from uav_dc_ros.env.render import Track, picture
+from uav_dc_ros.env.track import Track
 
 RENDER_MODES = ("rgb_array",)
 ACTIONS_TEXT = ", ".join(f"{action.value} {action.label}" for action in Action)
@@ -108,6 +108,8 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
             return None
         if not self._track.cells:
             raise ResetNeeded("render() before the first mission; expected a call of reset() first")
+        from uav_dc_ros.env.render import picture  # brings matplotlib
+
         return picture(self._track)
 
     def _draws(self) -> Array:

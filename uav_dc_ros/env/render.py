@@ -11,40 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from uav_dc_ros import files
-from uav_dc_ros.core import mission, radio, world
+from uav_dc_ros.core import mission, radio
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.env.track import Track
 
 INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
 WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
 # From the start of a mission to its end.
 PATH_COLOURS = LinearSegmentedColormap.from_list("path", ["#2b3f7e", "#8c5aa6", "#f0a83a"])
-
-
-class Track:
-    """What a picture needs of one mission, step by step.
-
-    Attributes:
-        scenario: the world's values.
-        cells: the UAV's cell after each step, the start first.
-        n_collected: users collected after each step.
-        sum_rate_bps: sum-rate of each step, 0 for the start.
-        state: the world now.
-    """
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        self.cells: list[Array] = []
-        self.n_collected: list[int] = []
-        self.sum_rate_bps: list[float] = []
-        self.state: world.State | None = None
-
-    def add(self, state: world.State, link: world.Link | None = None) -> None:
-        """Appends the start, or the next step, of one mission without batch dimensions."""
-        self.cells.append(state.cell)
-        self.n_collected.append(int(np.sum(state.collected)))
-        self.sum_rate_bps.append(float(link.sum_rate_bps) if link else 0.0)
-        self.state = state
 
 
 def picture(track: Track) -> Array:

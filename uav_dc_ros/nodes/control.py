@@ -8,15 +8,18 @@ pipe has no other end than the process that was started with it, and loses and r
 import contextlib
 import os
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from uav_dc_ros.nodes.managed_node import ManagedNode
+if TYPE_CHECKING:
+    from uav_dc_ros.nodes.managed_node import ManagedNode
 
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this process has been restarted
 REPORTS = "UAV_DC_ROS_REPORTS"  # set by run_all: the file descriptor that takes the reports
 PERIOD_S = 0.25  # from one report to the next
 CONFIGURE, ACTIVATE = "configure", "activate"
+FINALIZED = "finalized"  # the state in which a node has said its last
 REASON_MAX = 1000  # characters; a report is shorter than what a pipe takes in one piece
 
 
@@ -55,7 +58,7 @@ class Reporter:
         nodes: of this process.
     """
 
-    def __init__(self, nodes: Sequence[ManagedNode]) -> None:
+    def __init__(self, nodes: "Sequence[ManagedNode]") -> None:
         self._nodes = {node.row.name: node for node in nodes}
         self._refused: dict[str, str] = {}
         self._pipe: int | None = int(os.environ[REPORTS]) if REPORTS in os.environ else None

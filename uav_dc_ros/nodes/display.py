@@ -12,7 +12,8 @@ from rich.table import Table
 
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission, Phase
-from uav_dc_ros.nodes.observer import MissionSoFar, Summary
+from uav_dc_ros.mission_summary import Summary
+from uav_dc_ros.nodes.observer import MissionSoFar
 from uav_dc_ros.nodes.output import Output
 
 REFRESH_S = 0.05
@@ -27,15 +28,17 @@ class Display:
     Args:
         scenario: the world that is flown.
         missions: how many missions will be flown.
+        show: is anything printed?
     """
 
-    def __init__(self, scenario: Scenario, missions: int) -> None:
+    def __init__(self, scenario: Scenario, missions: int, *, show: bool = True) -> None:
         self.scenario = scenario
         self.missions = missions
         self._here = Path.cwd()  # by the end of the missions it may be deleted
         self._output = Output()
         self.console = self._output.console(sys.stdout)
         self.errors = self._output.console(sys.stderr)
+        self.console.quiet = self.errors.quiet = not show
         self._every = max(1, scenario.mission.max_steps // PLAIN_LINES)
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -125,4 +128,8 @@ class Display:
     ) -> None:
         """Leave the terminal as it was."""
         self._bar.stop()
+        self.drain()
+
+    def drain(self) -> None:
+        """Wait until everything is written."""
         self._output.drain()

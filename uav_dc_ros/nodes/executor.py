@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -33,13 +34,14 @@ class DirectExecutor:
     Args:
         rest_s: pause after each turn that handled all there was, seconds. Who need not answer at once takes
             what came meanwhile in one turn, and leaves the cores to those who must.
+        context: of ROS; None: the process's own.
     """
 
-    def __init__(self, rest_s: float = 0.0) -> None:
+    def __init__(self, rest_s: float = 0.0, context: Context | None = None) -> None:
         self.rest_s = rest_s
         self._at_once = TURN_MAX if rest_s else 1
         self._behind = False  # did messages wait for another turn
-        self._context: Any = get_default_context()
+        self._context: Any = context or get_default_context()
         self._guard = GuardCondition(callback=None, callback_group=None, context=self._context)
         self._nodes: list[Node] = []
         self._wait_set: Any = None
@@ -73,7 +75,7 @@ class DirectExecutor:
                     heard_s = self._heard_s
                     if quiet_turns >= QUIET_TURNS and time.monotonic() - heard_s > quiet_s:
                         return
-                if self.rest_s and not self._behind:
+                if self.rest_s and not self._behind and quiet_s is None:  # to wait for quiet is a rest
                     time.sleep(self.rest_s)
                 self._behind = False
 

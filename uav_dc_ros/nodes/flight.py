@@ -1,117 +1,190 @@
 """One run of run_all: check everything, start the nodes, follow the missions, stop, tell."""
 
-import argparse
+import gc
 import signal
 import tempfile
+import threading
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import msgspec
-import rclpy
-from rclpy.signals import SignalHandlerOptions
+from rclpy.context import Context
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
-from uav_dc_ros.nodes import foxglove_server, runtime
+from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes import options as run_options
-from uav_dc_ros.nodes.display import Display
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.observer import MissionSoFar, Observer, Summary, summary
+from uav_dc_ros.nodes.observer import MissionSoFar, Observer, summary
 from uav_dc_ros.nodes.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.rivals import AnotherMissionError
 from uav_dc_ros.nodes.supervisor import Supervisor
 from uav_dc_ros.nodes.table import rows
+from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED
+
+if TYPE_CHECKING:
+    from uav_dc_ros.nodes.display import Display
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
 REST_S, REST_QUIET_S = 2.0, 0.2  # longest time for what the nodes said last, and after which all of it came
-TICK_S = 0.02
+TICK_S = 0.02  # from one look at the nodes to the next
+BRING_UP_TICK_S = 0.004  # the same until all are active: each transition waits for such a look
+LEAVE_S = 3.0  # for the middleware to close, which was seen to hang
+
+
+class Network:
+    """The observer's way into ROS: a context, a node, an executor.
+
+    Args:
+        namespace: of the mission.
+        make: makes the node in a context.
+    """
+
+    def __init__(self, namespace: str, make: Callable[[Context], Observer]) -> None:
+        self._context = Context()
+        self._context.init(["--ros-args", "-r", f"__ns:={namespace}", "-r", "/clock:=clock"])
+        self.node = make(self._context)
+        self.executor = DirectExecutor(self.node.rest_s, self._context)
+        self.executor.add_node(self.node)
+        self._has_left = False
+
+    def leave(self) -> None:
+        """Leave the network, once: others would wait for a node that only ends with the process."""
+        if not self._has_left:
+            self._has_left = True
+            self.node.trigger_shutdown()
+            self.node.destroy_node()
+            del self.node, self.executor
+            leaving = threading.Thread(target=self._leave, daemon=True)
+            leaving.start()
+            leaving.join(LEAVE_S)
+
+    def _leave(self) -> None:
+        gc.collect()  # the middleware's part of a node ends with the last reference to it, and not before
+        self._context.try_shutdown()
+        self._context.destroy()
 
 
 class Flight:
-    """A run of missions, from the command line's options (see run_all).
+    """A run of missions.
+
+    Args:
+        config: what is flown.
+        show: are progress and summary printed?
 
     Raises:
-        UavDcError: an option that cannot be flown; nothing was started or written yet.
+        UavDcError: a value that cannot be flown; nothing was started or written yet.
+
+    Attributes:
+        summaries: one for each mission that is over.
+        errors: what went wrong, in words.
+        interrupted: was it asked to stop?
     """
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.options = options
-        self.scenario = scenarios.load(options.scenario)
-        self.policy = policies.load(options.policy or f"{self.scenario.name}_dueling")
+    def __init__(self, config: RunConfig, *, show: bool = True) -> None:
+        self.config = config
+        self.scenario = scenarios.load(config.scenario)
+        self.policy = policies.load(config.policy or f"{self.scenario.name}_dueling")
         self.policy.check(self.scenario)
-        self.is_simulated = options.vehicle == SIMULATED
+        self.is_simulated = config.vehicle == SIMULATED
         if self.is_simulated:
-            pace.check(self.scenario, options.pace, options.missions)
+            pace.check(self.scenario, config.factor, config.missions)
         self.rows = rows(() if self.is_simulated else ("bridge",))
-        self.nodes = run_options.nodes(options)
+        self.nodes = run_options.nodes(config)
         # Whoever starts the vehicle draws the run's identity; a run_all on another host adopts it.
         self.run_id = new_run() if ("world" if self.is_simulated else "bridge") in self.nodes else ""
-        self.together = run_options.together(options, self.nodes)
-        self._settings = run_options.settings(options, self.nodes)
-        run_options.check_vehicle(options, self.nodes, self.scenario)
-        if options.live is not None:
-            foxglove_server.check(address=str(ADDRESS.default), port=options.live)
-        self.bag = run_options.new_bag(options.bag) if "recorder" in self.nodes else None
-        if options.summary is not None:
-            run_options.check_writable(options.summary, self.bag)
-        self.display = Display(self.scenario, options.missions)
-        if self.policy.scenario.fingerprint != self.scenario.fingerprint:
-            self.display.note(
-                f"policy {self.policy.name} learnt in another world ({self.policy.scenario.name} "
-                f"{self.policy.scenario.fingerprint}) than it flies in ({self.scenario.name} "
-                f"{self.scenario.fingerprint})"
-            )
+        self.together = run_options.together(config, self.nodes)
+        self._settings = run_options.settings(config, self.nodes)
+        run_options.check_vehicle(config, self.nodes, self.scenario)
+        if config.live is not None:
+            from uav_dc_ros.nodes import foxglove_server  # brings rosbags, which only few need
+
+            foxglove_server.check(address=str(ADDRESS.default), port=config.live)
+        bag = None if config.bag is None else Path(config.bag)
+        self.bag = run_options.new_bag(bag) if "recorder" in self.nodes else None
+        if config.summary is not None:
+            run_options.check_writable(Path(config.summary), self.bag)
+        self._show, self._display, self._making = show, cast("Display | None", None), threading.Lock()
         self.summaries: list[Summary] = []
-        self._interrupted = self._aborted = False
+        self.errors: list[str] = []
+        self.interrupted = self._aborted = False
         self._why = ""  # this run ended before its missions
         self._step_s = 0.0  # when the last step came, monotonic clock
         self._status: Mission | None = None  # of the vehicle, its last word
 
+    @property
+    def display(self) -> "Display":
+        """What the user sees; made when it is first needed, since the nodes can start meanwhile."""
+        with self._making:
+            if self._display is None:
+                from uav_dc_ros.nodes.display import Display
+
+                self._display = Display(self.scenario, self.config.missions, show=self._show)
+            return self._display
+
     def run(self) -> int:
-        """Fly; returns the exit status of the command."""
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the terminal is gone: the mission goes on
-        cli.on_stop(self._interrupt)
+        """Fly; returns the exit status of the command.
+
+        It has a ROS context of its own, so that a caller's is as it was, and touches no signal handler.
+        """
         status = 0
-        remapped = ["--ros-args", "-r", f"__ns:={self.options.namespace}", "-r", "/clock:=clock"]
-        with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, self.display:
+        with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, ExitStack() as stack:
             folder = Path(temporary)
-            runtime.give_way()
-            rclpy.init(args=remapped, signal_handler_options=SignalHandlerOptions.NO)
-            parameters = self._parameters(folder)
-            seed = self.options.seed if "world" in self.nodes else None
-            node = Observer(
-                *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
-                *(self._on_status, self._on_step, self._on_end, self.display.note),
+            network = Network(self.config.namespace, self._observer)
+            stack.callback(network.leave)
+            namespace, parameters = network.node.get_namespace(), self._parameters(folder)
+            network.node.trigger_configure()
+            network.node.trigger_activate()  # it looks for other missions while all else starts
+            on_line: Callable[[str, str], None] = lambda node, line: self.display.node_line(node, line)  # noqa: E731
+            supervisor = Supervisor(namespace, parameters, self.together, folder, on_line, self._note)
+            stack.enter_context(supervisor)
+            stack.enter_context(self.display)
+            try:
+                self._tell_of_world()
+                self._follow(supervisor, network.node, network.executor)
+            except NodeError as error:
+                self._why = str(error)
+                self._error(self._why)
+                status = 1
+                if isinstance(error, AnotherMissionError):  # what was received may be its
+                    self.summaries.clear()
+                    network.node.mission = self._status = None
+            is_complete = len(self.summaries) >= self.config.missions
+            status = max(
+                status, self._stopped(supervisor.stop(network.leave if is_complete else lambda: None))
             )
-            executor = DirectExecutor(node.rest_s)
-            executor.add_node(node)
-            with Supervisor(
-                *(node.get_namespace(), parameters, self.together, folder),
-                *(self.display.node_line, self.display.note),
-            ) as supervisor:
-                try:
-                    self._follow(supervisor, node, executor)
-                except NodeError as error:
-                    self._why = str(error)
-                    self.display.error(self._why)
-                    status = 1
-                    if isinstance(error, AnotherMissionError):  # what was received may be its
-                        self.summaries.clear()
-                        node.mission = self._status = None
-                status = max(status, self._stopped(supervisor.stop()))
-                self._hear_the_rest(executor)
-            self._account_for_all(node)
-            node.trigger_shutdown()
-            rclpy.try_shutdown()
+            if not is_complete:
+                self._hear_the_rest(network.executor)
+                self._account_for_all(network.node)
         status = max(status, self._mend_bag(), int(self._aborted))
         self._tell()
-        return cli.INTERRUPTED if self._interrupted else status
+        self.display.drain()
+        return cli.INTERRUPTED if self.interrupted else status
+
+    def _observer(self, context: Context) -> Observer:
+        """The node that follows the missions."""
+        seed = self.config.seed if "world" in self.nodes else None
+        return Observer(
+            *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
+            *(self._on_status, self._on_step, self._on_end, self._note, context),
+        )
+
+    def _tell_of_world(self) -> None:
+        """Note that the policy learnt in another world."""
+        learnt, flown = self.policy.scenario, self.scenario
+        if learnt.fingerprint != flown.fingerprint:
+            self._note(
+                f"policy {self.policy.name} learnt in another world ({learnt.name} {learnt.fingerprint}) "
+                f"than it flies in ({flown.name} {flown.fingerprint})"
+            )
 
     def _follow(self, supervisor: Supervisor, node: Observer, executor: DirectExecutor) -> None:
         """Spin until all missions are over, or Ctrl-C.
@@ -119,15 +192,14 @@ class Flight:
         Raises:
             NodeError: a node gave up, no step came for too long, or somebody else's mission is flown here.
         """
-        node.trigger_configure()
-        node.trigger_activate()
         self._step_s = time.monotonic()
         check_s = 0.0
-        while not (self._interrupted or (node.is_alone and len(self.summaries) >= self.options.missions)):
-            executor.spin_once(TICK_S)
+        while not (self.interrupted or (node.is_alone and len(self.summaries) >= self.config.missions)):
+            tick_s = TICK_S if supervisor.brought_up else BRING_UP_TICK_S
+            executor.spin_once(tick_s)
             now_s = time.monotonic()
             if now_s >= check_s:
-                check_s = now_s + TICK_S
+                check_s = now_s + tick_s
                 node.look(supervisor.have_started)
                 supervisor.tick(node.is_alone)
                 if not node.is_alone:  # patience begins when the mission may
@@ -136,13 +208,13 @@ class Flight:
                     node.restarts_of, self._step_s = supervisor.restarts, now_s
                 node.close(LAST_RATES_S)
                 self._check_patience(node, now_s)
-            time.sleep(node.rest_s)
+            time.sleep(min(node.rest_s, tick_s))
 
     def _check_patience(self, node: Observer, now_s: float) -> None:
         """Wait for steps that are due, and for nodes that are started here; others may take their time."""
         if not self.is_simulated and self._status is not None:
             return  # the bridge itself sees to it that the mission ends; a pilot may take his time
-        patience_s = SILENCE_S + pace.period_s(self.scenario, self.options.pace)
+        patience_s = SILENCE_S + pace.period_s(self.scenario, self.config.factor)
         if now_s - self._step_s <= patience_s:
             return
         if node.mission is not None:
@@ -157,24 +229,24 @@ class Flight:
         """Tell which nodes did not end as they should; 1 if that spoilt anything: the recorder's bag."""
         odd = {name: code for name, code in statuses.items() if code not in (0, -signal.SIGTERM)}
         for name, code in odd.items():
-            self.display.error(f"node {name} ended with {code} when it was asked to stop")
+            self._error(f"node {name} ended with {code} when it was asked to stop")
         return int("recorder" in odd)
 
     def _hear_the_rest(self, executor: DirectExecutor) -> None:
         """Handle what the nodes said while they were stopped: how a mission ends that was broken off."""
-        if len(self.summaries) < self.options.missions:
+        if len(self.summaries) < self.config.missions:
             deadline_s = time.monotonic() + REST_S
             try:
                 executor.spin(lambda: time.monotonic() > deadline_s, REST_QUIET_S)
             except NodeError as error:
-                self.display.error(str(error))
+                self._error(str(error))
 
     def _account_for_all(self, node: Observer) -> None:
         """Every mission that was to be flown has its end: those without one were aborted."""
         node.close()
         flown = len(self.summaries)
-        if flown < self.options.missions:
-            not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.options.seed + flown)
+        if flown < self.config.missions:
+            not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.config.seed + flown)
             now = node.mission or not_begun
             now = now if now.mission == flown else not_begun
             status = self._status
@@ -188,10 +260,12 @@ class Flight:
         """Make a whole bag of one whose recorder did not close it; 1 if that cannot be."""
         if self.bag is None or not self.bag.is_dir() or (self.bag / "metadata.yaml").is_file():
             return 0
+        from uav_dc_ros.bags.mend import mend  # brings what reads bags, for the few that must be mended
+
         try:
             mended = mend(self.bag)
         except BagError as error:
-            self.display.error(str(error))
+            self._error(str(error))
             return 1
         self.display.note(f"the recorder did not close its bag: {mended}")
         return 0
@@ -199,7 +273,7 @@ class Flight:
     def _peers(self) -> list[str]:
         """Nodes that a mission waits for, on whichever host they run."""
         peers = [row.name for row in self.rows.values() if row.needed]
-        if self.options.no_record:
+        if not self.config.record:
             peers.remove("recorder")
         if self.is_simulated:
             peers.remove("bridge")
@@ -207,23 +281,23 @@ class Flight:
 
     def _parameters(self, folder: Path) -> dict[str, dict[str, object]]:
         """ROS parameters of the nodes to start."""
-        options = self.options
-        scenario = options.scenario
+        config = self.config
+        scenario = str(config.scenario)
         if scenario not in scenarios.names():
             scenario = str(Path(scenario).absolute())
         given: dict[str, object] = {
             "scenario": scenario,
             "policy": str(self.policy.folder.absolute()),
-            "seed": options.seed,
-            "missions": options.missions,
-            "pace": pace.text(options.pace),
+            "seed": config.seed,
+            "missions": config.missions,
+            "pace": pace.text(config.factor),
             "bag": str(self.bag),
-            "vehicle": options.vehicle,
-            "connect": options.connect or "",
-            "system": options.system or 0,
-            "arm": options.arm,
-            "datum": options.datum or "",
-            **({} if options.live is None else {"port": options.live}),
+            "vehicle": config.vehicle,
+            "connect": config.connect or "",
+            "system": config.system or 0,
+            "arm": config.arm,
+            "datum": config.datum or "",
+            **({} if config.live is None else {"port": config.live}),
         }
         started = {}
         for name in self.nodes:
@@ -241,8 +315,16 @@ class Flight:
             }
         return started
 
-    def _interrupt(self, *_: object) -> None:
-        self._interrupted = True
+    def interrupt(self, *_: object) -> None:
+        """Have the run end soon; a signal handler, too."""
+        self.interrupted = True
+
+    def _note(self, text: str) -> None:
+        self.display.note(text)
+
+    def _error(self, text: str) -> None:
+        self.errors.append(text)
+        self.display.error(text)
 
     def _on_status(self, status: Mission) -> None:
         self._status = status
@@ -255,17 +337,17 @@ class Flight:
     def _on_end(self, mission: MissionSoFar, outcome: Phase) -> None:
         bag = None if self.bag is None else str(self.bag)
         self._aborted |= outcome is Phase.ABORTED
-        if outcome is Phase.ABORTED and not (self._why or self._interrupted):
+        if outcome is Phase.ABORTED and not (self._why or self.interrupted):
             why = mission.reason or "the vehicle gave no reason"
-            self.display.error(f"mission {mission.mission} was aborted at step {mission.step}: {why}")
+            self._error(f"mission {mission.mission} was aborted at step {mission.step}: {why}")
         self.summaries.append(summary(mission, outcome, self.scenario, self.policy.name, bag))
 
     def _tell(self) -> None:
         """Write the summary where it was asked for, and print it."""
         if self.bag is not None and not self.bag.is_dir():  # the recorder never came so far
             self.summaries = [msgspec.structs.replace(mission, bag=None) for mission in self.summaries]
-        if self.options.summary is not None:
-            told = self.summaries[0] if self.options.missions == 1 else self.summaries
+        if self.config.summary is not None:
+            told = self.summaries[0] if self.config.missions == 1 else self.summaries
             text = msgspec.json.format(msgspec.json.encode(told), indent=2)
-            files.write(self.options.summary, text + b"\n")
+            files.write(Path(self.config.summary), text + b"\n")
         self.display.summary(self.summaries)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes import control, environment
-from uav_dc_ros.nodes.control import REPORTS, SUPERVISED, NodeReport
+from uav_dc_ros.nodes.control import FINALIZED, REPORTS, SUPERVISED, NodeReport
 
 READ_MAX = 1 << 16  # bytes; no pipe holds more
 
@@ -130,6 +130,13 @@ class NodeProcess:
     def ended(self) -> bool:
         """Has the process ended."""
         return self.process.poll() is not None
+
+    @property
+    def is_silent(self) -> bool:
+        """Have all its nodes said their last, or has the process ended."""
+        self.watch(0.0)
+        states = {report.state for report in self.reports.values()}
+        return states == {FINALIZED} or self.ended
 
     def ask_to_stop(self) -> None:
         """Send SIGTERM: unlike SIGINT it ends a Python that still starts without a traceback."""

@@ -12,6 +12,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.context import Context
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -30,6 +31,7 @@ class ManagedNode(LifecycleNode):
     Args:
         name: of its row.
         overrides: values of parameters, over those of the command line.
+        context: of ROS; None: the process's own.
 
     Raises:
         ParameterError: a value that cannot be, or a parameter that the node does not have.
@@ -40,9 +42,11 @@ class ManagedNode(LifecycleNode):
         failure: why the last transition was refused.
     """
 
-    def __init__(self, name: str, overrides: Sequence[rclpy.Parameter] = ()) -> None:
+    def __init__(
+        self, name: str, overrides: Sequence[rclpy.Parameter] = (), context: Context | None = None
+    ) -> None:
         try:
-            super().__init__(name, parameter_overrides=list(overrides))
+            super().__init__(name, parameter_overrides=list(overrides), context=context)
         except InvalidParameterTypeException as error:  # of a parameter that rclpy declares itself
             raise ParameterError(str(error)) from None
         self.row = NODES[name]

@@ -6,8 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from uav_dc_ros.bags import definitions
-
 NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 _BASIC = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}  # IDL's: .msg's
 _SEPARATOR = "=" * 80
@@ -42,6 +40,8 @@ def definition(type: str) -> bytes:
     Raises:
         LookupError: it, or a type inside it, is not installed.
     """
+    from uav_dc_ros.bags import definitions  # brings rosbags, which only few need, and late
+
     if type in definitions.TYPESTORE.fielddefs:
         return definitions.definition(type)
     texts: dict[str, str] = {}

@@ -9,6 +9,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
@@ -39,6 +40,7 @@ class MissionNode(ManagedNode):
     Args:
         name: of its row.
         overrides: values of parameters, over those of the command line.
+        context: of ROS; None: the process's own.
 
     Messages of another run of missions are counted and dropped. A node that was given no run has, as the
     vehicle, one of its own, and otherwise that of the only publisher which it receives from.
@@ -62,8 +64,10 @@ class MissionNode(ManagedNode):
     drains = False
     rest_s = 0.0
 
-    def __init__(self, name: str, overrides: Sequence[rclpy.Parameter] = ()) -> None:
-        super().__init__(name, overrides)
+    def __init__(
+        self, name: str, overrides: Sequence[rclpy.Parameter] = (), context: Context | None = None
+    ) -> None:
+        super().__init__(name, overrides, context)
         self.meter = Meter()
         self.is_supervised = SUPERVISED in os.environ
         self.restarts = int(os.environ.get(SUPERVISED) or 0)
@@ -81,6 +85,9 @@ class MissionNode(ManagedNode):
         self._diagnostics_timer: Any = None
         self._seen_incompatible: set[tuple[str, str, str]] = set()  # at the last look: topic, peer, reason
         self._told_incompatible: set[tuple[str, str]] = set()
+
+    def prepare(self) -> None:
+        """Import what configuring needs, while the node waits to be configured: not every node has any."""
 
     # What the life cycle brings and takes.
 

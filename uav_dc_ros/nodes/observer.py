@@ -5,14 +5,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 import rclpy
+from rclpy.context import Context
 
 from uav_dc_ros import messages, payloads
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
+from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes import rivals
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.pairs import StepPairs
@@ -21,40 +22,6 @@ ALONE_S = 1.0  # nobody else was found for so long, before any node of this miss
 LOOK_S = 0.1  # for others, until this mission has begun
 LOOK_LATER_S = 1.0  # for others, afterwards
 TELL_S = 3.0  # both who publishes and for which run are told, if they are known within this time
-
-
-class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """One mission, as `--summary` writes it.
-
-    Attributes:
-        scenario, policy: names.
-        seed: seed of the mission's users.
-        outcome: `landed`, `timeout` or `aborted`.
-        steps: steps flown.
-        steps_not_reached: of them, those whose cell a real vehicle did not reach.
-        users_collected, users_total: users.
-        data_bits: data collected from all users, bit.
-        sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
-        distance_m: length of the path flown, metres.
-        reward: r^t at the end (eq. 7), as `evaluate` and the policies' cards have it.
-        reason: how a real vehicle came to its end, or why a mission was aborted, in words; else empty.
-        bag: folder of the bag, or null.
-    """
-
-    scenario: str
-    policy: str
-    seed: int
-    outcome: messages.Phase
-    steps: int
-    steps_not_reached: int
-    users_collected: int
-    users_total: int
-    data_bits: float
-    sum_rate_bps: float
-    distance_m: float
-    reward: float
-    reason: str
-    bag: str | None
 
 
 @dataclass(kw_only=True)
@@ -133,6 +100,7 @@ class Observer(MissionNode):
         on_step: called after each step.
         on_end: called when a mission has come to its end, with how.
         on_note: called with what the user should know.
+        context: of ROS; None: the process's own.
 
     Attributes:
         is_alone: was nobody found who publishes for another mission, for long enough to begin this one.
@@ -152,9 +120,11 @@ class Observer(MissionNode):
         on_step: Callable[[MissionSoFar], None],
         on_end: Callable[[MissionSoFar, messages.Phase], None],
         on_note: Callable[[str], None],
+        context: Context | None = None,
     ) -> None:
         given = {"peers": peers, "run": run}
-        super().__init__("observer", [rclpy.Parameter(name, value=value) for name, value in given.items()])
+        overrides = [rclpy.Parameter(name, value=value) for name, value in given.items()]
+        super().__init__("observer", overrides, context)
         self.scenario = scenario
         self.seed = seed
         self.mission: MissionSoFar | None = None

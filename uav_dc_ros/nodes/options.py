@@ -1,6 +1,6 @@
 """Options of run_all that are looked at together, or need this machine: checked before anything starts."""
 
-import argparse
+import contextlib
 import os
 from datetime import datetime
 from pathlib import Path
@@ -11,8 +11,8 @@ from uav_dc_ros import files
 from uav_dc_ros.core import pace
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, UavDcError
-from uav_dc_ros.nodes import datums, vehicles
 from uav_dc_ros.nodes.table import COMPOSABLE, NODES
+from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
 # Parameters that are options of run_all.
@@ -31,58 +31,59 @@ OPTIONS = (
 )
 
 
-def nodes(options: argparse.Namespace) -> list[str]:
+def nodes(config: RunConfig) -> list[str]:
     """Names of the nodes to start here.
 
     Raises:
         ParameterError: a node that does not exist, or contradicts another option.
     """
     known = [row.name for row in NODES.values() if row.process]
-    wanted = options.nodes
-    if wanted is None:
+    wanted = list(config.nodes or ())
+    if config.nodes is None:
         wanted = [name for name in known if not NODES[name].on_request]
-        if options.vehicle != SIMULATED:
+        if config.vehicle != SIMULATED:
             wanted.append("bridge")
-        if options.no_record:
+        if not config.record:
             wanted.remove("recorder")
     for name in wanted:
         if name not in known:
             raise ParameterError(f"--nodes: {name!r}; expected some of {', '.join(known)}")
-    if "bridge" in wanted and options.vehicle == SIMULATED:
+    if "bridge" in wanted and config.vehicle == SIMULATED:
         raise ParameterError(f"--nodes: 'bridge'; expected it with --vehicle {', '.join(VEHICLES)} only")
-    if options.live is not None and "live_view" not in wanted:
+    if config.live is not None and "live_view" not in wanted:
         wanted = [*wanted, "live_view"]
-    if "recorder" in wanted and options.no_record:
+    if "recorder" in wanted and not config.record:
         raise ParameterError("--nodes: 'recorder', with --no-record; expected one or the other")
-    if "recorder" not in wanted and options.bag is not None:
-        raise ParameterError(f"--bag {options.bag}: no recorder is started here; expected it among --nodes")
+    if "recorder" not in wanted and config.bag is not None:
+        raise ParameterError(f"--bag {config.bag}: no recorder is started here; expected it among --nodes")
     return [name for name in known if name in wanted]
 
 
-def together(options: argparse.Namespace, nodes: list[str]) -> list[str]:
+def together(config: RunConfig, nodes: list[str]) -> list[str]:
     """Names of the nodes that share a process: in lockstep, unless told, those that wait for one another.
 
     Raises:
         ParameterError: it is asked for, and there are no two such nodes.
     """
-    if not (options.pace is None if options.compose is None else options.compose):
+    if not (config.factor is None if config.compose is None else config.compose):
         return []
     found = [name for name in nodes if name in COMPOSABLE]
-    if options.compose and len(found) < 2:
+    if config.compose and len(found) < 2:
         able = ", ".join(COMPOSABLE)
         raise ParameterError(f"--compose: expected two of {able} among --nodes {','.join(nodes)}")
     return found
 
 
-def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[str, object]]:
-    """Values of `--set`, checked, by node and parameter.
+def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]]:
+    """Values of the settings (`--set`), checked, by node and parameter.
 
     Raises:
         ParameterError: a node that is not started here, or a parameter or value that cannot be.
     """
     given: dict[str, dict[str, object]] = {}
-    for node, name, text in options.settings:
-        told = f"--set {node}.{name}={text}"
+    for key, setting in config.settings.items():
+        node, _, name = key.partition(".")
+        told = f"--set {key}={setting}"
         if node not in nodes:
             raise ParameterError(f"{told}: expected a node that is started here: {', '.join(nodes)}")
         row = next((row for row in NODES[node].parameters if row.name == name), None)
@@ -91,10 +92,10 @@ def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[st
         if row is None:
             known = ", ".join(row.name for row in NODES[node].parameters if row.name not in OPTIONS)
             raise ParameterError(f"{told}: node {node} has no such parameter; expected some of {known}")
-        try:
-            value = text if isinstance(row.default, str) else msgspec.json.decode(text)
-        except msgspec.DecodeError:
-            value = text
+        value = setting
+        if isinstance(setting, str) and not isinstance(row.default, str):
+            with contextlib.suppress(msgspec.DecodeError):
+                value = msgspec.json.decode(setting)
         try:
             row.value(value)
         except ParameterError as error:
@@ -103,28 +104,30 @@ def settings(options: argparse.Namespace, nodes: list[str]) -> dict[str, dict[st
     return given
 
 
-def check_vehicle(options: argparse.Namespace, nodes: list[str], scenario: Scenario) -> None:
+def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> None:
     """Refuse options that do not go together, and a way to the vehicle that this machine does not have.
 
     Raises:
         UavDcError: what was wrong.
     """
-    simulated = options.vehicle == SIMULATED
+    simulated = config.vehicle == SIMULATED
     for name in ("connect", "system", "arm", "datum"):
-        value = getattr(options, name)
+        value = getattr(config, name)
         if value and simulated:
             raise ParameterError(f"--{name}: expected --vehicle {', '.join(VEHICLES)} with it")
         if value and "bridge" not in nodes:
             raise ParameterError(f"--{name}: expected the node 'bridge' among --nodes")
     if simulated:
         return
-    if options.pace != pace.WATCHABLE:
-        raise ParameterError(f"--pace: expected none with --vehicle {options.vehicle}, which has its own")
-    if options.missions != 1:
-        raise ParameterError(f"--missions {options.missions}: expected 1 with --vehicle {options.vehicle}")
+    if config.pace != pace.WATCHABLE:
+        raise ParameterError(f"--pace: expected none with --vehicle {config.vehicle}, which has its own")
+    if config.missions != 1:
+        raise ParameterError(f"--missions {config.missions}: expected 1 with --vehicle {config.vehicle}")
     if "bridge" in nodes:
-        datums.parse(options.datum or "", scenario, options.vehicle, arm=options.arm)
-        vehicles.check(options.vehicle, options.connect or "", options.system or 0, options.arm)
+        from uav_dc_ros.nodes import datums, vehicles  # a simulated run needs no way to an autopilot
+
+        datums.parse(config.datum or "", scenario, config.vehicle, arm=config.arm)
+        vehicles.check(config.vehicle, config.connect or "", config.system or 0, config.arm)
 
 
 def check_writable(summary: Path, bag: Path | None) -> None:

@@ -7,20 +7,23 @@ What nobody can count: the last messages of a best-effort publisher, if none com
 published before a topic was found, a fifth of a second at most, unless it is latched.
 """
 
+import importlib
 import json
 import shutil
 import time
 from collections.abc import Mapping, Set
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
-from uav_dc_ros.nodes import message_types, qos, recorded_qos
+from uav_dc_ros.nodes import message_types, qos
 from uav_dc_ros.nodes.hearing import Hearing
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.topics import TOPICS, Topic
+
+if TYPE_CHECKING:  # what writes bags is slow to import: see `prepare`
+    from uav_dc_ros.bags.write import BagWriter
 
 LOOK_S = 0.2  # for new topics
 SYNC_S = 0.5  # what a kill takes at most is what came since, and what waits to be handled
@@ -61,8 +64,15 @@ class BagNode(MissionNode):
 
     # The life cycle.
 
+    def prepare(self) -> None:
+        """Import what writes bags."""
+        importlib.import_module("uav_dc_ros.bags.write")
+        importlib.import_module("uav_dc_ros.nodes.recorded_qos")
+
     def configure(self) -> None:
         """Make the bag."""
+        from uav_dc_ros.bags.write import BagWriter
+
         given = self.values
         if not given["bag"]:
             raise ParameterError("bag: ''; expected the folder of a new bag (-p bag:=FOLDER)")
@@ -184,6 +194,8 @@ class BagNode(MissionNode):
             BagError: earlier parts of the bag have it with another type; or the disk is full, or gone.
             LookupError: a type inside its type is not installed.
         """
+        from uav_dc_ros.nodes import recorded_qos
+
         ends = [end for end in self.get_publishers_info_by_topic(name) if end.topic_type == type]
         profiles = [end.qos_profile for end in ends] or ([] if topic is None else [qos.offered(topic)])
         depth = None if topic is None else topic.depth

@@ -134,6 +134,8 @@ def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> 
         stopper = Stopper(executor.wake)
         reporter = control.Reporter(nodes)
         reporter.report()
+        for node in nodes:
+            node.prepare()
         nodes[0].create_timer(control.PERIOD_S, reporter.report, clock=nodes[0].steady)
         if _begin([node for node in nodes if node.values["autostart"]]):
             gc.freeze()  # what is there by now stays: no need to look at it again and again
@@ -190,6 +192,7 @@ def _run(
     finally:
         for node in reversed(nodes):
             _shut_down(node)
+        reporter.report()  # all was said: see Supervisor.stop
     return 0 if all(node.failure is None for node in nodes) else GAVE_UP
 
 

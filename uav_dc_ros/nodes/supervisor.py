@@ -18,6 +18,7 @@ BACK_OFF_S = 0.2  # before the first restart; twice as long before each further 
 BEGIN_S = 25.0  # a process may be silent for so long while it starts, or its nodes configure and activate
 PASSED_MAX_S = 0.5  # from one look at reports to the next: more was a pause of this process itself
 STOP_S = 10.0  # for a node to end after it was asked to: a bridge waits for its vehicle to obey
+STOP_LOOK_S = 0.002  # from one look at a node that was asked to stop to the next
 UP = ("unconfigured", "inactive", "active")  # the way up; each transition leads to the next
 TRANSITIONS = {"unconfigured": CONFIGURE, "inactive": ACTIVATE}
 
@@ -79,6 +80,9 @@ class Supervisor:
         folder: for files of the processes.
         on_line: called, from threads, with each line that a node prints.
         on_note: called with what the user should know.
+
+    Attributes:
+        brought_up: were all nodes active at once?
     """
 
     def __init__(
@@ -94,7 +98,7 @@ class Supervisor:
         self._together, self._folder = together, folder
         self._on_line, self._on_note = on_line, on_note
         self.nodes = [Supervised(name, values) for name, values in parameters.items()]
-        self._brought_up = False
+        self.brought_up = False
         self._ticked_s = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -153,10 +157,10 @@ class Supervisor:
                 self._bury(node.process)
             elif may_begin and node.state != "active":
                 try:
-                    node.bring_up(self._brought_up or self._lower_ranks_are_active(node))
+                    node.bring_up(self.brought_up or self._lower_ranks_are_active(node))
                 except NodeError as error:
                     self._lose(node, str(error))
-        self._brought_up = self._brought_up or all(node.state == "active" for node in self.nodes)
+        self.brought_up = self.brought_up or all(node.state == "active" for node in self.nodes)
 
     def _watch_reports(self) -> None:
         """Kill processes that hang: their ends are seen as any other."""
@@ -213,7 +217,7 @@ class Supervisor:
         Raises:
             NodeError: no mission can be flown without it.
         """
-        if node.row.needed or (node.row.on_request and not self._brought_up):
+        if node.row.needed or (node.row.on_request and not self.brought_up):
             raise NodeError(why)
         self._on_note(f"{why}; the mission goes on without it")
         if node.process is not None:
@@ -221,16 +225,31 @@ class Supervisor:
             node.process.wait(time.monotonic() + STOP_S)
         self.nodes.remove(node)
 
-    def stop(self) -> dict[str, int]:
-        """Stop all nodes, higher ranks of the node table first. Returns their exit statuses."""
-        statuses = {}
+    def stop(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, int]:
+        """Stop all nodes, higher ranks of the node table first. Returns their exit statuses.
+
+        A rank is asked to stop when those above it have said their last, so that the recorder hears all of
+        it. The processes then end side by side.
+
+        Args:
+            meanwhile: called when all were asked to stop, before their ends are waited for.
+        """
+        statuses: dict[str, int] = {}
+        asked: dict[NodeProcess, float] = {}  # and until when each may take its time, monotonic clock
         running = {node.row.name: node.process for node in self.nodes if node.process is not None}
         for rank in sorted({NODES[name].rank for name in running}, reverse=True):
-            group = [process for name, process in running.items() if NODES[name].rank == rank]
-            for process in group:
+            group = {process for name, process in running.items() if NODES[name].rank == rank}
+            for process in group - asked.keys():
                 process.ask_to_stop()
-            deadline_s = time.monotonic() + STOP_S
+                asked[process] = time.monotonic() + STOP_S
             for process in group:
-                statuses[process.name] = process.wait(deadline_s)
+                while not process.is_silent:
+                    if time.monotonic() > asked[process]:
+                        process.kill("did not stop")
+                        break
+                    time.sleep(STOP_LOOK_S)
+        meanwhile()
+        for process, deadline_s in asked.items():
+            statuses[process.name] = process.wait(deadline_s)
         self.nodes = []
         return statuses

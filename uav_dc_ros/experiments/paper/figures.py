@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from uav_dc_ros import files
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.bootstrap import interval
-from uav_dc_ros.env.render import PATH_COLOURS, Track, picture
+from uav_dc_ros.env.render import PATH_COLOURS, picture
+from uav_dc_ros.env.track import Track
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper import style
 from uav_dc_ros.experiments.paper.evidence import SMOOTHING, Evidence, name, smooth

@@ -8,7 +8,7 @@ import msgspec
 
 from uav_dc_ros import files
 from uav_dc_ros.core.bootstrap import Interval
-from uav_dc_ros.env.render import Track
+from uav_dc_ros.env.track import Track
 from uav_dc_ros.experiments.paper.claims import Finding, check, count
 from uav_dc_ros.experiments.paper.evidence import RULES, Part, Table, Verdict
 from uav_dc_ros.experiments.paper.figures import draw, drawable

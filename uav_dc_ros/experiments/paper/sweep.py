@@ -15,7 +15,7 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.batch import observe
-from uav_dc_ros.env.render import Track
+from uav_dc_ros.env.track import Track
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments import shards
 from uav_dc_ros.experiments.paper.plan import FIGURES

@@ -1,0 +1,47 @@
+"""Public functions that put several parts together; `uav_dc_ros` re-exports them."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from uav_dc_ros.agents.policy import Policy
+from uav_dc_ros.bags.read import BagReader
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.experiments.evaluate import TEST_SEEDS, steer
+from uav_dc_ros.experiments.fly import Act, Missions, fly
+from uav_dc_ros.recordings import steps
+from uav_dc_ros.recordings.step import RecordedStep
+
+
+def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Missions:
+    """Fly one mission per seed, side by side in numpy, without ROS.
+
+    Args:
+        act: a policy, or a function from the state of the missions (`core.world.State`, `[S, ...]`) to an
+            action for each, integers `[S]`.
+        scenario: the world.
+        seeds: of the users, S of them.
+
+    Returns:
+        How the missions went, `[S]` each.
+
+    Raises:
+        PolicyError: the policy does not fit the scenario.
+    """
+    return fly(scenario, steer(act, scenario) if isinstance(act, Policy) else act, seeds)
+
+
+def read_steps(bag: str | Path, namespace: str | None = None) -> Iterator[RecordedStep]:
+    """The steps of the missions in a bag, in order; a few are in memory at a time.
+
+    Args:
+        bag: folder of a bag, or a file of one.
+        namespace: of the missions; None: the only one in the bag.
+
+    Raises:
+        BagError: the bag cannot be read, or does not hold such missions.
+        ScenarioError: the bag's own scenario cannot be read.
+    """
+    with BagReader(Path(bag)) as reader:
+        name = steps.namespace(reader, namespace)
+        step_s = steps.scenario(reader, name).mission.step_s
+        yield from steps.Steps(reader, name, round(step_s * 1e9))

@@ -1,0 +1,33 @@
+"""A single mission, step by step, as pictures need it. Needs numpy only."""
+
+import numpy as np
+
+from uav_dc_ros.core import world
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario
+
+
+class Track:
+    """What a picture needs of one mission, step by step.
+
+    Attributes:
+        scenario: the world's values.
+        cells: the UAV's cell after each step, the start first.
+        n_collected: users collected after each step.
+        sum_rate_bps: sum-rate of each step, 0 for the start.
+        state: the world now.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.cells: list[Array] = []
+        self.n_collected: list[int] = []
+        self.sum_rate_bps: list[float] = []
+        self.state: world.State | None = None
+
+    def add(self, state: world.State, link: world.Link | None = None) -> None:
+        """Appends the start, or the next step, of one mission without batch dimensions."""
+        self.cells.append(state.cell)
+        self.n_collected.append(int(np.sum(state.collected)))
+        self.sum_rate_bps.append(float(link.sum_rate_bps) if link else 0.0)
+        self.state = state

@@ -1,0 +1,78 @@
+"""List, show and check scenarios.
+
+python -m uav_dc_ros.scenario check my_field.toml
+"""
+
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from uav_dc_ros import cli
+
+if TYPE_CHECKING:
+    from uav_dc_ros.core.scenario import Scenario
+
+PROG = "python -m uav_dc_ros.scenario"
+
+
+def parser() -> cli.Parser:
+    """The command line."""
+    options = cli.Parser(prog=PROG, description="List, show and check scenarios.")
+    verbs = options.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs.add_parser("list", help="the shipped scenarios", description="The shipped scenarios.")
+    show = verbs.add_parser(
+        "show", help="a scenario as TOML, to begin one of your own with", description="A scenario as TOML."
+    )
+    show.add_argument("scenario", metavar="NAME|FILE")
+    check = verbs.add_parser(
+        "check", help="tell whether a file can be flown", description="Tell whether a file can be flown."
+    )
+    check.add_argument("scenario", metavar="FILE|NAME")
+    return options
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command, and exit."""
+
+    def command() -> int:
+        options = parser().parse_args(arguments)
+        from uav_dc_ros import scenarios
+        from uav_dc_ros.agents import policy as policies
+        from uav_dc_ros.errors import PolicyError
+
+        if options.verb == "list":
+            for name in scenarios.names():
+                print(f"{name}: {_told(scenarios.load(name))}")
+            return 0
+        scenario = scenarios.load(options.scenario)
+        if options.verb == "show":
+            shipped = options.scenario in scenarios.names()
+            text = files(scenarios) / f"{options.scenario}.toml" if shipped else Path(options.scenario)
+            print(text.read_text("utf-8"), end="")
+            return 0
+        print(f"{options.scenario}: {_told(scenario)}")
+        fitting = []
+        for name in policies.names():
+            try:
+                policies.load(name).check(scenario)
+            except PolicyError:
+                continue
+            fitting.append(name)
+        print(f"shipped policies that fit: {', '.join(fitting) or '(none): train one'}")
+        return 0
+
+    cli.run(command, PROG)
+
+
+def _told(scenario: "Scenario") -> str:
+    """A scenario in a line."""
+    grid, mission = scenario.grid, scenario.mission
+    return (
+        f"{scenario.n_users} users in {scenario.n_clusters} clusters, "
+        f"{grid.n_x} x {grid.n_y} x {grid.n_z} cells of {grid.cell_m:g} m, "
+        f"{mission.max_steps} steps of {mission.step_s:g} s, fingerprint {scenario.fingerprint}"
+    )
+
+
+if __name__ == "__main__":
+    main()
