@@ -1,7 +1,6 @@
 """The companion guide's commands, parameters, figures and units are those of the code."""
 
 import configparser
-import importlib
 import itertools
 import json
 import re
@@ -14,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ruamel.yaml import YAML
 
-from uav_dc_ros import cli, resources, scenarios
+from tests.doc_commands import parameter, parsed
+from uav_dc_ros import resources, scenarios
 from uav_dc_ros.autopilot import beat, fence, systems
 from uav_dc_ros.autopilot.links import Address
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes import datums, lease, options, supervisor
-from uav_dc_ros.nodes.parameters import EVERY
 from uav_dc_ros.nodes.table import NODES
 
 ROOT = Path(__file__).parents[1]
@@ -44,10 +42,6 @@ KEYS = {
         *("SystemCallArchitectures", "LimitRTPRIO"),
     },
 }
-
-
-class Parsed(BaseException):
-    """A command line was parsed; what it would do is not done."""
 
 
 def unit(path: Path) -> dict[str, dict[str, list[str]]]:
@@ -84,27 +78,6 @@ def commands() -> Iterator[list[str]]:
 COMMANDS = list(commands())
 RUNS = [words[1:] for words in COMMANDS if words[0] == "uav_dc_ros.run_all"]
 NODES_ALONE = [words for words in COMMANDS if words[0].startswith("uav_dc_ros.nodes.")]
-
-
-def parameter(node: str, assignment: str) -> Any:
-    """The value that a node would use of `NAME:=VALUE`."""
-    name, _, text = assignment.partition(":=")
-    row = {row.name: row for row in (*NODES[node].parameters, *EVERY)}[name]
-    return row.value(YAML(typ="safe", pure=True).load(text))
-
-
-def parsed(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> Any:
-    """What the real parser of a command makes of its options."""
-    found = []
-
-    def parse_args(self: cli.Parser, *arguments: Any) -> None:
-        found.append(super(cli.Parser, self).parse_args(*arguments))
-        raise Parsed
-
-    monkeypatch.setattr(cli.Parser, "parse_args", parse_args)
-    with pytest.raises(Parsed):
-        importlib.import_module(words[0]).main(words[1:])
-    return found[0]
 
 
 def test_the_guide_has_commands_of_every_kind() -> None:
@@ -163,7 +136,7 @@ def test_every_link_leads_somewhere() -> None:
     links = re.findall(r"\]\(([^)]+)\)", GUIDE)
     assert len(links) >= 4
     for link in links:
-        assert (ROOT / "docs" / link).exists(), link
+        assert (ROOT / "docs" / link.partition("#")[0]).exists(), link
 
 
 def test_the_table_of_parameters_is_the_bridge_s() -> None:

@@ -16,9 +16,9 @@ DESCRIPTION = "Record, play, recover, verify and explain bags."
 VERBS = {
     "record": ("uav_dc_ros.nodes.record", "record topics into a new bag"),
     "play": ("uav_dc_ros.nodes.play", "publish a bag's messages again, with their timing and QoS"),
-    "info": ("uav_dc_ros.recordings.info", "tell what a bag holds, and whether it is complete"),
+    "info": ("uav_dc_ros.recordings.info", "show what a bag holds, and whether it is complete"),
     "recover": ("uav_dc_ros.bags.recover", "make a whole bag of what a killed recorder left"),
-    "verify": ("uav_dc_ros.recordings.verify", "recompute everything that a bag tells of its missions"),
+    "verify": ("uav_dc_ros.recordings.verify", "recompute everything that a bag holds of its missions"),
     "report": (
         "uav_dc_ros.recordings.report",
         "write a page about missions, or compare several bags",
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 def _help() -> str:
     verbs = "\n".join(f"  {verb:<8} {does}" for verb, (_, does) in VERBS.items())
-    return f"usage: {PROG} VERB ...\n\n{DESCRIPTION}\n\n{verbs}\n\n{PROG} VERB --help tells its options."
+    return f"usage: {PROG} VERB ...\n\n{DESCRIPTION}\n\n{verbs}\n\n{PROG} VERB --help lists its options."
 
 
 if __name__ == "__main__":

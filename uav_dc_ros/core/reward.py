@@ -64,7 +64,8 @@ def total(
     Args:
         data_bits: data collected up to now, bit, `[..., U]` with U = M K users.
         r_plus: `[...]`.
-        beta, zeta: weights, numbers or `[...]`.
+        beta: weight of the data, a number or `[...]`.
+        zeta: weight of the trajectory, a number or `[...]`.
         data_scale_bits: data of a user that counts as 1, bit, a number or `[...]`.
 
     Returns:

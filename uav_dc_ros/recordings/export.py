@@ -37,14 +37,14 @@ Tables go into a new folder, a file each, one observation a row:
   steps     a row per step: pose, cell, phase, action, sum-rate, data, rewards
   users     a row per user and step: position, SINR (linear), rate, data, served, collected
   missions  a row per mission: seed, scenario, policy, outcome, totals
-  phases    of a real vehicle only: a row per phase it told, with the reason and the time
+  phases    of a real vehicle only: a row per phase, with its reason and time
 Of a real vehicle, steps also have the reason of their phase, and how long the move to them took; missions
 have what flew, the reason of their end, and how many steps were flown without reaching their cell.
 Units are in the names of columns. Rewards are computed anew from recorded cells and data.
 
 Transitions go into a new .npz file, which numpy.load reads: observation, next_observation (float32 [T, D]),
 action (int64 [T]), reward (float64 [T]), terminated, truncated (bool [T]); flight, mission, step (int64 [T]),
-which tell where each comes from; and metadata, a JSON text. The trainer reads bags themselves:
+which name the source of each; and metadata, a JSON text. The trainer reads bags themselves:
 python -m uav_dc_ros.train --from-bags BAG.
 
 Tables: {", ".join(ALL)}.
@@ -63,14 +63,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR|FILE",
         help="new folder; for transitions a new .npz file",
     )
-    add("--format", choices=get_args(Format), help="of tables; parquet unless told, which needs pyarrow")
-    add("--tables", type=_tables, metavar="NAME,...", help="which; all unless told")
+    add("--format", choices=get_args(Format), help="of tables (default: parquet, which needs pyarrow)")
+    add("--tables", type=_tables, metavar="NAME,...", help="which tables (default: all)")
     add("--transitions", action="store_true", help="write transitions (s, a, r, s', terminated), no tables")
-    add("--observation", choices=get_args(Observation), help="of transitions; mission unless told")
+    add("--observation", choices=get_args(Observation), help="of transitions (default: mission)")
     add(
         "--reward-form", choices=get_args(RewardForm), help="what a step pays, instead of the scenario's form"
     )
-    add("--scenario", metavar="NAME|FILE", help="the world, for a bag that does not tell it")
+    add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the mission, for a bag with several")
 
 

@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="BAG",
         help="bags to put beside the first one; without any, the missions of the first one side by side",
     )
-    parser.add_argument("--scenario", metavar="NAME|FILE", help="the world, where a bag does not tell it")
+    parser.add_argument("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     parser.add_argument("--namespace", metavar="NAME", help="of the missions, where there are several")
 
 

@@ -40,8 +40,8 @@ Poses, and users from the seed, are recomputed for flights of this project's own
 mathematics may differ in the last digit: --tolerance 1e-12 lets that pass, and counts it.
 
 A real vehicle's poses are what it measured itself. Its phases must follow each other as they may, no move may
-be flown twice, and users have the time of a pose; how far it was from the centres of its cells is told, and
-no difference: a step also ends when its time is over.
+be flown twice, and users have the time of a pose; its distance to the centres of its cells is reported and
+is no difference: a step also ends when its time is over.
 """
 
 
@@ -50,14 +50,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
-    add("--policy", metavar="NAME|DIR", help="also tell where this policy would have decided otherwise")
+    add("--policy", metavar="NAME|DIR", help="also show where this policy would have decided otherwise")
     add(
         "--policy-dir",
         type=Path,
         metavar="DIR",
         help="where the policy that flew lies: its folder, or theirs",
     )
-    add("--scenario", metavar="NAME|FILE", help="the world, for a bag that does not tell it")
+    add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the mission, for a bag with several")
     add(
         "--tolerance",
