@@ -13,7 +13,7 @@ from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Limits, Mode, SetMode, TakeOff, Telemetry
 from uav_dc_ros.autopilot.watch import Settings
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.messages import FaultKind, Phase
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
 STEP_S = SCENARIO.mission.step_s
@@ -380,8 +380,12 @@ def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(hold_s: flo
 def test_a_link_that_comes_back_in_time_is_held_through() -> None:
     flight = fly_to_step(5, Settings(arm=True, hold_s=20.0))
     cut(flight, 10.0)
+    assert (flight.bridge.fault_kind, flight.bridge.reason) == (
+        FaultKind.LINK, "link lost: no heartbeat for 3 s",
+    )  # fmt: skip
     flight.until(Phase.LANDED)
-    assert any(reason == "holds: link lost: no heartbeat for 3 s" for _, _, reason in flight.log)
+    assert flight.bridge.fault_kind is None
+    assert any(reason == "goes on after: link lost: no heartbeat for 3 s" for _, _, reason in flight.log)
 
 
 @pytest.mark.parametrize("reports", [True, False])

@@ -142,6 +142,8 @@ class Flight:
             step=bridge.step,
             phase=bridge.phase,
             reason=bridge.reason,
+            held=bridge.fault_kind is not None,
+            fault=bridge.fault_kind,
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
             seed=self.seed,

@@ -24,10 +24,10 @@ from uav_dc_ros.autopilot.hold import Hold
 from uav_dc_ros.autopilot.patience import Patience
 from uav_dc_ros.autopilot.progress import Tracking
 from uav_dc_ros.autopilot.vehicle import Mode, SetMode, TakeOff, Telemetry, Wish
-from uav_dc_ros.autopilot.watch import Fault, FaultKind, Settings, Watch
+from uav_dc_ros.autopilot.watch import Fault, Settings, Watch
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.messages import FaultKind, Phase
 
 __all__ = ["Bridge", "Standing"]
 
@@ -35,6 +35,7 @@ GROUND = (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT)
 FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
 DECIDED = (Phase.READY, Phase.MOVING)  # by a policy
 STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
+POLICY_IS_GONE = "the policy is gone"
 
 
 class Bridge:
@@ -112,6 +113,15 @@ class Bridge:
     def fault(self) -> str | None:
         """What keeps it from going on at the moment; None: nothing."""
         return self._hold.fault.why if self._hold.fault is not None else None
+
+    @property
+    def fault_kind(self) -> FaultKind | None:
+        """The kind of the fault that holds the vehicle; None: nothing holds it."""
+        if self.phase not in STEERED:
+            return None
+        if self._hold.fault is not None:
+            return self._hold.fault.kind
+        return FaultKind.POLICY if self._patience.gone_since is not None else None
 
     @property
     def steps_not_reached(self) -> int:
@@ -274,7 +284,9 @@ class Bridge:
         fault = self._watched.fault(now_s, known) or self._strays(known)
         match self._hold.look(now_s, known, fault):
             case "begins" | "turns":
-                self._change(f"holds: {self.fault}")
+                self._change(str(self.fault))
+            case "passes" if self._patience.gone_since is not None:
+                self._change(POLICY_IS_GONE)
             case "passes":
                 self._change(f"goes on after: {self.reason}")
             case "ends":
@@ -294,7 +306,7 @@ class Bridge:
             self._patience.gone_since = now
             if self.phase is Phase.MOVING and known.position is not None:
                 self.setpoint = known.position
-            self._change("holds: the policy is gone")
+            self._change(POLICY_IS_GONE)
         elif self.policy_is_gone and since is not None and self._patience.is_over(since, now):
             self._give_up(f"the policy has been gone for {self._patience.limit_s:g} s")
         elif not self.policy_is_gone and since is not None:

@@ -5,7 +5,8 @@ import math
 from uav_dc_ros.autopilot.course import Course
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Telemetry
-from uav_dc_ros.autopilot.watch import Fault, FaultKind, Settings
+from uav_dc_ros.autopilot.watch import Fault, Settings
+from uav_dc_ros.messages import FaultKind
 
 NEARER_M = 1.0  # by what a vehicle has to come nearer to count as doing so
 TARGET_M = 1.0  # by what a target that the autopilot reports may differ from the setpoint, beyond tolerance

@@ -288,6 +288,8 @@ class AutopilotBridge(MissionNode):
             step=bridge.step,
             phase=bridge.phase,
             reason=messages.told(waits or bridge.reason),
+            held=bridge.fault_kind is not None,
+            fault=bridge.fault_kind,
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
             steps_not_reached=bridge.steps_not_reached,
@@ -297,10 +299,10 @@ class AutopilotBridge(MissionNode):
         )
         if status != self._told:
             self._told = status
-            self._news.append(f"{status.phase}, step {status.step}: {status.reason}")
+            self._news.append(f"{status.state}, step {status.step}: {status.reason}")
             self.say("mission", status)
             if not self.is_supervised and bridge.phase not in (Phase.READY, Phase.MOVING):
-                self.get_logger().info(f"{status.phase}: {status.reason}")
+                self.get_logger().info(f"{status.state}: {status.reason}")
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """Where the mission and the vehicle stand."""

@@ -115,7 +115,7 @@ class Flights(Book):
             (step.flight, step.mission, step.step)
         )
         self.apart.add(step, self._scenario)
-        self.holds += sum(told.holds for told in step.told)
+        self.holds += sum(told.held for told in step.told)
         if step.status is not None:
             self.not_reached[step.flight, step.mission] = step.status.steps_not_reached
         found = self._time(step)

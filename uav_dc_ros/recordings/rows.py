@@ -82,6 +82,8 @@ REAL: dict[str, Columns] = {
         "time_s": "float",  # when it was published, since the epoch
         "phase": "text",
         "reason": "text",
+        "held": "bool",  # by a fault
+        "fault": "text",  # its kind
     },
 }
 Rows = Mapping[str, Sequence[Any]]
@@ -242,6 +244,8 @@ def _phases(step: RecordedStep) -> Rows:
         "time_s": [told.publish_ns / 1e9 for told in step.told],
         "phase": [told.phase.value for told in step.told],
         "reason": [told.reason for told in step.told],
+        "held": [told.held for told in step.told],
+        "fault": [told.fault for told in step.told],
     }
 
 

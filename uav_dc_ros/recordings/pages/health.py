@@ -109,7 +109,7 @@ class Health:
             why = f": {flown.reason}" if flown.reason else ""
             self._fault(flown.last_ns, name, f"{told}, after step {flown.steps}{why}")
         for step, word in flown.journey.words if flown.journey else ():
-            if word.holds:
+            if word.held:
                 self._fault(word.log_ns, name, f"step {step}: {word.reason}")
 
     def read(self) -> None:

@@ -108,7 +108,7 @@ class Journey:
                     "step": step,
                     "phase": told.phase.value,
                     "reason": told.reason,
-                    "holds": told.holds,
+                    "held": told.held,
                 }
                 for (step, told), end_ns in zip(self.words, ends_ns, strict=True)
             ],
