@@ -1,11 +1,15 @@
-"""What run_all prints of a real vehicle: each phase of a flight, and of the phases of each step the faults."""
+"""What run_all prints of a real vehicle: each phase of a flight, and of those of each step the faults."""
+
+import io
 
 import msgspec
 import pytest
+from rich.console import Console
 
 from tests.nodes.test_drawing import MISSION, SCENARIO
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.nodes.display import Display
+from uav_dc_ros.nodes.output import Output
 
 FLIGHT = (
     (Phase.TAKEOFF, "takes off", None),
@@ -20,12 +24,14 @@ FLIGHT = (
 )
 
 
-def test_it_prints_what_is_no_daily_work(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_prints_what_is_no_daily_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+    monkeypatch.setattr(Output, "console", lambda self, file: Console(file=out, width=80))
     display = Display(SCENARIO, 1)
     for phase, reason, fault in FLIGHT:
         held = fault is not None
         display.vehicle(msgspec.structs.replace(MISSION, phase=phase, reason=reason, held=held, fault=fault))
-    assert capsys.readouterr().out.splitlines() == [
+    assert out.getvalue().splitlines() == [
         "takeoff: takes off",
         "ready: at the start, cell (0, 0, 0)",
         "moving (held): no heartbeat for 3 s",
