@@ -17,8 +17,10 @@ from typing import IO, Any
 
 import pytest
 
+from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.errors import MessageError
 
+Bridge.is_strict = True  # a phase that cannot follow fails the test; in the air it would end the mission
 MARK = "UAV_DC_TEST"
 ROOT = Path(__file__).parents[1]
 # How long a test waits for what must come, wall time. Only what never comes takes this long: a machine with

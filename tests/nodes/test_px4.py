@@ -713,7 +713,7 @@ class Flight:
     def note(self) -> None:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and self.log[-1][0] is not Phase.MOVING:
-            self.cells.append(bridge.goal)
+            self.cells.append(bridge.course.goal)
         self.log.append((bridge.phase, bridge.step, bridge.reason))
 
     def tick(self) -> None:

@@ -149,7 +149,7 @@ class Flight:
             seed=self.seed,
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
-            steps_not_reached=bridge.steps_not_reached,
+            steps_not_reached=bridge.course.steps_not_reached,
         )
         if status == self._last:
             return  # as the node does
@@ -198,7 +198,7 @@ class Flight:
         self._say("move", messages.Move(mission=0, step=step, action=ACTION_LABELS[action]))
         if bridge.move(step, action) is None:
             self.executed.append(step)
-            goal = bridge.scenario.grid.centre_m(np.asarray(bridge.goal), like=np.zeros(1))
+            goal = bridge.scenario.grid.centre_m(np.asarray(bridge.course.goal), like=np.zeros(1))
             self._say("target", pose(goal.tolist(), self.now_ns))
 
     def _decided(self, status: messages.Mission, rates: messages.Rates) -> Action:

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import messages, scenarios
-from uav_dc_ros.autopilot.bridge import Bridge, Standing
+from uav_dc_ros.autopilot.bridge import Bridge
+from uav_dc_ros.autopilot.course import Standing
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.priority import run_when_due
@@ -292,7 +293,7 @@ class AutopilotBridge(MissionNode):
             fault=bridge.fault_kind,
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
-            steps_not_reached=bridge.steps_not_reached,
+            steps_not_reached=bridge.course.steps_not_reached,
             seed=self.values["seed"],
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,

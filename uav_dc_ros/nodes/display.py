@@ -11,12 +11,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.messages import Mission, Phase
+from uav_dc_ros.messages import Mission
 from uav_dc_ros.nodes.observer import MissionSoFar, Summary
 from uav_dc_ros.nodes.output import Output
+from uav_dc_ros.phases import DECIDED
 
 REFRESH_S = 0.05
-DAILY = (Phase.READY, Phase.MOVING)  # phases of each step
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
 
 
@@ -71,8 +71,8 @@ class Display:
         if not status.reason or (before is not None and told == (before.state, before.reason)):
             return
         self._told = status
-        goes_on = before is not None and before.phase in DAILY and not before.held
-        if status.phase in DAILY and not status.held and goes_on:
+        goes_on = before is not None and before.phase in DECIDED and not before.held
+        if status.phase in DECIDED and not status.held and goes_on:
             return
         self._bar.update(self._task, description=status.phase.value)
         self.console.print(f"{status.state}: {status.reason}", markup=False)

@@ -11,7 +11,8 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.recordings.step import BEFORE_START, RecordedStep
+from uav_dc_ros.phases import BEFORE_START
+from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.tables import Columns
 from uav_dc_ros.topics import SIMULATED
 

@@ -10,11 +10,10 @@ import msgspec
 from uav_dc_ros import messages
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.messages import FaultKind, Mission, Phase
+from uav_dc_ros.phases import BEFORE_START
 
 POSES_KEPT = 64  # of a step
 TOLD_KEPT = 1000  # words of a vehicle on a step: one that waits for hours tells of it again and again
-GROUND = (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT)
-BEFORE_START = (*GROUND, Phase.TAKEOFF)
 
 
 class RecordedPose(NamedTuple):

@@ -20,8 +20,8 @@ from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import BagError, MessageError, ScenarioError
 from uav_dc_ros.messages import Mission
+from uav_dc_ros.phases import GROUND
 from uav_dc_ros.recordings.step import (
-    GROUND,
     POSES_KEPT,
     RecordedPose,
     RecordedStep,

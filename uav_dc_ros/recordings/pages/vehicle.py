@@ -9,7 +9,8 @@ from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.recordings.step import BEFORE_START, RecordedPose, RecordedStep, Told
+from uav_dc_ros.phases import BEFORE_START
+from uav_dc_ros.recordings.step import RecordedPose, RecordedStep, Told
 from uav_dc_ros.recordings.steps import read_pose
 
 WORDS_MAX = 1000  # phases and reasons that are shown of a mission
