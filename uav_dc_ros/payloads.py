@@ -77,12 +77,7 @@ def users_m(payload: messages.Users, scenario: Scenario) -> Array:
     Raises:
         MessageError: other users than the scenario's.
     """
-    if payload.cluster != scenario.user_cluster.tolist():
-        raise MessageError(
-            "layout",
-            f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
-            f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
-        )
+    check(payload, scenario)
     return np.asarray([payload.x_m, payload.y_m], dtype=np.float64).T
 
 
@@ -109,29 +104,34 @@ def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Arra
     Raises:
         MessageError: another number of users than the scenario's.
     """
-    check_users(payload, scenario)
+    check(payload, scenario)
     return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
 
 
-def check_users(payload: messages.Rates, scenario: Scenario) -> None:
-    """Refuse the rates of another scenario's users.
+def check(payload: messages.Payload, scenario: Scenario) -> None:
+    """Refuse a payload of another world.
 
     Raises:
-        MessageError: another number of users than the scenario's.
+        MessageError: a mission with another fingerprint, a cell outside the grid, or more steps than the
+            battery allows; users, or rates of them, that are not the scenario's.
     """
-    if len(payload.data_bits) != scenario.n_users:
-        raise MessageError(
-            "layout",
-            f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
-        )
+    match payload:
+        case messages.Mission():
+            _check_mission(payload, scenario)
+        case messages.Users() if payload.cluster != scenario.user_cluster.tolist():
+            raise MessageError(
+                "layout",
+                f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
+                f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
+            )
+        case messages.Rates() if len(payload.data_bits) != scenario.n_users:
+            raise MessageError(
+                "layout",
+                f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
+            )
 
 
-def check_world(payload: messages.Mission, scenario: Scenario) -> None:
-    """Refuse a mission in another world, or where this one has nothing.
-
-    Raises:
-        MessageError: the fingerprints differ; a cell outside the grid; more steps than the battery allows.
-    """
+def _check_mission(payload: messages.Mission, scenario: Scenario) -> None:
     if payload.fingerprint != scenario.fingerprint:
         raise MessageError(
             "scenario",

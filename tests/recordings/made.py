@@ -70,7 +70,7 @@ def flight(
         phase, link = messages.Phase.READY, None
         while True:
             step = int(state.step)
-            time_ns = round((mission * (max_steps + 1) + step) * scenario.mission.step_s * 1e9)
+            time_ns = scenario.time_ns(mission, step)
             uav_m = scenario.grid.centre_m(state.cell, like=state.users_m)
             if link is None:
                 link = world.measure(scenario, uav_m, state.users_m, state.collected)

@@ -102,7 +102,7 @@ def step_messages(
 ) -> Iterator[tuple[str, bytes]]:
     """Messages of a step, topic and content."""
     step = int(state.step)
-    stamp_ns = round((mission * (scenario.mission.max_steps + 1) + step) * scenario.mission.step_s * 1e9)
+    stamp_ns = scenario.time_ns(mission, step)
     _, _, landed = world.ends(scenario, state.step, state.cell)
     over = messages.Phase.LANDED if landed else messages.Phase.TIMEOUT
     said: dict[str, messages.Payload] = {

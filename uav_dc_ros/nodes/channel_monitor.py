@@ -31,7 +31,6 @@ class ChannelMonitor(MissionNode):
         self.scenario = scenarios.load(self.values["scenario"])
         self.message_bytes = {"rates": USER_BYTES * self.scenario.n_users}
         self.journal = Journal(self.values["journal"])
-        self._step_ns = round(self.scenario.mission.step_s * 1e9)
         self._said: messages.Rates | None = None
         self._forget()
         self._restore()
@@ -94,7 +93,9 @@ class ChannelMonitor(MissionNode):
         for waiting in tuple(self._users):
             users, users_m, published_ns = waiting
             begun_ns = users.stamp_ns
-            poses = [heard for heard in self._poses if 0 <= heard[0].stamp_ns - begun_ns < self._step_ns]
+            poses = [
+                heard for heard in self._poses if 0 <= heard[0].stamp_ns - begun_ns < self.scenario.step_ns
+            ]
             if not poses:
                 continue
             while (passed := self._users.popleft()) is not waiting:

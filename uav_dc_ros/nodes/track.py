@@ -30,7 +30,7 @@ class Track:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._step_ns = round(scenario.mission.step_s * 1e9)
+        self._step_ns = scenario.step_ns
         self._apart_m = APART_CELLS * scenario.grid.cell_m
         self._apart = 1  # times `_apart_m` and APART_NS
         self.version = 0

@@ -99,12 +99,7 @@ class Visualizer(MissionNode):
             return None
         try:
             payload = messages.decode(payloads.text_in_cdr(self._newest[topic][1]), kind)
-            if isinstance(payload, messages.Mission):
-                payloads.check_world(payload, self.scenario)
-            if isinstance(payload, messages.Rates):
-                payloads.collection(payload, self.scenario)
-            if isinstance(payload, messages.Users):
-                payloads.users_m(payload, self.scenario)
+            payloads.check(payload, self.scenario)
         except MessageError as error:
             self.reject(topic, error)
             del self._newest[topic]

@@ -50,7 +50,7 @@ def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list
     found: list[MissionSurvey] = []
     try:
         try:
-            step_ns = round(scenario(reader, namespace).mission.step_s * 1e9)
+            step_ns = scenario(reader, namespace).step_ns
         except UavDcError:
             step_ns = 2**63  # the scenario is not known: the bag of another one
         steps = Steps(reader, namespace, step_ns)

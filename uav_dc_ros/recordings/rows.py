@@ -123,12 +123,8 @@ class Mission:
             BagError: it is of another world.
         """
         try:
-            if step.status is not None:
-                payloads.check_world(step.status, self._scenario)
-            if step.users is not None:
-                payloads.users_m(step.users, self._scenario)
-            if step.rates is not None:
-                payloads.collection(step.rates, self._scenario)
+            for payload in filter(None, (step.status, step.users, step.rates)):
+                payloads.check(payload, self._scenario)
         except MessageError as error:
             raise BagError(f"{step.name}: {error}") from None
         before = self._last

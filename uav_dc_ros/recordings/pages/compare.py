@@ -119,7 +119,7 @@ def _groups(
         name = steps.namespace(reader, namespace)
         scenario = steps.scenario(reader, name, wanted)
         policy = reader.about.get("policy", "unknown policy")
-        recorded = steps.Steps(reader, name, round(scenario.mission.step_s * 1e9))
+        recorded = steps.Steps(reader, name, scenario.step_ns)
         for one in flown(iter(recorded), scenario):
             if missions is not None and one.index not in missions:
                 continue

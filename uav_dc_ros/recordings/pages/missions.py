@@ -6,7 +6,7 @@ step, every fourth, and so on. Its numbers (data, distance, rates) are always th
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -84,9 +84,7 @@ class Flown:
         self.last_ns = max(step.log_ns.values(), default=self.last_ns)
         if self.journey is not None:
             self.journey.add(step)
-        status = self._fitting(step.status, lambda it: payloads.check_world(it, self.scenario))
-        rates = self._fitting(step.rates, lambda it: payloads.collection(it, self.scenario))
-        users = self._fitting(step.users, lambda it: payloads.users_m(it, self.scenario))
+        status, rates, users = map(self._fitting, (step.status, step.rates, step.users))
         for name, there in (
             ("mission", status),
             ("users", users),
@@ -156,11 +154,9 @@ class Flown:
             "rate_bps": _finite(np.where(served > 0, rate_bps, math.nan)),
         }
 
-    def _fitting(self, payload: Any, check: Callable[[Any], object]) -> Any:
-        if payload is None:
-            return None
+    def _fitting(self, payload: Any) -> Any:
         try:
-            check(payload)
+            payloads.check(payload, self.scenario)
         except MessageError as error:
             kind = type(payload).__name__.lower()
             self.faults[f"{kind} messages of another world ({error.reason})"] += 1
