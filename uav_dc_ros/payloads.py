@@ -1,6 +1,4 @@
-"""Payloads to and from the core's arrays, and their text in a serialised std_msgs/String. Knows no ROS."""
-
-from typing import Literal
+"""Payloads to and from the core's arrays. Knows no ROS."""
 
 import numpy as np
 
@@ -9,51 +7,6 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Link
 from uav_dc_ros.errors import MessageError
-
-CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # how a serialised message says how its numbers are laid out
-CDR_BIG_ENDIAN = b"\0\0\0\0"
-# Encapsulations that are not ROS 2's, and frames that are none.
-_NAMES = {
-    **{bytes([0, kind]): f"parameter list (0x{kind:04x})" for kind in (2, 3)},
-    **{bytes([0, kind]): f"XCDR2 (0x{kind:04x})" for kind in range(6, 12)},
-    b"\x28\xb5": "a zstd frame that is damaged",
-}
-
-
-def cdr_of_text(text: bytes) -> bytes:
-    """A std_msgs/String, serialised: its JSON goes to the middleware, and comes from it, as bytes."""
-    return CDR_LITTLE_ENDIAN + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
-
-
-def byte_order(data: bytes) -> Literal["little", "big"]:
-    """The byte order of a serialised message, by its encapsulation: plain CDR, as ROS 2 has it.
-
-    Raises:
-        MessageError: another encapsulation, or none.
-    """
-    kind = data[:2] if len(data) >= len(CDR_LITTLE_ENDIAN) else b""
-    if kind == CDR_LITTLE_ENDIAN[:2]:
-        return "little"
-    if kind == CDR_BIG_ENDIAN[:2]:
-        return "big"
-    if not kind:
-        raise MessageError("malformed", f"{len(data)} bytes; expected a message with its encapsulation")
-    raise MessageError(
-        "encapsulation", f"{_NAMES.get(kind, f'0x{kind.hex()}')}; expected CDR (0x0000 or 0x0001)"
-    )
-
-
-def text_in_cdr(data: bytes) -> bytes:
-    """The text in a serialised std_msgs/String.
-
-    Raises:
-        MessageError: it is serialised in another way, or holds less than it says.
-    """
-    order = byte_order(data)
-    length = int.from_bytes(data[4:8], order)  # with the zero at its end
-    if len(data) < 8 + length:
-        raise MessageError("malformed", f"{len(data) - 8} bytes of text; expected {length}, as it says")
-    return data[8 : 7 + length]
 
 
 def users(

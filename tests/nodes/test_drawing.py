@@ -14,10 +14,10 @@ from rosbags.typesys import Stores, get_typestore
 from visualization_msgs.msg import Marker, MarkerArray
 
 from tests.nodes.poses import pose as pose_message
-from uav_dc_ros import scenarios
+from uav_dc_ros import cdr, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
-from uav_dc_ros.nodes import cdr, drawing
+from uav_dc_ros.nodes import drawing
 from uav_dc_ros.nodes.drawing import Scene, UserState
 from uav_dc_ros.nodes.track import POSES_MAX, Track
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tests.autopilot.simulated import Vehicle
 from tests.recordings.made import BEGUN_NS, about, pose, said, write
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.frames import Enu
@@ -328,7 +328,7 @@ def flown_about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, s
 def phases(told: list[BagMessage]) -> list[tuple[int, Phase, str]]:
     """Step, phase and reason of each word of the vehicle."""
     found = [
-        msgspec.json.decode(payloads.text_in_cdr(message.data), type=messages.Mission)
+        msgspec.json.decode(cdr.text_in(message.data), type=messages.Mission)
         for message in told
         if message.topic == "/mission"
     ]

@@ -19,7 +19,7 @@ from tests.recordings.made import changing, copy, flight, said, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, read
 from tests.small_worlds import saved, tiny
 from uav_dc_ros import bag as command
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import cdr, messages
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagReader
@@ -73,7 +73,7 @@ def not_reached(tmp_path_factory):
     changed = []
     for message in told:
         if message.topic == "/mission":
-            payload = messages.decode(payloads.text_in_cdr(message.data), messages.Mission)
+            payload = messages.decode(cdr.text_in(message.data), messages.Mission)
             late = payload.step == 2 and payload.phase is not Phase.READY
             n = (payload.step > 1) + (payload.step > 2 or late)
             payload = msgspec.structs.replace(payload, steps_not_reached=n)
@@ -103,7 +103,7 @@ def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
     """One that was told before it, for the same end, is not."""
     told = flown.Flight(TINY, seed=5).fly()
     last = max(i for i, message in enumerate(told) if message.topic == "/mission")
-    payload = messages.decode(payloads.text_in_cdr(told[last].data), messages.Mission)
+    payload = messages.decode(cdr.text_in(told[last].data), messages.Mission)
     for i, reason in enumerate(("step 4: there", "the motors were stopped: by hand")):
         ended = msgspec.structs.replace(payload, phase=Phase.ABORTED, reason=reason)
         told.insert(last + i, said("mission", ended, told[last + i - 1].publish_time_ns + 1000))
@@ -186,7 +186,7 @@ def test_what_a_middleware_repeats_is_counted_and_told_once():
 def test_a_vehicle_that_waits_for_hours_fills_no_memory():
     told = flown.Flight(TINY, beat=flown.FAULTS["ground"][0]).fly()
     i, word = next((i, m) for i, m in enumerate(told) if m.topic == "/mission")
-    status = messages.decode(payloads.text_in_cdr(word.data), messages.Mission)
+    status = messages.decode(cdr.text_in(word.data), messages.Mission)
     again = [
         said("mission", msgspec.structs.replace(status, reason=f"waits {n}"), word.log_time_ns + n)
         for n in range(1, TOLD_KEPT + 50)
@@ -298,7 +298,7 @@ def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
     moving = next(
         i
         for i in where
-        if (p := messages.decode(payloads.text_in_cdr(told[i].data), messages.Mission)).step == 3
+        if (p := messages.decode(cdr.text_in(told[i].data), messages.Mission)).step == 3
         and p.phase is Phase.MOVING
     )
     ready = max(i for i in where if i < moving)
@@ -392,10 +392,10 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
 
 def as_version_0_1(message):
     """A word of the vehicle as it was once said: a fault had no field, and stood in the reason."""
-    payload = json.loads(payloads.text_in_cdr(message.data))
+    payload = json.loads(cdr.text_in(message.data))
     held, _ = payload.pop("held"), payload.pop("fault")
     payload["reason"] = f"holds: {payload['reason']}" if held else payload["reason"]
-    return message._replace(data=payloads.cdr_of_text(json.dumps(payload).encode()))
+    return message._replace(data=cdr.of_text(json.dumps(payload).encode()))
 
 
 def test_a_bag_of_version_0_1_is_read_as_before(bags, capsys, tmp_path):

@@ -13,7 +13,7 @@ from contextlib import ExitStack
 import msgspec
 import numpy as np
 
-from uav_dc_ros import messages, scenarios
+from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.course import Standing
 from uav_dc_ros.autopilot.fence import Fence
@@ -24,7 +24,7 @@ from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError, UavDcError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import cdr, datums, runtime, vehicles
+from uav_dc_ros.nodes import datums, runtime, vehicles
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.lease import Lease
 from uav_dc_ros.nodes.mission_node import MissionNode

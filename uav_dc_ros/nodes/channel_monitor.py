@@ -8,11 +8,11 @@ from collections import deque
 
 import numpy as np
 
-from uav_dc_ros import messages, payloads, scenarios
+from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import MessageError, NodeError
-from uav_dc_ros.nodes import cdr, runtime
+from uav_dc_ros.nodes import runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 

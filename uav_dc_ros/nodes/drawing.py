@@ -8,12 +8,11 @@ from enum import IntEnum
 import numpy as np
 from visualization_msgs.msg import Marker
 
+from uav_dc_ros.cdr import FRAME, Writer
 from uav_dc_ros.core import radio
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission, Phase
-from uav_dc_ros.nodes.cdr import Writer
-from uav_dc_ros.nodes.convert import FRAME
 
 Rgba = tuple[float, float, float, float]
 Xyz = tuple[float, float, float]

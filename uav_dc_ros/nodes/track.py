@@ -2,8 +2,8 @@
 
 import math
 
+from uav_dc_ros.cdr import Pose
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.nodes.cdr import Pose
 
 APART_CELLS = 0.05  # poses that lie nearer together than this, and come sooner than that, ...
 APART_NS = 2 * 10**9  # ... are one: a real vehicle tells twenty a second

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from rclpy.duration import Duration
 
-from uav_dc_ros import messages, payloads, scenarios
+from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
@@ -28,7 +28,7 @@ from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import cdr, convert, runtime
+from uav_dc_ros.nodes import convert, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.parameters import EXTERNAL
