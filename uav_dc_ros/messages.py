@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import force_setattr
 
-from uav_dc_ros import resources
+from uav_dc_ros import files, resources
 from uav_dc_ros.core.grid import ActionLabel
 from uav_dc_ros.errors import MessageError
 
@@ -274,7 +274,7 @@ def schema_text(kind: type[Payload]) -> str:
 def write_schemas(folder: Path) -> None:
     """Write the schema of every JSON topic."""
     for topic, kind in PAYLOADS.items():
-        (folder / f"{topic}.schema.json").write_text(schema_text(kind), "utf-8")
+        files.write(folder / f"{topic}.schema.json", schema_text(kind).encode())
 
 
 def told(text: str) -> str:

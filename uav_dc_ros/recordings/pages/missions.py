@@ -18,6 +18,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.recordings.pages.vehicle import Journey
 from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.thinning import EveryNth, spread
 
 STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart
 VALUES_MAX = 60_000  # steps times users: what a page can draw, and hold
@@ -43,7 +44,6 @@ class Flown:
         data_bits, collected: of each user at the end, `[U]`.
         distance_m: length of the path flown, metres.
         faults: what is missing or cannot be true, counted in words.
-        stride: every how many steps one is kept.
         last_ns: when the last message of it was received.
         journey: what a real vehicle told of it; None of a simulated one.
     """
@@ -61,12 +61,11 @@ class Flown:
         self.collected: Array = np.zeros(n_users, dtype=bool)
         self.distance_m = 0.0
         self.faults: Counter[str] = Counter()
-        self.stride = 1
         self.last_ns = 0
-        self.shown_users = _spread(n_users, USERS_MAX)
-        self._kept: list[dict[str, Any]] = []
+        self.shown_users = spread(n_users, USERS_MAX)
+        most = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
+        self._steps: EveryNth[dict[str, Any]] = EveryNth(most)
         self._last: dict[str, Any] | None = None  # the newest step, kept or not
-        self._kept_max = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
         self._position_m: Array | None = None
         self._cell: Array | None = None
         self._expected = 0
@@ -134,8 +133,13 @@ class Flown:
 
     def course(self) -> list[dict[str, Any]]:
         """The steps that are shown, in their order; the last one is always among them."""
-        kept = self._kept
+        kept = self._steps.kept
         return kept if self._last is None or self._last is kept[-1] else [*kept, self._last]
+
+    @property
+    def stride(self) -> int:
+        """Every how many steps one is shown."""
+        return self._steps.stride
 
     def table(self) -> dict[str, list[Any]]:
         """Columns, an entry per user shown; SINR and rate are means over the steps in which it was served."""
@@ -212,12 +216,7 @@ class Flown:
             "sum_rate_bps": rates.sum_rate_bps if rates and step.step else None,
             "reward": _finite(np.asarray(self.rewards(self._cell, self.data_bits))),
         }
-        # The first step heard, whatever its number: a mission that was joined late begins there.
-        if not self._kept or step.step % self.stride == 0:
-            self._kept.append(self._last)
-        if len(self._kept) > self._kept_max:
-            self.stride *= 2
-            self._kept = self._kept[:1] + [it for it in self._kept[1:] if it["step"] % self.stride == 0]
+        self._steps.add(step.step, self._last)
 
 
 def flown(steps: Iterator[RecordedStep], scenario: Scenario, real: bool = False) -> Iterator[Flown]:
@@ -249,8 +248,3 @@ def _users_m(users: messages.Users, shown: Array) -> list[list[float]]:
 
 def _finite(values: Array) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
-
-
-def _spread(n: int, most: int) -> Array:
-    """Indices of at most `most` of `n`, evenly spread, the first and the last among them."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
