@@ -12,6 +12,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.phases import BEFORE_START
+from uav_dc_ros.recordings.mission_totals import MissionTotals
 from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.tables import Columns
 from uav_dc_ros.topics import SIMULATED
@@ -110,7 +111,7 @@ class Mission:
         self._scenario, self._about, self._vehicle = scenario, about, vehicle
         self._total: tuple[int, float] | None = None  # step, and r^t there
         self._last: RecordedStep | None = None
-        self._status = self._rates = None  # type: Any  # the latest that are recorded
+        self._totals = MissionTotals()
         self._recorded = 0
         self._sum_rates: list[float] = []
         self._first_ns = 2**63 - 1
@@ -129,8 +130,8 @@ class Mission:
             raise BagError(f"{step.name}: {error}") from None
         before = self._last
         self._recorded += 1
-        self._last, self._status = step, step.status or self._status
-        self._rates = step.rates or self._rates
+        self._last = step
+        self._totals.add(step.step, step.status, step.rates)
         self._first_ns = min(self._first_ns, *step.log_ns.values())
         self._last_ns = max(self._last_ns, *step.log_ns.values())
         if step.rates is not None and step.step > 0:
@@ -192,33 +193,33 @@ class Mission:
 
     def summary(self) -> Rows:
         """The row of the mission, after its last step."""
-        last, status, rates = self._last, self._status, self._rates
+        last, totals = self._last, self._totals
         assert last is not None, "a mission has a step"
-        over = status is not None and status.phase.is_over
+        known = totals.seed is not None  # has the vehicle said anything
         row = {
             "flight": last.flight,
             "mission": last.mission,
-            "seed": status and status.seed,
+            "seed": totals.seed,
             "scenario": self._scenario.name,
             "scenario_fingerprint": self._scenario.fingerprint,
             "policy": self._about.get("policy"),
             "policy_sha256": self._about.get("policy_sha256"),
-            "outcome": status.phase.value if over else "unfinished",
+            "outcome": totals.outcome,
             "steps_flown": last.step,
             "steps_recorded": self._recorded,
             "first_received_ns": self._first_ns,
             "last_received_ns": self._last_ns,
             "users_total": self._scenario.n_users,
-            "users_collected": rates and sum(rates.collected),
-            "data_bits": rates and float(np.sum(rates.data_bits)),
+            "users_collected": totals.collected,
+            "data_bits": totals.data_bits,
             "mean_sum_rate_bps": float(np.mean(self._sum_rates)) if self._sum_rates else None,
             "total_reward": self._total and self._total[1],
         }
         if self._vehicle != SIMULATED:
             row |= {
                 "vehicle": self._vehicle,
-                "reason": status and status.reason,
-                "steps_not_reached": status and status.steps_not_reached,
+                "reason": totals.reason if known else None,
+                "steps_not_reached": totals.steps_not_reached if known else None,
             }
         return {name: [value] for name, value in row.items()}
 

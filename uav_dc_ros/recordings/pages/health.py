@@ -9,8 +9,9 @@ from uav_dc_ros import topics
 from uav_dc_ros.bags.definitions import TYPESTORE
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TOLD_MAX, Phase
+from uav_dc_ros.recordings.mission_totals import UNFINISHED
 from uav_dc_ros.recordings.pages.diagnostics import Node, Report
-from uav_dc_ros.recordings.pages.missions import NO_END, Flown
+from uav_dc_ros.recordings.pages.missions import Flown
 from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps
 from uav_dc_ros.recordings.thinning import EveryNth
@@ -100,10 +101,10 @@ class Health:
         name = f"mission {flown.index}" + (f" of flight {flown.flight}" if flown.flight else "")
         for what, count in flown.faults.items():
             self._fault(flown.last_ns, name, f"{what}: {count}")
-        if flown.outcome in (Phase.ABORTED, NO_END):
-            told = "aborted" if flown.outcome == Phase.ABORTED else "its end is not in the bag"
+        if flown.totals.outcome in (Phase.ABORTED, UNFINISHED):
+            told = "aborted" if flown.totals.is_over else "its end is not in the bag"
             why = f": {flown.reason}" if flown.reason else ""
-            self._fault(flown.last_ns, name, f"{told}, after step {flown.steps}{why}")
+            self._fault(flown.last_ns, name, f"{told}, after step {flown.totals.steps}{why}")
         for step, word in flown.journey.words if flown.journey else ():
             if word.held:
                 self._fault(word.log_ns, name, f"step {step}: {word.reason}")

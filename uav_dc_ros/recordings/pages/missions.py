@@ -16,6 +16,7 @@ from uav_dc_ros.core import mission, radio, reward, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
+from uav_dc_ros.recordings.mission_totals import MissionTotals
 from uav_dc_ros.recordings.pages.vehicle import Journey
 from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.thinning import EveryNth, spread
@@ -23,7 +24,6 @@ from uav_dc_ros.recordings.thinning import EveryNth, spread
 STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart
 VALUES_MAX = 60_000  # steps times users: what a page can draw, and hold
 USERS_MAX = 2_000  # shown
-NO_END = "no end"  # outcome of a mission whose end is not in the bag
 WAITING, SERVED, COLLECTED = "012"  # a user's state, as a page knows it
 
 
@@ -36,11 +36,7 @@ class Flown:
         real: was it flown by a real vehicle?
 
     Attributes:
-        seed: of its users; None where the bag does not tell.
-        outcome: how it ended.
-        reason: why, as a real vehicle tells.
-        steps: steps flown.
-        steps_not_reached: those of them whose cell a real vehicle did not reach, as it says itself.
+        totals: the mission in numbers.
         data_bits, collected: of each user at the end, `[U]`.
         distance_m: length of the path flown, metres.
         faults: what is missing or cannot be true, counted in words.
@@ -52,11 +48,8 @@ class Flown:
         n_users = scenario.n_users
         self.scenario = scenario
         self.flight, self.index = flight, index
-        self.seed: int | None = None
-        self.outcome: str = NO_END
-        self.reason = ""
+        self.totals = MissionTotals()
         self.journey = Journey(scenario) if real else None
-        self.steps = self.steps_not_reached = 0
         self.data_bits: Array = np.zeros(n_users)
         self.collected: Array = np.zeros(n_users, dtype=bool)
         self.distance_m = 0.0
@@ -79,7 +72,6 @@ class Flown:
         if step.step > self._expected:
             self.faults["steps that are not in the bag"] += step.step - self._expected
         self._expected = step.step + 1
-        self.steps = max(self.steps, step.step)
         self.last_ns = max(step.log_ns.values(), default=self.last_ns)
         if self.journey is not None:
             self.journey.add(step)
@@ -93,32 +85,34 @@ class Flown:
             if not there and (name == "mission" or step.is_measured):
                 self.faults[f"steps without {name}"] += 1
         if status is not None:
-            self.seed = status.seed
-            self.steps_not_reached = status.steps_not_reached
             self._cell = np.asarray(status.cell)
-            if status.phase.is_over:
-                self.outcome, self.reason = status.phase.value, status.reason
+        self.totals.add(step.step, status, rates)
         if rates is not None:
             self._book(step.step, rates)
         self._keep(step, self._fly(step.position_m, status if step.is_measured else None), users, rates)
 
+    @property
+    def reason(self) -> str:
+        """Why it ended, as a real vehicle tells."""
+        return self.totals.reason if self.totals.is_over else ""
+
     def summary(self) -> dict[str, Any]:
         """The mission in numbers, as run_all's `--summary` has them."""
-        total, n = self._sum_rates_bps
+        (total, n), totals = self._sum_rates_bps, self.totals
         return {
             **({"reason": self.reason} if self.reason else {}),
-            **({"steps_not_reached": self.steps_not_reached} if self.steps_not_reached else {}),
+            **({"steps_not_reached": totals.steps_not_reached} if totals.steps_not_reached else {}),
             "flight": self.flight,
             "mission": self.index,
-            "seed": self.seed,
-            "outcome": self.outcome,
-            "steps": self.steps,
+            "seed": totals.seed,
+            "outcome": totals.outcome,
+            "steps": totals.steps,
             "users_collected": int(self.collected.sum()),
             "users_total": self.scenario.n_users,
             "data_bits": float(self.data_bits.sum()),
             "sum_rate_bps": total / max(n, 1),
             "distance_m": self.distance_m,
-            "reward": self.rewards(self._cell, self.data_bits)[2] if self.steps else 0.0,
+            "reward": self.rewards(self._cell, self.data_bits)[2] if totals.steps else 0.0,
         }
 
     def rewards(self, cell: Array | None, data_bits: Array) -> tuple[float, float, float]:
