@@ -26,61 +26,36 @@ class Transition(NamedTuple):
     why: str
 
 
-_STOPPED = "the mission is stopped"
-_TAKEN = "a pilot or a failsafe has the vehicle"
-_FAULT = "a fault lasts, or the mission is stopped: return or land"
-_DOCK = "the last step is flown"
-TRANSITIONS = tuple(
-    Transition(before, after, steps, why)
-    for before, steps, following in (
-        (
-            Phase.IDLE,
-            0,
-            {
-                Phase.CONNECTING: "the peers are ready, or a mission is taken up again",
-                Phase.LANDING: f"{_STOPPED}, and the vehicle is armed",
-                Phase.ABORTED: _STOPPED,
-            },
-        ),
-        (
-            Phase.CONNECTING,
-            0,
-            {
-                Phase.PREFLIGHT: "telemetry has come",
-                Phase.TAKEOFF: "the vehicle flies already",
-                Phase.LANDING: "a mission that came down is taken up again, or must not go on",
-                Phase.LANDED: "it had landed when the bridge came back",
-                Phase.TIMEOUT: "it was out of steps when the bridge came back",
-                Phase.ABORTED: f"{_STOPPED}, or {_TAKEN}",
-            },
-        ),
-        (
-            Phase.PREFLIGHT,
-            0,
-            {
-                Phase.CONNECTING: "telemetry is lost",
-                Phase.TAKEOFF: "armed, in the commanded mode",
-                Phase.LANDING: "armed where the mission must not begin",
-                Phase.ABORTED: f"{_STOPPED}, or {_TAKEN}",
-            },
-        ),
-        (Phase.TAKEOFF, 0, {Phase.READY: "at the start", Phase.LANDING: _FAULT, Phase.ABORTED: _TAKEN}),
-        (Phase.READY, 0, {Phase.MOVING: "a move came", Phase.LANDING: _FAULT, Phase.ABORTED: _TAKEN}),
-        (Phase.MOVING, 0, {Phase.LANDING: _FAULT, Phase.ABORTED: _TAKEN}),
-        (Phase.MOVING, 1, {Phase.READY: "at the cell", Phase.LANDING: _DOCK}),
-        # A move that was begun when the bridge was killed is flown to its end.
-        (Phase.TAKEOFF, 1, {Phase.READY: "at the cell of a move that was begun", Phase.LANDING: _DOCK}),
-        (
-            Phase.LANDING,
-            0,
-            {
-                Phase.LANDED: "disarmed at the dock",
-                Phase.TIMEOUT: "disarmed elsewhere, out of steps",
-                Phase.ABORTED: "disarmed after a fault, or not heard of",
-            },
-        ),
-    )
-    for after, why in following.items()
+TRANSITIONS = (
+    Transition(Phase.IDLE, Phase.CONNECTING, 0, "the peers are ready, or a restart"),
+    Transition(Phase.IDLE, Phase.LANDING, 0, "stopped, and the vehicle is armed"),
+    Transition(Phase.IDLE, Phase.ABORTED, 0, "the mission is stopped"),
+    Transition(Phase.CONNECTING, Phase.PREFLIGHT, 0, "telemetry has come"),
+    Transition(Phase.CONNECTING, Phase.TAKEOFF, 0, "the vehicle flies already"),
+    Transition(Phase.CONNECTING, Phase.LANDING, 0, "it came down, or must not go on"),
+    Transition(Phase.CONNECTING, Phase.LANDED, 0, "it had landed before a restart"),
+    Transition(Phase.CONNECTING, Phase.TIMEOUT, 0, "it was out of steps before a restart"),
+    Transition(Phase.CONNECTING, Phase.ABORTED, 0, "stopped, or taken by a pilot"),
+    Transition(Phase.PREFLIGHT, Phase.CONNECTING, 0, "telemetry is lost"),
+    Transition(Phase.PREFLIGHT, Phase.TAKEOFF, 0, "armed, in the commanded mode"),
+    Transition(Phase.PREFLIGHT, Phase.LANDING, 0, "armed where the mission must not begin"),
+    Transition(Phase.PREFLIGHT, Phase.ABORTED, 0, "stopped, or taken by a pilot"),
+    Transition(Phase.TAKEOFF, Phase.READY, 0, "at the start"),
+    Transition(Phase.TAKEOFF, Phase.LANDING, 0, "a fault lasts, or a stop"),
+    Transition(Phase.TAKEOFF, Phase.ABORTED, 0, "taken by a pilot or a failsafe"),
+    Transition(Phase.READY, Phase.MOVING, 0, "a move came"),
+    Transition(Phase.READY, Phase.LANDING, 0, "a fault lasts, or a stop"),
+    Transition(Phase.READY, Phase.ABORTED, 0, "taken by a pilot or a failsafe"),
+    Transition(Phase.MOVING, Phase.LANDING, 0, "a fault lasts, or a stop"),
+    Transition(Phase.MOVING, Phase.ABORTED, 0, "taken by a pilot or a failsafe"),
+    Transition(Phase.MOVING, Phase.READY, 1, "at the cell"),
+    Transition(Phase.MOVING, Phase.LANDING, 1, "the last step is flown"),
+    # A move that was begun when the bridge was killed is flown to its end.
+    Transition(Phase.TAKEOFF, Phase.READY, 1, "at the cell"),
+    Transition(Phase.TAKEOFF, Phase.LANDING, 1, "the last step is flown"),
+    Transition(Phase.LANDING, Phase.LANDED, 0, "disarmed at the dock"),
+    Transition(Phase.LANDING, Phase.TIMEOUT, 0, "disarmed elsewhere, out of steps"),
+    Transition(Phase.LANDING, Phase.ABORTED, 0, "disarmed after a fault, or not heard of"),
 )
 
 
