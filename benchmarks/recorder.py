@@ -24,9 +24,9 @@ from pathlib import Path
 
 from mcap.writer import Writer
 
+from uav_dc_ros import cdr
 from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.payloads import cdr_of_text
 
 SECONDS = 3.0  # that a rate is held
 SETTLE_S = 1.0
@@ -40,13 +40,13 @@ import random, sys, time
 import rclpy
 from std_msgs.msg import String
 from uav_dc_ros.nodes import fastdds
-from uav_dc_ros.payloads import cdr_of_text
+from uav_dc_ros import cdr
 size, rate_hz, seconds = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
 fastdds.use_profiles()
 rclpy.init()
 node = rclpy.create_node("publisher")
 publisher = node.create_publisher(String, "t", 1000 if size < 1000 else 50)
-data = cdr_of_text(random.Random(1).randbytes(size // 2).hex().encode())
+data = cdr.of_text(random.Random(1).randbytes(size // 2).hex().encode())
 while not publisher.get_subscription_count():
     time.sleep(0.01)
 time.sleep(0.5)
@@ -90,7 +90,7 @@ else:
 
 def bare_hz(folder: Path, size: int) -> float:
     """Messages a second that the mcap writer takes, with its own defaults."""
-    data = cdr_of_text(random.Random(1).randbytes(size // 2).hex().encode())
+    data = cdr.of_text(random.Random(1).randbytes(size // 2).hex().encode())
     n = int(min(BARE_BYTES / size, 200_000))
     with (folder / "bare.mcap").open("wb") as file:
         writer = Writer(file)

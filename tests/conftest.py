@@ -15,10 +15,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
+import hypothesis
 import pytest
 
+from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.errors import MessageError
 
+Bridge.is_strict = True  # a phase that cannot follow fails the test; in the air it would end the mission
 MARK = "UAV_DC_TEST"
 ROOT = Path(__file__).parents[1]
 # How long a test waits for what must come, wall time. Only what never comes takes this long: a machine with
@@ -28,6 +31,10 @@ PATIENCE_S = 90.0
 # The tests start some hundred processes. Without bytecode each of them compiles this project anew.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# What takes long on a busy machine is no failure.
+hypothesis.settings.register_profile("patient", deadline=None)
+hypothesis.settings.load_profile("patient")
 
 # A shell without job control, such as that of a script, ignores Ctrl-C for what it starts in the background.
 signal.signal(signal.SIGINT, signal.default_int_handler)

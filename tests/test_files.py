@@ -152,6 +152,16 @@ def test_a_failed_block_leaves_the_older_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_folder_appears_when_it_is_whole_and_a_failed_one_leaves_nothing(tmp_path: Path) -> None:
+    with files.building(tmp_path / "new" / "made") as partial:
+        (partial / "a").write_text("content")
+        assert not (tmp_path / "new" / "made").exists()
+    assert (tmp_path / "new" / "made" / "a").read_text() == "content"
+    with pytest.raises(FileNotFoundError), files.building(tmp_path / "new" / "failed") as partial:
+        (partial / "none").unlink()
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["made"]
+
+
 def test_content_is_on_the_disk_before_its_name_and_the_name_before_it_returns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,7 @@ from tests.conftest import outcome
 from uav_dc_ros import messages, resources, topics
 from uav_dc_ros.core.grid import ACTION_LABELS, ActionLabel
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.messages import PAYLOADS, Mission, Move, Phase, Rates, Ready, Users
+from uav_dc_ros.messages import PAYLOADS, FaultKind, Mission, Move, Phase, Rates, Ready, Users
 
 RUN = "0123456789abcdef"
 EXAMPLES = {
@@ -46,6 +46,8 @@ EXAMPLES = {
         step=3,
         phase=Phase.READY,
         reason="no position for 0.5 s",
+        held=True,
+        fault=FaultKind.POSITION,
         cell=(1, 2, 0),
         remaining_steps=57,
         seed=2**63 - 1,
@@ -58,6 +60,8 @@ EXAMPLES = {
 OPTIONAL = {  # older bags have none
     ("mission", "reason"),
     ("mission", "steps_not_reached"),
+    ("mission", "held"),
+    ("mission", "fault"),
     *((topic, "run") for topic in PAYLOADS),
 }
 
@@ -66,6 +70,26 @@ OPTIONAL = {  # older bags have none
 def test_a_payload_arrives_as_it_was_sent(topic: str) -> None:
     sent = EXAMPLES[topic]
     assert messages.decode(messages.encode(sent), PAYLOADS[topic]) == sent
+
+
+@pytest.mark.parametrize(
+    ("told", "held"),
+    [
+        ({"reason": "holds: no position for 0.5 s"}, True),  # as version 0.1 said it
+        ({"reason": "goes on after: holds: no position for 0.5 s"}, False),
+        ({}, False),
+        ({"reason": "no position for 0.5 s", "held": True, "fault": "position"}, True),
+        ({"reason": "no position for 0.5 s", "held": False, "fault": None}, False),
+    ],
+)
+def test_held_is_a_field_and_in_an_old_payload_a_prefix(told: dict[str, Any], held: bool) -> None:
+    payload = json.loads(messages.encode(EXAMPLES["mission"]))
+    for name in ("reason", "held", "fault"):
+        del payload[name]
+    mission = messages.decode(json.dumps(payload | told), Mission)
+    assert (mission.held, mission.fault) == (held, told.get("fault"))
+    assert mission.reason == told.get("reason", ""), "as it was recorded"
+    assert mission.state == ("ready (held)" if held else "ready")
 
 
 @pytest.mark.parametrize("topic", PAYLOADS)
@@ -94,7 +118,8 @@ def test_an_independent_validator_agrees(topic: str) -> None:
             validator.validate(less)
             messages.decode(json.dumps(less), PAYLOADS[topic])
             less = {}
-        for bad in (less, good | {key: None}, good | {key: {}}, good | {"surplus": 1}):
+        nothing = {key: None} if key != "fault" else {key: "none"}
+        for bad in (less, good | nothing, good | {key: {}}, good | {"surplus": 1}):
             assert not validator.is_valid(bad)
             with pytest.raises(MessageError):
                 messages.decode(json.dumps(bad), PAYLOADS[topic])

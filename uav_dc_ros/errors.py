@@ -45,5 +45,9 @@ class VehicleError(UavDcError):
     """A vehicle, or a way to it, that cannot be used."""
 
 
+class PhaseError(UavDcError):
+    """A phase of a mission that cannot follow the one before: an error of the bridge itself."""
+
+
 class TrainingError(UavDcError):
     """A training run that cannot start or go on."""

@@ -103,6 +103,22 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def building(folder: Path) -> Iterator[Path]:
+    """A folder to fill, which becomes `folder` when the block ends without an error, and is gone otherwise.
+
+    Raises:
+        OSError: it cannot be made or renamed, or the disk failed.
+    """
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        place(partial, folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def place(made: Path, path: Path, *, durable: bool = True) -> None:
     """Gives a file, or a folder with all that is in it, the name `path` in the same file system.
 

@@ -15,13 +15,15 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import force_setattr
 
-from uav_dc_ros import resources
+from uav_dc_ros import files, resources
 from uav_dc_ros.core.grid import ActionLabel
 from uav_dc_ros.errors import MessageError
 
 MAX_BYTES = 64 * 2**20  # of one payload; a hundred thousand users take about 8 MiB
 TOLD_MAX = 200  # characters of what is told about a bad one
+HELD_BEFORE_0_2 = "holds: "  # how the reason began, in version 0.1, where now `held` is true
 
 Index: TypeAlias = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 StampNs: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -59,6 +61,18 @@ class Phase(StrEnum):
     def is_over(self) -> bool:
         """Has this mission no further step."""
         return self in (Phase.LANDED, Phase.TIMEOUT, Phase.ABORTED)
+
+
+class FaultKind(StrEnum):
+    """What keeps a vehicle from going on."""
+
+    LINK = "link"  # no heartbeat
+    POSITION = "position"  # no position
+    ESTIMATE = "estimate"  # the autopilot does not trust its own position
+    CLOCK = "clock"  # the vehicle's time stands still
+    TARGET = "target"  # the autopilot reports another target than the setpoint
+    PROGRESS = "progress"  # it comes no nearer to its cell
+    POLICY = "policy"  # nobody is there who decides
 
 
 class Payload(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -136,6 +150,13 @@ class Mission(Stepped, frozen=True, kw_only=True):
     reason: Annotated[
         str, Meta(max_length=TOLD_MAX, description="why it is in this phase, or does not go on; may be empty")
     ] = ""
+    held: Annotated[
+        bool, Meta(description="the vehicle stays where it is, because of a fault; `reason` tells which")
+    ] = False
+    fault: Annotated[
+        FaultKind | None,
+        Meta(description="kind of the fault; null: none, or not known, as in bags that are older than it"),
+    ] = None
     cell: Annotated[
         tuple[Index, Index, Index],
         Meta(description="the cell that the UAV reached last: indices east, north, up"),
@@ -154,6 +175,16 @@ class Mission(Stepped, frozen=True, kw_only=True):
             description="of the scenario's world: equal for equal worlds only",
         ),
     ]
+
+    def __post_init__(self) -> None:
+        """Understand a vehicle of version 0.1. Its reason stays as it was recorded."""
+        if not self.held and self.reason.startswith(HELD_BEFORE_0_2):
+            force_setattr(self, "held", True)
+
+    @property
+    def state(self) -> str:
+        """The phase in words, and whether the vehicle is held in it."""
+        return f"{self.phase} (held)" if self.held else str(self.phase)
 
 
 class Move(Stepped, frozen=True, kw_only=True):
@@ -208,7 +239,7 @@ def encode(payload: Payload) -> bytes:
         MessageError: a number that is not finite.
     """
     text = msgspec.json.encode(payload)
-    if b"null" in text:  # how a number that is none is written; at most a reason has this word, too
+    if b"null" in text:  # how a number that is none is written; a mission without a fault has it, too
         decode(text, type(payload))
     return text
 
@@ -243,7 +274,7 @@ def schema_text(kind: type[Payload]) -> str:
 def write_schemas(folder: Path) -> None:
     """Write the schema of every JSON topic."""
     for topic, kind in PAYLOADS.items():
-        (folder / f"{topic}.schema.json").write_text(schema_text(kind), "utf-8")
+        files.write(folder / f"{topic}.schema.json", schema_text(kind).encode())
 
 
 def told(text: str) -> str:

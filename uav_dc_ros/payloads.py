@@ -1,6 +1,4 @@
-"""Payloads to and from the core's arrays, and their text in a serialised std_msgs/String. Knows no ROS."""
-
-from typing import Literal
+"""Payloads to and from the core's arrays. Knows no ROS."""
 
 import numpy as np
 
@@ -9,51 +7,6 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Link
 from uav_dc_ros.errors import MessageError
-
-CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # how a serialised message says how its numbers are laid out
-CDR_BIG_ENDIAN = b"\0\0\0\0"
-# Encapsulations that are not ROS 2's, and frames that are none.
-_NAMES = {
-    **{bytes([0, kind]): f"parameter list (0x{kind:04x})" for kind in (2, 3)},
-    **{bytes([0, kind]): f"XCDR2 (0x{kind:04x})" for kind in range(6, 12)},
-    b"\x28\xb5": "a zstd frame that is damaged",
-}
-
-
-def cdr_of_text(text: bytes) -> bytes:
-    """A std_msgs/String, serialised: its JSON goes to the middleware, and comes from it, as bytes."""
-    return CDR_LITTLE_ENDIAN + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
-
-
-def byte_order(data: bytes) -> Literal["little", "big"]:
-    """The byte order of a serialised message, by its encapsulation: plain CDR, as ROS 2 has it.
-
-    Raises:
-        MessageError: another encapsulation, or none.
-    """
-    kind = data[:2] if len(data) >= len(CDR_LITTLE_ENDIAN) else b""
-    if kind == CDR_LITTLE_ENDIAN[:2]:
-        return "little"
-    if kind == CDR_BIG_ENDIAN[:2]:
-        return "big"
-    if not kind:
-        raise MessageError("malformed", f"{len(data)} bytes; expected a message with its encapsulation")
-    raise MessageError(
-        "encapsulation", f"{_NAMES.get(kind, f'0x{kind.hex()}')}; expected CDR (0x0000 or 0x0001)"
-    )
-
-
-def text_in_cdr(data: bytes) -> bytes:
-    """The text in a serialised std_msgs/String.
-
-    Raises:
-        MessageError: it is serialised in another way, or holds less than it says.
-    """
-    order = byte_order(data)
-    length = int.from_bytes(data[4:8], order)  # with the zero at its end
-    if len(data) < 8 + length:
-        raise MessageError("malformed", f"{len(data) - 8} bytes of text; expected {length}, as it says")
-    return data[8 : 7 + length]
 
 
 def users(
@@ -77,12 +30,7 @@ def users_m(payload: messages.Users, scenario: Scenario) -> Array:
     Raises:
         MessageError: other users than the scenario's.
     """
-    if payload.cluster != scenario.user_cluster.tolist():
-        raise MessageError(
-            "layout",
-            f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
-            f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
-        )
+    check(payload, scenario)
     return np.asarray([payload.x_m, payload.y_m], dtype=np.float64).T
 
 
@@ -109,29 +57,34 @@ def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Arra
     Raises:
         MessageError: another number of users than the scenario's.
     """
-    check_users(payload, scenario)
+    check(payload, scenario)
     return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
 
 
-def check_users(payload: messages.Rates, scenario: Scenario) -> None:
-    """Refuse the rates of another scenario's users.
+def check(payload: messages.Payload, scenario: Scenario) -> None:
+    """Refuse a payload of another world.
 
     Raises:
-        MessageError: another number of users than the scenario's.
+        MessageError: a mission with another fingerprint, a cell outside the grid, or more steps than the
+            battery allows; users, or rates of them, that are not the scenario's.
     """
-    if len(payload.data_bits) != scenario.n_users:
-        raise MessageError(
-            "layout",
-            f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
-        )
+    match payload:
+        case messages.Mission():
+            _check_mission(payload, scenario)
+        case messages.Users() if payload.cluster != scenario.user_cluster.tolist():
+            raise MessageError(
+                "layout",
+                f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
+                f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
+            )
+        case messages.Rates() if len(payload.data_bits) != scenario.n_users:
+            raise MessageError(
+                "layout",
+                f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
+            )
 
 
-def check_world(payload: messages.Mission, scenario: Scenario) -> None:
-    """Refuse a mission in another world, or where this one has nothing.
-
-    Raises:
-        MessageError: the fingerprints differ; a cell outside the grid; more steps than the battery allows.
-    """
+def _check_mission(payload: messages.Mission, scenario: Scenario) -> None:
     if payload.fingerprint != scenario.fingerprint:
         raise MessageError(
             "scenario",

@@ -17,7 +17,6 @@ FULL_V, SAG_V, EMPTY_V = 12.6, 0.3, 10.2  # at rest, less in the air, at rest wi
 COUNTED_PER_S = 29.3 / 3600 / 3.3  # amperes of ArduCopter's simulator, ampere-hours of BATT_CAPACITY
 LOW_V, LOW_S = 10.5, 10.0  # BATT_LOW_VOLT, BATT_LOW_TIMER
 VELOCITY_S = 3.0  # GUID_TIMEOUT
-OFFBOARD_LOSS_S = 1.0  # COM_OF_LOSS_T
 IDLE_DISARM_S, LANDED_DISARM_S = 10.0, 1.0
 FALL_MPS, FALL_TILT_RAD = 8.0, 1.2
 GRAVITY_MPS2 = 9.81
@@ -49,6 +48,7 @@ ARDUPILOT_PARAMETERS: dict[str, float] = {
     "FS_GCS_TIMEOUT": 5.0,
 }
 PX4_PARAMETERS: dict[str, float] = {
+    "COM_OF_LOSS_T": 1.0,
     "GF_ACTION": 2,
     "GF_MAX_HOR_DIST": 0.0,
     "GF_MAX_VER_DIST": 0.0,
@@ -202,7 +202,11 @@ class Copter:
 
     def _fail_safe(self) -> None:
         """What the autopilot does of itself."""
-        if self.px4 and self.mode == "OFFBOARD" and self.t_s - self.streamed_s > OFFBOARD_LOSS_S:
+        if (
+            self.px4
+            and self.mode == "OFFBOARD"
+            and self.t_s - self.streamed_s > self.parameters["COM_OF_LOSS_T"]
+        ):
             self.set_mode("AUTO.RTL", "failsafe: no offboard setpoints")
         flies = self.armed and not self.landed
         home = "AUTO.RTL" if self.px4 else "RTL"

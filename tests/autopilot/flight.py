@@ -154,7 +154,7 @@ class Flight:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
             self.executed.append(bridge.step)
-            self.cells.append(bridge.goal)
+            self.cells.append(bridge.course.goal)
         if bridge.step != self._step:
             self._step = bridge.step
             self._check_step()

@@ -161,7 +161,7 @@ def towards(position: Enu, target: Enu, seconds: float, speeds_mps: dict[str, fl
 
 def way_home(bridge: Bridge) -> Action:
     """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.goal, bridge.scenario.dock_cell
+    (x, y, _), (dock_x, dock_y) = bridge.course.goal, bridge.scenario.dock_cell
     if x != dock_x:
         return Action.RIGHT if x < dock_x else Action.LEFT
     if y != dock_y:

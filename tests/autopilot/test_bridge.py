@@ -332,12 +332,12 @@ def test_a_vehicle_that_somebody_else_flew_is_not_armed_again(mode: Mode) -> Non
 
 def test_moves_out_of_turn_change_nothing() -> None:
     flight = fly_to_step(5)
-    before = flight.bridge.goal, flight.bridge.setpoint
+    before = flight.bridge.course.goal, flight.bridge.setpoint
     assert "expected it to be ready" in str(flight.bridge.move(5, Action.UPWARD))
     flight.policy = None
     flight.until(Phase.READY)
     assert flight.bridge.move(5, Action.UPWARD) == "a move for step 5; expected 6"
-    assert (flight.bridge.goal, flight.bridge.setpoint) == before
+    assert (flight.bridge.course.goal, flight.bridge.setpoint) == before
 
 
 FAULTS = st.sampled_from(

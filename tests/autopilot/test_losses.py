@@ -13,7 +13,7 @@ from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Limits, Mode, SetMode, TakeOff, Telemetry
 from uav_dc_ros.autopilot.watch import Settings
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.messages import FaultKind, Phase
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
 STEP_S = SCENARIO.mission.step_s
@@ -43,7 +43,7 @@ def test_a_circle_that_the_autopilot_keeps_in_silence_is_noticed() -> None:
     vehicle.reports_target = False
     flight.until(Phase.LANDING)
     assert flight.bridge.reason == "no nearer to cell (5, 0, 2) for 5 s, 100 m away from it"
-    assert (flight.bridge.step, flight.bridge.steps_not_reached) == (4, 0)
+    assert (flight.bridge.step, flight.bridge.course.steps_not_reached) == (4, 0)
     flight.until(Phase.ABORTED)
 
 
@@ -148,7 +148,7 @@ def test_a_step_that_is_late_goes_on_until_the_goal_is_the_nearest_cell() -> Non
     flight.until(Phase.LANDED, 6000.0)
     assert flight.executed == list(range(SCENARIO.mission.max_steps))
     assert max(flight.ended_m) <= math.hypot(50.0, 50.0, 25.0)
-    assert flight.bridge.steps_not_reached == sum(m > ARMING.tolerance_m for m in flight.ended_m) > 10
+    assert flight.bridge.course.steps_not_reached == sum(m > ARMING.tolerance_m for m in flight.ended_m) > 10
     assert any("flies on" in reason for _, _, reason in flight.log)
 
 
@@ -156,10 +156,10 @@ def test_how_many_steps_were_not_reached_is_known_after_a_restart() -> None:
     flight = slowly(4.0)
     while flight.bridge.step < 4:
         flight.tick()
-    missed = flight.bridge.steps_not_reached
+    missed = flight.bridge.course.steps_not_reached
     assert missed >= 3
     again = Flight(ARMING, flight.vehicle, standing=flight.bridge.standing)
-    assert again.bridge.steps_not_reached == missed
+    assert again.bridge.course.steps_not_reached == missed
 
 
 def test_a_step_that_ends_at_the_dock_is_flown_to_its_end() -> None:
@@ -380,8 +380,12 @@ def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(hold_s: flo
 def test_a_link_that_comes_back_in_time_is_held_through() -> None:
     flight = fly_to_step(5, Settings(arm=True, hold_s=20.0))
     cut(flight, 10.0)
+    assert (flight.bridge.fault_kind, flight.bridge.reason) == (
+        FaultKind.LINK, "link lost: no heartbeat for 3 s",
+    )  # fmt: skip
     flight.until(Phase.LANDED)
-    assert any(reason == "holds: link lost: no heartbeat for 3 s" for _, _, reason in flight.log)
+    assert flight.bridge.fault_kind is None
+    assert any(reason == "goes on after: link lost: no heartbeat for 3 s" for _, _, reason in flight.log)
 
 
 @pytest.mark.parametrize("reports", [True, False])

@@ -93,6 +93,8 @@ class FakeMavros:
                 c.arm(verb == "arm", "pilot")
             case "takeoff":
                 c.taking_off_to_m, c.take_off_s = float(words[0]), c.t_s
+            case "param":
+                c.parameters[words[0]] = float(words[1])
             case "battery":
                 c.battery = float(words[0])
             case "estimate_lost":

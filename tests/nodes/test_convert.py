@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from tests.conftest import outcome
 from tests.nodes import poses
 from tests.small_worlds import tiny
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes import convert
 
@@ -29,7 +29,7 @@ SCENARIO = tiny()
 @example(b"\0\1\0\0\xff\xff\xff\xff")
 @example(b"\0\0\0\0\0\0\0\2a\0")
 def test_any_bytes_are_a_text_or_malformed(data: bytes) -> None:
-    came = outcome(lambda: payloads.text_in_cdr(data))
+    came = outcome(lambda: cdr.text_in(data))
     if isinstance(came, MessageError):
         assert came.reason in ("malformed", "encapsulation")
     else:
@@ -38,8 +38,8 @@ def test_any_bytes_are_a_text_or_malformed(data: bytes) -> None:
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0")))
 def test_a_text_is_serialised_as_ros_does(text: str) -> None:
-    ours, theirs = payloads.cdr_of_text(text.encode()), serialize_message(String(data=text))
-    assert payloads.text_in_cdr(theirs) == text.encode()
+    ours, theirs = cdr.of_text(text.encode()), serialize_message(String(data=text))
+    assert cdr.text_in(theirs) == text.encode()
     assert deserialize_message(ours, String).data == text
 
 
@@ -78,3 +78,22 @@ def test_other_users_are_refused(convert_it: Callable[..., object], cluster: lis
         with pytest.raises(MessageError) as refused:
             convert_it(payload, SCENARIO)
         assert refused.value.reason == "layout"
+
+
+@given(st.binary(max_size=100), st.integers(0, 100))
+def test_any_bytes_are_a_pose_or_refused(junk: bytes, at: int) -> None:
+    honest = cdr.pose(np.asarray([1.0, 2.0, 3.0]), LATEST_NS)
+    for data in (junk, honest[:at], honest[:at] + junk, honest[:at] + junk + honest[at + len(junk) :]):
+        came = outcome(lambda data=data: cdr.Pose(data))
+        if isinstance(came, MessageError):
+            assert came.reason in ("malformed", "encapsulation", "frame", "not_finite")
+        else:
+            assert all(map(math.isfinite, came.position_m))
+            assert len(came.record) == len(honest) - cdr.HEAD
+
+
+@given(st.integers(0, LATEST_NS), st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3))
+def test_a_pose_is_serialised_as_ros_does(time_ns: int, position_m: tuple[float, float, float]) -> None:
+    theirs = serialize_message(poses.pose(np.asarray(position_m), time_ns))
+    assert cdr.pose(np.asarray(position_m), time_ns) == theirs
+    assert (cdr.Pose(theirs).stamp_ns, cdr.Pose(theirs).position_m) == (time_ns, position_m)

@@ -14,10 +14,10 @@ from rosbags.typesys import Stores, get_typestore
 from visualization_msgs.msg import Marker, MarkerArray
 
 from tests.nodes.poses import pose as pose_message
-from uav_dc_ros import scenarios
+from uav_dc_ros import cdr, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
-from uav_dc_ros.nodes import cdr, drawing
+from uav_dc_ros.nodes import drawing
 from uav_dc_ros.nodes.drawing import Scene, UserState
 from uav_dc_ros.nodes.track import POSES_MAX, Track
 
@@ -347,13 +347,14 @@ def test_a_way_of_any_length_stays_small() -> None:
     [
         (Phase.READY, "", "step 12 of 60"),
         (Phase.READY, "step 12: there", "step 12 of 60"),
-        (Phase.READY, "holds: no heartbeat for 3 s", "step 12 of 60: ready\nholds: no heartbeat for 3 s"),
+        (Phase.READY, "no heartbeat for 3 s", "step 12 of 60: ready (held)\nno heartbeat for 3 s"),
         (Phase.MOVING, "up to cell (3, 4, 1)", "step 12 of 60: moving\nup to cell (3, 4, 1)"),
         (Phase.ABORTED, "", "step 12 of 60: aborted"),
         (Phase.LANDING, "a " * 99, "step 12 of 60: landing" + 3 * ("\n" + " ".join("a" * 20))),
     ],
 )
 def test_the_text_tells_what_a_real_vehicle_does_and_why(phase: Phase, reason: str, expected: str) -> None:
-    mission = msgspec.structs.replace(MISSION, phase=phase, reason=reason)
+    held = reason.startswith("no ")
+    mission = msgspec.structs.replace(MISSION, phase=phase, reason=reason, held=held)
     text = drawing.status_text(SCENARIO, scene(mission=mission))
     assert text == f"{expected}\n2 of 50 users collected\n1.23 Mbit/s"

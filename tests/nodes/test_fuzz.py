@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from tests.conftest import Ros
 from tests.nodes import garbage
-from uav_dc_ros import messages, payloads, scenarios
+from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.table import NODES
 
@@ -75,7 +75,7 @@ def said_by_nodes(bag: Path) -> dict[str, list[Any]]:
             if topic not in said:
                 continue
             try:
-                text = payloads.text_in_cdr(data)
+                text = cdr.text_in(data)
                 payload = messages.decode(text, messages.PAYLOADS[topic])
             except MessageError:
                 continue

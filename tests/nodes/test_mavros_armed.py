@@ -184,7 +184,7 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
             vehicle.ask(wish)
         if bridge.phase is Phase.READY and bridge.fault is None:
             assert bridge.move(bridge.step, way_home(bridge)) is None
-            cells.append(bridge.goal)
+            cells.append(bridge.course.goal)
         vehicle.steer(bridge.setpoint)
     assert bridge.phase is Phase.LANDED, log[-5:]
     assert cells == [(2, 0, 0), (2, 1, 0), (2, 1, 0)]

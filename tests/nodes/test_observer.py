@@ -9,7 +9,7 @@ import pytest
 import rclpy
 
 from tests.conftest import Ros
-from uav_dc_ros import messages, payloads, scenarios
+from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
@@ -203,7 +203,7 @@ def test_who_keeps_messages_as_bytes_knows_those_of_another_run(bench: Bench) ->
         ('{"run": 7}', False),
         ('{"run":', False),
     ):
-        assert node.is_of_another_run("mission", payloads.cdr_of_text(text.encode())) is expected, text
+        assert node.is_of_another_run("mission", cdr.of_text(text.encode())) is expected, text
     assert node.meter.rejected["mission", "another_run"] == 2
     assert not node.is_of_another_run("path", b"")
 

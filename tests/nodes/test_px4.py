@@ -717,7 +717,7 @@ class Flight:
     def note(self) -> None:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and self.log[-1][0] is not Phase.MOVING:
-            self.cells.append(bridge.goal)
+            self.cells.append(bridge.course.goal)
         told = bridge.phase, bridge.step, bridge.reason
         if told not in self.log[-1:]:  # what is to be kept may change without
             self.log.append(told)
@@ -831,7 +831,7 @@ def test_without_a_position_it_holds_until_px4_gives_up(
     flight.do(fault)
     flight.until(lambda: flight.bridge.phase is Phase.LANDING)
     (phase, step, why), (_, _, end) = flight.log[-2:]
-    assert (phase.is_over, why) == (False, f"holds: {reason}")
+    assert (phase.is_over, why) == (False, reason)
     assert end.startswith(
         f"mode {mode} (failsafe): changed by a pilot or by the autopilot's failsafe (after: {reason}"
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from tests.autopilot.simulated import Vehicle
 from tests.recordings.made import BEGUN_NS, about, pose, said, write
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.autopilot.frames import Enu
@@ -144,12 +144,14 @@ class Flight:
             step=bridge.step,
             phase=bridge.phase,
             reason=bridge.reason,
+            held=bridge.fault_kind is not None,
+            fault=bridge.fault_kind,
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
             seed=self.seed,
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
-            steps_not_reached=bridge.steps_not_reached,
+            steps_not_reached=bridge.course.steps_not_reached,
         )
         if status == self._last:
             return  # as the node does
@@ -198,7 +200,7 @@ class Flight:
         self._say("move", messages.Move(mission=0, step=step, action=ACTION_LABELS[action]))
         if bridge.move(step, action) is None:
             self.executed.append(step)
-            goal = bridge.scenario.grid.centre_m(np.asarray(bridge.goal), like=np.zeros(1))
+            goal = bridge.scenario.grid.centre_m(np.asarray(bridge.course.goal), like=np.zeros(1))
             self._say("target", pose(goal.tolist(), self.now_ns))
 
     def _decided(self, status: messages.Mission, rates: messages.Rates) -> Action:
@@ -328,7 +330,7 @@ def flown_about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, s
 def phases(told: list[BagMessage]) -> list[tuple[int, Phase, str]]:
     """Step, phase and reason of each word of the vehicle."""
     found = [
-        msgspec.json.decode(payloads.text_in_cdr(message.data), type=messages.Mission)
+        msgspec.json.decode(cdr.text_in(message.data), type=messages.Mission)
         for message in told
         if message.topic == "/mission"
     ]

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from tests.bags.made import TYPES
-from uav_dc_ros import __version__, messages, payloads, topics
+from uav_dc_ros import __version__, cdr, messages, payloads, topics
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core import world
@@ -35,7 +35,7 @@ def pose(position_m: Sequence[float], stamp_ns: int, frame: str = "map") -> byte
 
 def said(topic: str, payload: messages.Payload | bytes, time_ns: int) -> BagMessage:
     """A message that was received when it was published; bytes are a pose."""
-    data = payload if isinstance(payload, bytes) else payloads.cdr_of_text(messages.encode(payload))
+    data = payload if isinstance(payload, bytes) else cdr.of_text(messages.encode(payload))
     return BagMessage(f"/{topic}", topics.TOPICS[topic].type, data, time_ns, time_ns)
 
 
@@ -70,7 +70,7 @@ def flight(
         phase, link = messages.Phase.READY, None
         while True:
             step = int(state.step)
-            time_ns = round((mission * (max_steps + 1) + step) * scenario.mission.step_s * 1e9)
+            time_ns = scenario.time_ns(mission, step)
             uav_m = scenario.grid.centre_m(state.cell, like=state.users_m)
             if link is None:
                 link = world.measure(scenario, uav_m, state.users_m, state.collected)
@@ -155,7 +155,7 @@ def changing(
     def apply(message: BagMessage) -> BagMessage | None:
         if message.topic != f"/{topic}":
             return message
-        payload = messages.decode(payloads.text_in_cdr(message.data), messages.PAYLOADS[topic])
+        payload = messages.decode(cdr.text_in(message.data), messages.PAYLOADS[topic])
         if (payload.mission, payload.step) != (mission, step):
             return message
         made = change(payload)

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from uav_dc_ros import messages, payloads, topics
+from uav_dc_ros import cdr, messages, payloads, topics
 from uav_dc_ros.bags.definitions import TYPESTORE
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core import world
@@ -102,7 +102,7 @@ def step_messages(
 ) -> Iterator[tuple[str, bytes]]:
     """Messages of a step, topic and content."""
     step = int(state.step)
-    stamp_ns = round((mission * (scenario.mission.max_steps + 1) + step) * scenario.mission.step_s * 1e9)
+    stamp_ns = scenario.time_ns(mission, step)
     _, _, landed = world.ends(scenario, state.step, state.cell)
     over = messages.Phase.LANDED if landed else messages.Phase.TIMEOUT
     said: dict[str, messages.Payload] = {
@@ -123,7 +123,7 @@ def step_messages(
         said["move"] = messages.Move(mission=mission, step=step, action=ACTION_LABELS[action])
     yield "pose", pose(stamp_ns, scenario.grid.centre_m(state.cell, like=state.users_m))
     for topic, payload in said.items():
-        yield topic, payloads.cdr_of_text(messages.encode(payload))
+        yield topic, cdr.of_text(messages.encode(payload))
 
 
 def unpacked(page: Path) -> dict[str, Any]:

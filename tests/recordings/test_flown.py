@@ -19,11 +19,11 @@ from tests.recordings.made import changing, copy, flight, said, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, read
 from tests.small_worlds import saved, tiny
 from uav_dc_ros import bag as command
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import cdr, messages
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.recordings.missions import look_through
 from uav_dc_ros.recordings.pages import missions as pages
 from uav_dc_ros.recordings.pages.vehicle import WAY_MAX, Way
@@ -73,7 +73,7 @@ def not_reached(tmp_path_factory):
     changed = []
     for message in told:
         if message.topic == "/mission":
-            payload = messages.decode(payloads.text_in_cdr(message.data), messages.Mission)
+            payload = messages.decode(cdr.text_in(message.data), messages.Mission)
             late = payload.step == 2 and payload.phase is not Phase.READY
             n = (payload.step > 1) + (payload.step > 2 or late)
             payload = msgspec.structs.replace(payload, steps_not_reached=n)
@@ -103,7 +103,7 @@ def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
     """One that was told before it, for the same end, is not."""
     told = flown.Flight(TINY, seed=5).fly()
     last = max(i for i, message in enumerate(told) if message.topic == "/mission")
-    payload = messages.decode(payloads.text_in_cdr(told[last].data), messages.Mission)
+    payload = messages.decode(cdr.text_in(told[last].data), messages.Mission)
     for i, reason in enumerate(("step 4: there", "the motors were stopped: by hand")):
         ended = msgspec.structs.replace(payload, phase=Phase.ABORTED, reason=reason)
         told.insert(last + i, said("mission", ended, told[last + i - 1].publish_time_ns + 1000))
@@ -163,7 +163,9 @@ def test_a_vehicle_that_is_ready_again_has_the_same_users_at_another_time():
     flight = flown.Flight(TINY, beat=frozen, patience_s=5.0)
     found, stream = read(flight.fly())
     reasons = [told.reason for told in found[0].told if told.phase is Phase.READY]
-    assert reasons[1:] == ["holds: no position for 0.5 s", f"goes on after: {reasons[1]}"]
+    assert reasons[1:] == ["no position for 0.5 s", f"goes on after: {reasons[1]}"]
+    kinds = [told.fault for told in found[0].told if told.phase is Phase.READY]
+    assert kinds == [None, FaultKind.POSITION, None]
     assert found[0].flight == found[-1].flight == 0, "it is no other flight"
     assert found[0].others["users"].stamp_ns > found[0].users.stamp_ns
     assert stream.repeated == {"rates": 1}
@@ -184,7 +186,7 @@ def test_what_a_middleware_repeats_is_counted_and_told_once():
 def test_a_vehicle_that_waits_for_hours_fills_no_memory():
     told = flown.Flight(TINY, beat=flown.FAULTS["ground"][0]).fly()
     i, word = next((i, m) for i, m in enumerate(told) if m.topic == "/mission")
-    status = messages.decode(payloads.text_in_cdr(word.data), messages.Mission)
+    status = messages.decode(cdr.text_in(word.data), messages.Mission)
     again = [
         said("mission", msgspec.structs.replace(status, reason=f"waits {n}"), word.log_time_ns + n)
         for n in range(1, TOLD_KEPT + 50)
@@ -296,7 +298,7 @@ def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
     moving = next(
         i
         for i in where
-        if (p := messages.decode(payloads.text_in_cdr(told[i].data), messages.Mission)).step == 3
+        if (p := messages.decode(cdr.text_in(told[i].data), messages.Mission)).step == 3
         and p.phase is Phase.MOVING
     )
     ready = max(i for i in where if i < moving)
@@ -378,7 +380,8 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
     assert out.endswith("\nverified\n")
     assert "phases of 8 of 8 steps looked at, each follows as it may; 7 moves were begun" in out
     told = [one for step in steps_of(bag)[0] for one in step.told]
-    assert "holds: the policy is gone" in {one.reason for one in told}
+    gone = (True, FaultKind.POLICY, "the policy is gone")
+    assert gone in {(one.held, one.fault, one.reason) for one in told}
     assert sum(one.phase is Phase.TAKEOFF for one in told) == 2
     status, out = run(capsys, "info", bag)
     assert "vehicle   mavlink" in out
@@ -387,6 +390,32 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
     assert "mission 0: landed: step 7: at the dock" in out
     journey = page_of(capsys, bag, ros.folder)["mission-0"]["journey"]
     assert max(journey["way"]["z"]) == pytest.approx(10.0, abs=2.0)
+
+
+def as_version_0_1(message):
+    """A word of the vehicle as it was once said: a fault had no field, and stood in the reason."""
+    payload = json.loads(cdr.text_in(message.data))
+    held, _ = payload.pop("held"), payload.pop("fault")
+    payload["reason"] = f"holds: {payload['reason']}" if held else payload["reason"]
+    return message._replace(data=cdr.of_text(json.dumps(payload).encode()))
+
+
+def test_a_bag_of_version_0_1_is_read_as_before(bags, capsys, tmp_path):
+    told = flown.Flight(TINY, seed=5, beat=flown.FAULTS["hold"][0]).fly()
+    old = [as_version_0_1(one) if one.topic == "/mission" else one for one in told]
+    bag = write(tmp_path / "old", old, flown.flown_about(TINY, 5))
+    words = [[one for step in steps_of(it)[0] for one in step.told] for it in (bag, bags["hold"])]
+    assert [one.held for one in words[0]] == [one.held for one in words[1]]
+    prefixes = ["holds: " if one.held else "" for one in words[1]]
+    assert any(prefixes)
+    assert [one.reason for one in words[0]] == [
+        prefix + one.reason for prefix, one in zip(prefixes, words[1], strict=True)
+    ]
+    texts = [run(capsys, "verify", it) for it in (bag, bags["hold"])]
+    assert texts[0] == (0, texts[1][1].replace(str(bags["hold"]), str(bag)))
+    pages = [page_of(capsys, it, tmp_path)["data"]["health"]["faults"] for it in (bag, bags["hold"])]
+    assert len(pages[0]) == len(pages[1]) == sum(map(bool, prefixes))
+    assert all(fault["what"].partition(": ")[2].startswith("holds: ") for fault in pages[0])
 
 
 # Info, export.
@@ -427,8 +456,8 @@ def test_an_export_has_reasons_phases_and_times(bags, capsys, tmp_path):
         there = next(t for t in step.told if t.phase in (Phase.READY, Phase.LANDING))
         assert float(row["flown_s"]) == pytest.approx((there.publish_ns - begun.publish_ns) / 1e9)
     assert sum(float(row["flown_s"]) for row in rows[1:5]) > 40.0, "a hundred metres take ten seconds"
-    words = [(int(r["step"]), r["phase"], r["reason"]) for r in table(tmp_path / "t", "phases")]
-    assert words == [(s.step, t.phase.value, t.reason) for s in found for t in s.told]
+    words = [(int(r["step"]), r["phase"], r["reason"], r["held"]) for r in table(tmp_path / "t", "phases")]
+    assert words == [(s.step, t.phase.value, t.reason, str(t.held).lower()) for s in found for t in s.told]
     (mission,) = table(tmp_path / "t", "missions")
     assert (mission["vehicle"], mission["outcome"], mission["reason"]) == (
         "mavlink", "landed", found[-1].status.reason,
@@ -480,7 +509,8 @@ def test_a_report_tells_phases_faults_and_the_way(bags, capsys, tmp_path, fault)
     (mission,) = data["data"]["missions"]
     assert (mission["outcome"], mission["reason"]) == (told[-1][1], told[-1][2])
     whats = [one["what"] for one in data["data"]["health"]["faults"]]
-    held = [f"step {step}: {reason}" for step, _, reason in told if reason.startswith("holds")]
+    held = [f"step {step.step}: {one.reason}" for step in found for one in step.told if one.held]
+    assert bool(held) == (fault in ("hold", "frozen"))
     ended = [f"aborted, after step {found[-1].step}: {told[-1][2]}"] if told[-1][1] == "aborted" else []
     assert whats == held + ended
     cells = journey["cells"]

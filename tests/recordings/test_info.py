@@ -13,7 +13,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from tests.bags.made import QOS, STRING, TYPES, content, information, text
 from tests.recordings import made
 from uav_dc_ros import bag as command
-from uav_dc_ros import messages, payloads, scenarios, topics
+from uav_dc_ros import cdr, messages, scenarios, topics
 from uav_dc_ros.bags.recover import recover
 from uav_dc_ros.bags.write import BagWriter
 
@@ -53,7 +53,7 @@ def write_step(
             t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
         ),
     )
-    serialised = {name: payloads.cdr_of_text(messages.encode(payload)) for name, payload in said.items()}
+    serialised = {name: cdr.of_text(messages.encode(payload)) for name, payload in said.items()}
     serialised["pose"] = bytes(TYPES.serialize_cdr(pose, topics.POSE))
     for i, (name, data) in enumerate(serialised.items()):
         if name not in without:

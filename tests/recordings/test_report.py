@@ -140,7 +140,7 @@ def test_faults_are_told_and_a_good_bag_has_none(made):
     ]
     (node,) = data["data"]["health"]["nodes"]
     assert (node["warnings"], node["restarts"], node["reports"]) == (2, "2", 3)
-    assert data["data"]["missions"][0]["outcome"] == "no end"
+    assert data["data"]["missions"][0]["outcome"] == "unfinished"
 
 
 def test_latencies_are_those_of_the_recording(made):

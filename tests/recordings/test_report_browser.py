@@ -13,7 +13,7 @@ import pytest
 from tests.recordings import flown, report_bags
 from tests.recordings.test_report import HOSTILE, report
 from tests.small_worlds import tiny
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import cdr, messages
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 if CHROMIUM is None:
@@ -248,7 +248,7 @@ def test_the_flight_of_a_real_vehicle(chromium, tmp_path):
     """Its reason is told, its phases are listed, and its way is drawn as far as the slider stands."""
     scenario = tiny()
     flight = flown.Flight(scenario, beat=flown.FAULTS["battery"][0])
-    said = [payloads.text_in_cdr(m.data) for m in flight.fly() if m.topic == "/mission"]
+    said = [cdr.text_in(m.data) for m in flight.fly() if m.topic == "/mission"]
     words = [messages.decode(text, messages.Mission) for text in said]
     told = [said_with(m, words[-1], HOSTILE) for m in flight.told]
     bag = flown.write(tmp_path / "bag", told, flown.flown_about(scenario))
@@ -279,10 +279,10 @@ def test_the_flight_of_a_real_vehicle(chromium, tmp_path):
 
 def said_with(message: Any, last: messages.Mission, reason: str) -> Any:
     """The message, with another reason if it is the last word."""
-    if message.data != payloads.cdr_of_text(messages.encode(last)):
+    if message.data != cdr.of_text(messages.encode(last)):
         return message
     other = msgspec.structs.replace(last, reason=reason)
-    return message._replace(data=payloads.cdr_of_text(messages.encode(other)))
+    return message._replace(data=cdr.of_text(messages.encode(other)))
 
 
 def test_a_comparison_is_drawn_and_fits_a_phone_too(browser, comparison_page):

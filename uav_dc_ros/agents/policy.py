@@ -5,8 +5,6 @@ A policy is a folder: `config.json` (a `PolicyConfig`), `model.safetensors` (the
 """
 
 import hashlib
-import os
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -237,21 +235,17 @@ def save(
         PolicyError: `folder` exists or cannot be written, or what was written cannot be loaded.
     """
     refuse_existing(folder)
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in parameters.items()}
     try:
-        partial.mkdir(parents=True)
-        arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in parameters.items()}
-        (partial / MODEL).write_bytes(safetensors.numpy.save(arrays))
-        (partial / CONFIG).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2) + b"\n")
-        made = load(partial)
-        (partial / CARD).write_text(card(made), "utf-8")
-        if draw:
-            draw(made, partial)
-        files.place(partial, folder)
+        with files.building(folder) as partial:
+            (partial / MODEL).write_bytes(safetensors.numpy.save(arrays))
+            (partial / CONFIG).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2) + b"\n")
+            made = load(partial)
+            (partial / CARD).write_text(card(made), "utf-8")
+            if draw:
+                draw(made, partial)
     except OSError as error:
         raise PolicyError(f"policy {str(folder)!r} cannot be written: {error}") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def refuse_existing(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
     idle -> connecting -> preflight -> takeoff -> ready <-> moving -> landing -> landed | timeout | aborted
 
+It enters no phase that may not follow by the table `phases.TRANSITIONS`.
 It decides, and does nothing itself: `tick` is called often with what is known of the vehicle, and returns
 wishes for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
 last good setpoint stays), then to *return* or *land*, and at last to `aborted` with its reason. A pilot who
@@ -10,6 +11,7 @@ brings it down (an autopilot's failsafe does that, too), it is watched until it 
 """
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import msgspec
 
@@ -24,17 +26,14 @@ from uav_dc_ros.autopilot.hold import Hold
 from uav_dc_ros.autopilot.patience import Patience
 from uav_dc_ros.autopilot.progress import Tracking
 from uav_dc_ros.autopilot.vehicle import Mode, SetMode, TakeOff, Telemetry, Wish
-from uav_dc_ros.autopilot.watch import Fault, FaultKind, Settings, Watch
+from uav_dc_ros.autopilot.watch import Settings, Watch
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.errors import PhaseError
+from uav_dc_ros.messages import FaultKind, Phase
+from uav_dc_ros.phases import DECIDED, FLYING, GROUND, STEERED, impossible
 
-__all__ = ["Bridge", "Standing"]
-
-GROUND = (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT)
-FLYING = (Phase.TAKEOFF, Phase.READY, Phase.MOVING, Phase.LANDING)
-DECIDED = (Phase.READY, Phase.MOVING)  # by a policy
-STEERED = (Phase.TAKEOFF, Phase.READY, Phase.MOVING)  # by setpoints
+POLICY_IS_GONE = "the policy is gone"
 
 
 class Bridge:
@@ -53,7 +52,10 @@ class Bridge:
         course: steps flown, the cell reached last, and the cell that it flies to.
         setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
         policy_is_gone: to be set while nobody is there who would decide the next move: the vehicle stops.
+        is_strict: raise PhaseError where a phase cannot follow (in tests); otherwise give up the mission.
     """
+
+    is_strict: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -69,6 +71,7 @@ class Bridge:
         self.course = Course(scenario, standing)
         self.setpoint: Enu | None = None
         self.policy_is_gone = False
+        self._entered_step = self.step  # when the phase was entered
         self._on_change = on_change
         self._asked = Asked(settings)
         self._since_s = 0.0  # vehicle time of the last change of phase
@@ -105,19 +108,18 @@ class Bridge:
         return self.course.cell
 
     @property
-    def goal(self) -> Cell:
-        """The cell that it is in, or flies to."""
-        return self.course.goal
-
-    @property
     def fault(self) -> str | None:
         """What keeps it from going on at the moment; None: nothing."""
         return self._hold.fault.why if self._hold.fault is not None else None
 
     @property
-    def steps_not_reached(self) -> int:
-        """Of the steps flown, how many ended away from their cell's centre."""
-        return self.course.steps_not_reached
+    def fault_kind(self) -> FaultKind | None:
+        """The kind of the fault that holds the vehicle; None: nothing holds it."""
+        if self.phase not in STEERED:
+            return None
+        if self._hold.fault is not None:
+            return self._hold.fault.kind
+        return FaultKind.POLICY if self._patience.gone_since is not None else None
 
     @property
     def discarded(self) -> dict[str, int]:
@@ -146,8 +148,8 @@ class Bridge:
             kept,
             step=self.step,
             cell=self.cell,
-            goal=self.goal if self._finishes or self.phase is Phase.MOVING else None,
-            steps_not_reached=self.steps_not_reached,
+            goal=self.course.goal if self._finishes or self.phase is Phase.MOVING else None,
+            steps_not_reached=self.course.steps_not_reached,
             flies=True,
             released=self._taken or (self.is_over and not self._known.armed),
             outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
@@ -291,22 +293,19 @@ class Bridge:
         if known.position is not None and (breach := self.fence.breach(known.position)) is not None:
             self._give_up(f"the vehicle is outside the fence: {breach}")
             return
-        fault = self._watched.fault(now_s, known) or self._strays(known)
+        fault = self._watched.fault(now_s, known)
+        if fault is None and self.phase in DECIDED:
+            fault = self._tracking.fault(known, self.phase is Phase.MOVING and not self.policy_is_gone)
         match self._hold.look(now_s, known, fault):
             case "begins" | "turns":
-                self._change(f"holds: {self.fault}")
+                self._change(str(self.fault))
+            case "passes" if self._patience.gone_since is not None:
+                self._change(POLICY_IS_GONE)
             case "passes":
                 self._change(f"goes on after: {self.reason}")
             case "ends" if (lasting := self._hold.fault) is not None:
                 blind_since_s = self._hold.since_s[0] if lasting.kind is FaultKind.POSITION else None
                 self._give_up(lasting.why, None, blind_since_s)
-
-    def _strays(self, known: Telemetry) -> Fault | None:
-        """Does it not fly to where a move has sent it."""
-        if self.phase not in DECIDED:
-            return None
-        moves = self.phase is Phase.MOVING and not self.policy_is_gone
-        return self._tracking.ignored(known) or (self._tracking.stalled(known) if moves else None)
 
     def _policy_lives(self, known: Telemetry) -> bool:
         """Is there somebody who decides; until there is, the vehicle stops, and the step's time with it."""
@@ -315,7 +314,7 @@ class Bridge:
             self._patience.gone_since = now
             if self.phase is Phase.MOVING and known.position is not None:
                 self.setpoint = known.position
-            self._change("holds: the policy is gone")
+            self._change(POLICY_IS_GONE)
         elif self.policy_is_gone and since is not None and self._patience.is_over(since, now):
             self._give_up(f"the policy has been gone for {self._patience.limit_s:g} s")
         elif not self.policy_is_gone and since is not None:
@@ -429,11 +428,16 @@ class Bridge:
         self._enter(Phase.LANDING, why)
 
     def _end(self, phase: Phase, why: str) -> None:
-        self.setpoint, self._hold.fault = None, None
+        before, self.setpoint, self._hold.fault = self.setpoint, None, None
         self._enter(phase, why)
+        if not self.is_over:
+            self.setpoint = before
 
     def _enter(self, phase: Phase, why: str) -> None:
-        self.phase, self._since_s = phase, self._now_s
+        if (error := impossible(self.phase, phase, self.step - self._entered_step)) is not None:
+            self._refuse(error)
+            return
+        self.phase, self._since_s, self._entered_step = phase, self._now_s, self.step
         self._dwell.begin()
         self._tracking.begin()
         self._crash.begin(flies=phase in DECIDED)
@@ -442,6 +446,16 @@ class Bridge:
         self._asked.begin()
         self.reason = why
         self._on_change()
+
+    def _refuse(self, error: PhaseError) -> None:
+        """Give up a mission whose phases went wrong; one that comes down, or is over, stays so."""
+        if self.is_strict:
+            raise error
+        self._entered_step = self.step  # within a step, each phase may come down or end
+        if self.phase in STEERED:
+            self._give_up(f"an error of the bridge: {error}")
+        elif self.phase in GROUND:
+            self._end(Phase.ABORTED, f"an error of the bridge: {error}")
 
     def _change(self, why: str) -> None:
         """Tell another reason within a phase."""

@@ -3,7 +3,8 @@
 from typing import Literal
 
 from uav_dc_ros.autopilot.vehicle import Telemetry
-from uav_dc_ros.autopilot.watch import Fault, FaultKind
+from uav_dc_ros.autopilot.watch import Fault
+from uav_dc_ros.messages import FaultKind
 
 
 class Hold:

@@ -5,7 +5,8 @@ import math
 from uav_dc_ros.autopilot.course import Course
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.vehicle import Telemetry
-from uav_dc_ros.autopilot.watch import Fault, FaultKind, Settings
+from uav_dc_ros.autopilot.watch import Fault, Settings
+from uav_dc_ros.messages import FaultKind
 
 NEARER_M = 1.0  # by what a vehicle has to come nearer to count as doing so
 TARGET_M = 1.0  # by what a target that the autopilot reports may differ from the setpoint, beyond tolerance
@@ -77,7 +78,11 @@ class Tracking:
         if setpoint != self._setpoint:
             self._setpoint, self._sent_s = setpoint, now_s
 
-    def ignored(self, known: Telemetry) -> Fault | None:
+    def fault(self, known: Telemetry, moves: bool) -> Fault | None:
+        """Does it not fly to where it is sent, or, while it `moves`, come no nearer."""
+        return self._ignored(known) or (self._stalled(known) if moves else None)
+
+    def _ignored(self, known: Telemetry) -> Fault | None:
         """Has the autopilot reported another target than the setpoint for too long."""
         target, target_s, setpoint = known.target, known.target_s, self._setpoint
         off_m = 0.0
@@ -93,7 +98,7 @@ class Tracking:
         why = f"the autopilot does not take its target: it reports one {off_m:.0f} m from the setpoint"
         return Fault(FaultKind.TARGET, why)
 
-    def stalled(self, known: Telemetry) -> Fault | None:
+    def _stalled(self, known: Telemetry) -> Fault | None:
         """Does a vehicle that is late come no nearer to the goal. To be asked often while it moves."""
         if known.position is None or known.position_s == self._position_s:
             return self._stall

@@ -90,8 +90,9 @@ class Session:
             self._ask_s = following(self._ask_s, ASK_S, now_s)
             self._ask_for_messages(now_s)
         wishes, self._wishes = self._wishes, []
-        for wish in () if hearing.doubts_mode(now_s) else wishes:  # not against a pilot; they are repeated
-            self._send_wish(wish, now_s)
+        if not hearing.doubts_mode(now_s):  # it may be a pilot; the bridge sends again what was not executed
+            for wish in wishes:
+                self._send_wish(wish, now_s)
         streamed, streamed_vehicle_s = self._streamed
         due = now_s >= self.stream_s or self._setpoint != streamed
         if due or vehicle_s - streamed_vehicle_s >= STREAM_VEHICLE_S:

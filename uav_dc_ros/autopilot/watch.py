@@ -2,13 +2,13 @@
 
 import dataclasses
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Literal
 
 from uav_dc_ros.autopilot.battery import Battery
 from uav_dc_ros.autopilot.frames import Enu
 from uav_dc_ros.autopilot.plausibility import Plausibility
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry
+from uav_dc_ros.messages import FaultKind
 
 ESTIMATE_AGE_S = 3.0  # age after which the last report on an estimate says nothing, steady clock
 HEARTBEATS_S = 1.5  # a link whose last heartbeat is that much younger than another message is alive
@@ -80,17 +80,6 @@ class Settings:
     tilt_limit_deg: float = 70.0
     sink_limit_m: float = 10.0
     crash_s: float = 1.0
-
-
-class FaultKind(StrEnum):
-    """What keeps a vehicle from going on."""
-
-    LINK = "link"
-    POSITION = "position"
-    ESTIMATE = "estimate"
-    CLOCK = "clock"
-    TARGET = "target"
-    PROGRESS = "progress"
 
 
 @dataclass(frozen=True)

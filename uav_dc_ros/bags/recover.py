@@ -5,9 +5,6 @@ What was lost is told: how many bytes, where, and between which messages.
 """
 
 import argparse
-import contextlib
-import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,26 +82,21 @@ def recover(path: Path, folder: Path) -> Recovered:
     if folder.exists() or folder.is_symlink():
         raise BagError(f"bag folder {folder} exists already; expected a new one")
     sources = storage_files(path)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    recovered: list[RecoveredPart] = []
     try:
-        temporary.mkdir(parents=True)
-        recovered: list[RecoveredPart] = []
-        for source in sources:
-            number = sum(part.part is not None for part in recovered)
-            recovered.append(_recover_part(source, temporary / f"{folder.name}_{number}.mcap"))
-        parts = [part.part for part in recovered if part.part is not None]
-        if not parts:
-            told = "; ".join(f"{part.source.name}: {part.why}" for part in recovered)
-            raise BagError(f"nothing can be recovered from {path}: {told}")
-        write_metadata(temporary, parts)
-        if folder.exists():  # made in the meantime
-            raise BagError(f"bag folder {folder} exists already; expected a new one")
-        files.place(temporary, folder)
+        with files.building(folder) as temporary:
+            for source in sources:
+                number = sum(part.part is not None for part in recovered)
+                recovered.append(_recover_part(source, temporary / f"{folder.name}_{number}.mcap"))
+            parts = [part.part for part in recovered if part.part is not None]
+            if not parts:
+                told = "; ".join(f"{part.source.name}: {part.why}" for part in recovered)
+                raise BagError(f"nothing can be recovered from {path}: {told}")
+            write_metadata(temporary, parts)
+            if folder.exists():  # made in the meantime
+                raise BagError(f"bag folder {folder} exists already; expected a new one")
     except OSError as error:
         raise BagError(f"bag folder {folder} cannot be written: {error.strerror}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(temporary)
     return Recovered(folder=folder, parts=recovered)
 
 

@@ -22,7 +22,7 @@ from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metadata, Schema
 from mcap.summary import Summary
 
-from uav_dc_ros import payloads
+from uav_dc_ros import cdr
 from uav_dc_ros.bags.frames import (
     CDR,
     COMPRESSIONS,
@@ -332,9 +332,9 @@ class Scan:
         """Look whether a payload is CDR, as far as that can be told without its type; of a text, whole."""
         try:
             if self.part.topics[topic]["type"] == JSON:
-                payloads.text_in_cdr(data)
+                cdr.text_in(data)
             else:
-                payloads.byte_order(data)
+                cdr.byte_order(data)
         except MessageError as error:
             self.unreadable.enter(topic, error)
 

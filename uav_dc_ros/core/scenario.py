@@ -157,6 +157,15 @@ class Scenario(_Section, frozen=True, dict=True):
         return tuple(self.users.cluster_centres_m[i] for i in self.user_cluster)
 
     @cached_property
+    def step_ns(self) -> int:
+        """Duration of a step, nanoseconds."""
+        return round(self.mission.step_s * 1e9)
+
+    def time_ns(self, mission: int, step: int) -> int:
+        """Mission time of a step, nanoseconds; missions follow each other one step apart."""
+        return round((mission * (self.mission.max_steps + 1) + step) * self.mission.step_s * 1e9)
+
+    @cached_property
     def start_cell(self) -> tuple[int, int, int]:
         """Cell in which a mission starts."""
         cell = self.grid.cell_at(self.mission.start_m)

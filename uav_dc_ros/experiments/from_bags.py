@@ -67,7 +67,7 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
         n_before, unreadable = n, list[str]()
         with BagReader(bag) as reader:
             for namespace in steps.namespaces(reader):
-                recorded = steps.Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
+                recorded = steps.Steps(reader, namespace, scenario.step_ns)
                 ours = Transitions(_checked(recorded, scenario, bag), scenario, population.observation)
                 for transition in ours:
                     training.remember(transition)

@@ -13,8 +13,9 @@ from contextlib import ExitStack
 import msgspec
 import numpy as np
 
-from uav_dc_ros import messages, scenarios
-from uav_dc_ros.autopilot.bridge import Bridge, Standing
+from uav_dc_ros import cdr, messages, scenarios
+from uav_dc_ros.autopilot.bridge import Bridge
+from uav_dc_ros.autopilot.course import Standing
 from uav_dc_ros.autopilot.fence import Fence
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.plausibility import Plausibility
@@ -24,7 +25,7 @@ from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError, UavDcError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import cdr, datums, runtime, vehicles
+from uav_dc_ros.nodes import datums, runtime, vehicles
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.lease import Lease
 from uav_dc_ros.nodes.mission_node import MissionNode
@@ -293,19 +294,21 @@ class AutopilotBridge(MissionNode):
             step=bridge.step,
             phase=bridge.phase,
             reason=messages.told(waits or bridge.reason),
+            held=bridge.fault_kind is not None,
+            fault=bridge.fault_kind,
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
-            steps_not_reached=bridge.steps_not_reached,
+            steps_not_reached=bridge.course.steps_not_reached,
             seed=self.values["seed"],
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
         )
         if status != self._told:
             self._told = status
-            self._news.append(f"{status.phase}, step {status.step}: {status.reason}")
+            self._news.append(f"{status.state}, step {status.step}: {status.reason}")
             self.say("mission", status)
             if not self.is_supervised and bridge.phase not in (Phase.READY, Phase.MOVING):
-                self.get_logger().info(f"{status.phase}: {status.reason}")
+                self.get_logger().info(f"{status.state}: {status.reason}")
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """Where the mission and the vehicle stand."""

@@ -8,11 +8,11 @@ from collections import deque
 
 import numpy as np
 
-from uav_dc_ros import messages, payloads, scenarios
+from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import MessageError, NodeError
-from uav_dc_ros.nodes import cdr, runtime
+from uav_dc_ros.nodes import runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 
@@ -31,7 +31,6 @@ class ChannelMonitor(MissionNode):
         self.scenario = scenarios.load(self.values["scenario"])
         self.message_bytes = {"rates": USER_BYTES * self.scenario.n_users}
         self.journal = Journal(self.values["journal"])
-        self._step_ns = round(self.scenario.mission.step_s * 1e9)
         self._said: messages.Rates | None = None
         self._forget()
         self._restore()
@@ -94,7 +93,9 @@ class ChannelMonitor(MissionNode):
         for waiting in tuple(self._users):
             users, users_m, published_ns = waiting
             begun_ns = users.stamp_ns
-            poses = [heard for heard in self._poses if 0 <= heard[0].stamp_ns - begun_ns < self._step_ns]
+            poses = [
+                heard for heard in self._poses if 0 <= heard[0].stamp_ns - begun_ns < self.scenario.step_ns
+            ]
             if not poses:
                 continue
             while (passed := self._users.popleft()) is not waiting:

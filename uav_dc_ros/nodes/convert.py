@@ -5,10 +5,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rosgraph_msgs.msg import Clock
 
+from uav_dc_ros import cdr
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.errors import MessageError
-
-FRAME = "map"  # ENU, as everywhere in this project
 
 
 def clock(time_ns: int) -> Clock:
@@ -32,10 +30,7 @@ def position_m(message: PoseStamped) -> Array:
     Raises:
         MessageError: another frame than `map`, or a position that is not finite.
     """
-    if message.header.frame_id != FRAME:
-        raise MessageError("frame", f"frame {message.header.frame_id[:64]!r}; expected {FRAME!r}")
     point = message.pose.position
-    position = np.asarray([point.x, point.y, point.z], dtype=np.float64)
-    if not np.isfinite(position).all():
-        raise MessageError("not_finite", f"position {position.tolist()}; expected finite metres")
-    return position
+    position = point.x, point.y, point.z
+    cdr.check_position(message.header.frame_id, position)
+    return np.asarray(position, dtype=np.float64)

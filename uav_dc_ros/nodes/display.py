@@ -11,14 +11,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.messages import Mission, Phase
+from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes.observer import MissionSoFar
 from uav_dc_ros.nodes.output import Output
+from uav_dc_ros.phases import DECIDED
 
 REFRESH_S = 0.05
-DAILY = (Phase.READY, Phase.MOVING)  # phases of each step
-NEWS = ("at the start", "holds", "goes on")  # of them
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
 
 
@@ -50,7 +49,7 @@ class Display:
             disable=not self.console.is_terminal,
         )
         self._next_s = 0.0  # when the next step is shown
-        self._told: tuple[Phase, str] | None = None  # what the vehicle did last
+        self._told: Mission | None = None  # what the vehicle did last
         self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, told="")
 
     def step(self, now: MissionSoFar) -> None:
@@ -70,15 +69,16 @@ class Display:
             self._bar.update(self._task, description=title, completed=now.step, told=told)
 
     def vehicle(self, status: Mission) -> None:
-        """Tell what a real vehicle does, unless it is a step's daily work."""
-        told = status.phase, status.reason
-        if told == self._told or not status.reason:
+        """Tell what a real vehicle does, unless it is a step's daily work: a fault, and its end, is not."""
+        before, told = self._told, (status.state, status.reason)
+        if not status.reason or (before is not None and told == (before.state, before.reason)):
             return
-        self._told = told
-        if status.phase in DAILY and not status.reason.startswith(NEWS):
+        self._told = status
+        goes_on = before is not None and before.phase in DECIDED and not before.held
+        if status.phase in DECIDED and not status.held and goes_on:
             return
         self._bar.update(self._task, description=status.phase.value)
-        self.console.print(f"{status.phase}: {status.reason}", markup=False)
+        self.console.print(f"{status.state}: {status.reason}", markup=False)
 
     def node_line(self, node: str, line: str) -> None:
         """Pass on a line that a node printed."""

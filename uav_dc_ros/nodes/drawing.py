@@ -8,13 +8,11 @@ from enum import IntEnum
 import numpy as np
 from visualization_msgs.msg import Marker
 
+from uav_dc_ros.cdr import FRAME, Writer
 from uav_dc_ros.core import radio
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission, Phase
-from uav_dc_ros.nodes.cdr import Writer
-from uav_dc_ros.nodes.convert import FRAME
-from uav_dc_ros.recordings.step import HOLDS
 
 Rgba = tuple[float, float, float, float]
 Xyz = tuple[float, float, float]
@@ -114,13 +112,12 @@ def status_text(scenario: Scenario, scene: Scene) -> str:
     """Step, users collected and sum-rate, a line each; of a real vehicle what it does, and why."""
     lines = []
     if scene.mission is not None:
-        phase, reason = scene.mission.phase, scene.mission.reason
-        waits = phase is Phase.READY and not reason.startswith(HOLDS)
-        lines.append(
-            f"step {scene.mission.step} of {scenario.mission.max_steps}{'' if waits else f': {phase}'}"
-        )
-        if reason and not waits:
-            lines += textwrap.wrap(reason, REASON_WIDTH)[:REASON_LINES]
+        told = scene.mission
+        waits = told.phase is Phase.READY and not told.held
+        state = "" if waits else f": {told.state}"
+        lines.append(f"step {told.step} of {scenario.mission.max_steps}{state}")
+        if told.reason and not waits:
+            lines += textwrap.wrap(told.reason, REASON_WIDTH)[:REASON_LINES]
     if scene.sum_rate_bps is not None:
         lines.append(f"{int(np.sum(scene.collected))} of {scenario.n_users} users collected")
         lines.append(f"{scene.sum_rate_bps / 1e6:.2f} Mbit/s")

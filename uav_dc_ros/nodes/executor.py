@@ -13,10 +13,10 @@ from typing import Any
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from rclpy.utilities import get_default_context
+
+from uav_dc_ros.nodes import rclpy_private
 
 TURN_MAX, TURN_MAX_S = 100, 0.2  # messages of one topic, and their time, before the others get their turn
 # Quiet is what was so in as many turns: on a busy computer the middleware's thread may have had no time yet.
@@ -97,7 +97,7 @@ class DirectExecutor:
         self._looked_s = time.monotonic()
         subscriptions = [entity for node in self._nodes for entity in node.subscriptions]
         if len(subscriptions) > len(self._subscriptions):
-            self._few = _rclpy.WaitSet(len(subscriptions), 1, 0, 0, 0, 0, self._context.handle)
+            self._few = rclpy_private.wait_set(self._context, len(subscriptions), 1, 0, 0, 0)
         self._subscriptions = subscriptions
 
     def _take_what_comes(self) -> bool:
@@ -150,7 +150,7 @@ class DirectExecutor:
 
     def _take_messages(self, subscription: Any) -> None:
         handle = subscription.handle
-        with_info = subscription._callback_type is Subscription.CallbackType.WithMessageInfo
+        with_info = rclpy_private.takes_info(subscription)
         until_s = time.monotonic() + TURN_MAX_S
         with handle:  # raises InvalidHandle, if it was destroyed since it became ready
             for _ in range(self._at_once):
@@ -170,9 +170,7 @@ class DirectExecutor:
         """The wait set, empty, with room for subscriptions, guards, timers, clients, services."""
         if any(has < wants for has, wants in zip(self._capacity or (0,) * 5, capacity, strict=True)):
             self._capacity = capacity
-            subscriptions, guards, timers, clients, services = capacity
-            context = self._context.handle
-            self._wait_set = _rclpy.WaitSet(subscriptions, guards, timers, clients, services, 0, context)
+            self._wait_set = rclpy_private.wait_set(self._context, *capacity)
         self._wait_set.clear_entities()
         return self._wait_set
 

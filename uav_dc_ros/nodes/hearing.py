@@ -4,15 +4,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rclpy.event_handler import (
-    QoSSubscriptionEventType,
-    SubscriptionEventCallbacks,
-    UnsupportedEventTypeError,
-)
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.event_handler import QoSSubscriptionEventType, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from uav_dc_ros.nodes.rclpy_private import EventCount
 
 Callback = Callable[[bytes, Any], None]
 
@@ -34,29 +31,18 @@ class _Ear:
 
     def __init__(self, subscription: Any) -> None:
         self.subscription = subscription
-        kind = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST
-        try:
-            self._event = _rclpy.EventHandle(subscription.handle, kind)
-        except UnsupportedEventTypeError:
-            self._event = None
+        self._losses = EventCount(subscription, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST)
+        self.close = self._losses.close
 
     def lost(self) -> int:
         """Messages that were lost until now; 0 with a middleware that does not count."""
-        if self._event is None:
-            return 0
-        with self._event:
-            return int(self._event.take_event().total_count)
+        count = self._losses.take()
+        return 0 if count is None else int(count.total_count)
 
     def take(self) -> Any:
         """The next message and its info; None if there is none now."""
         with self.subscription.handle:
             return self.subscription.handle.take_message(self.subscription.msg_type, True)
-
-    def close(self) -> None:
-        """Let go of the count."""
-        if self._event is not None:
-            self._event.destroy_when_not_in_use()
-            self._event = None
 
 
 class Hearing:

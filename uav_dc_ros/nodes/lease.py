@@ -9,18 +9,13 @@ alone: one that asked for the messages, too, would not match publishers that off
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.event_handler import (
-    QoSSubscriptionEventType,
-    SubscriptionEventCallbacks,
-    UnsupportedEventTypeError,
-)
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.event_handler import QoSSubscriptionEventType, SubscriptionEventCallbacks
 from rclpy.node import Node
 
 from uav_dc_ros.nodes import qos
+from uav_dc_ros.nodes.rclpy_private import EventCount
 from uav_dc_ros.topics import Topic
 
 MISSED_S = 1.25  # without an assertion, after which the middleware reports liveliness as lost
@@ -81,18 +76,12 @@ class Lease:
             raw=True,
         )
         kind = QoSSubscriptionEventType.RCL_SUBSCRIPTION_LIVELINESS_CHANGED
-        try:
-            self._event: Any = _rclpy.EventHandle(self._subscription.handle, kind)
-        except UnsupportedEventTypeError:
-            self._event = None
+        self._liveliness = EventCount(self._subscription, kind)
 
     def is_gone(self) -> bool:
         """Was somebody there who is not any more. Never so with publishers that offer no lease."""
-        if self._event is None:
-            return False
-        with self._event:
-            alive = bool(self._event.take_event().alive_count)
-        return self._confirmed.is_gone(alive)
+        count = self._liveliness.take()
+        return count is not None and self._confirmed.is_gone(bool(count.alive_count))
 
     def hear(self) -> None:
         """Note that somebody has published: one that offers no lease, maybe, in place of one that did."""
@@ -100,9 +89,7 @@ class Lease:
 
     def close(self) -> None:
         """Look no more."""
-        if self._event is not None:
-            self._event.destroy_when_not_in_use()
-            self._event = None
+        self._liveliness.close()
         self._node.destroy_subscription(self._subscription)
 
 

@@ -14,10 +14,10 @@ from rcl_interfaces.msg import (
 )
 from rclpy.context import Context
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from uav_dc_ros.errors import ParameterError, UavDcError
+from uav_dc_ros.nodes import rclpy_private
 from uav_dc_ros.nodes.parameters import EVERY, Parameter
 from uav_dc_ros.nodes.table import NODES
 
@@ -53,8 +53,7 @@ class ManagedNode(LifecycleNode):
         self.values: dict[str, Any] = {}
         self.failure: UavDcError | None = None
         self._is_active = False
-        self._change_state = self._service_change_state.callback
-        self._service_change_state.callback = self._refuse_impossible
+        self._change_state = rclpy_private.answer_transitions(self, self._refuse_impossible)
         self._declare()
 
     # Parameters.
@@ -66,13 +65,14 @@ class ManagedNode(LifecycleNode):
             ParameterError: a value that cannot be, or a parameter that the node does not have.
         """
         rows = {row.name: row for row in (*EVERY, *self.row.parameters)}
+        overrides = rclpy_private.overrides(self)
         for row in rows.values():
-            if (given := self._parameter_overrides.get(row.name)) is not None:
-                self._parameter_overrides[row.name] = _typed(given, row)
+            if (given := overrides.get(row.name)) is not None:
+                overrides[row.name] = _typed(given, row)
             try:
                 value = self.declare_parameter(row.name, row.default, _descriptor(row)).value
             except InvalidParameterValueException:
-                value = self._parameter_overrides[row.name].value
+                value = overrides[row.name].value
             self.values[row.name] = row.value(value)
         self._refuse_unknown("", list(rows))
         for peer in self.values["peers"]:
@@ -85,7 +85,7 @@ class ManagedNode(LifecycleNode):
 
     def _refuse_unknown(self, kind: str, known: Sequence[str]) -> None:
         """Refuse parameters that were given, and that the node has not declared: typing errors, mostly."""
-        for name in self._parameter_overrides:
+        for name in rclpy_private.overrides(self):
             if name.startswith("qos_overrides.") == bool(kind) and not self.has_parameter(name):
                 close = difflib.get_close_matches(name, known, 1)
                 meant = f"did you mean {close[0]!r}?" if close else f"expected some of {', '.join(known)}"
@@ -115,7 +115,7 @@ class ManagedNode(LifecycleNode):
     @property
     def state(self) -> str:
         """State of the life cycle: `unconfigured`, `inactive`, `active` or `finalized`."""
-        return str(self._state_machine.current_state[1])
+        return rclpy_private.state(self)
 
     def configure(self) -> None:
         """Load and check what the parameters name.
@@ -207,7 +207,7 @@ class ManagedNode(LifecycleNode):
         """Answer a wish for a transition that this state does not have: rclpy would end the node."""
         try:
             return self._change_state(request, response)
-        except _rclpy.RCLError:
+        except rclpy_private.RCLError:
             wanted = request.transition.label or request.transition.id
             self.get_logger().warning(f"transition {wanted}: not one from the state {self.state}")
             response.success = False

@@ -15,9 +15,9 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.publisher import Publisher
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from uav_dc_ros import messages, payloads, topics
+from uav_dc_ros import cdr, messages, topics
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import cdr, diagnostics, qos, rivals
+from uav_dc_ros.nodes import diagnostics, qos, rivals
 from uav_dc_ros.nodes.control import SUPERVISED
 from uav_dc_ros.nodes.diagnostics import Meter
 from uav_dc_ros.nodes.managed_node import ManagedNode
@@ -165,7 +165,7 @@ class MissionNode(ManagedNode):
                 if payload is None:
                     handle(cdr.Pose(data))
                 else:
-                    decoded = messages.decode(payloads.text_in_cdr(data), payload)
+                    decoded = messages.decode(cdr.text_in(data), payload)
                     self.check_run(topic.name, decoded.run)
                     handle(decoded)
             except MessageError as error:
@@ -227,7 +227,7 @@ class MissionNode(ManagedNode):
 
     def say_encoded(self, topic: str, text: bytes) -> None:
         """Publish a payload that was checked and encoded."""
-        self.publish(topic, payloads.cdr_of_text(text))
+        self.publish(topic, cdr.of_text(text))
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish a message, or its serialised form, on any topic."""

@@ -199,7 +199,7 @@ class Observer(MissionNode):
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Follow the vehicle."""
-        payloads.check_world(payload, self.scenario)
+        payloads.check(payload, self.scenario)
         if self.seed is not None and payload.seed != self.seed + payload.mission:
             raise MessageError(
                 "seed",
@@ -217,7 +217,7 @@ class Observer(MissionNode):
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Follow the collection."""
-        payloads.check_users(payload, self.scenario)
+        payloads.check(payload, self.scenario)
         self._hear(payload)
 
     def _hear(self, payload: messages.Mission | messages.Rates) -> None:

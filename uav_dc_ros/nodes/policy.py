@@ -35,13 +35,13 @@ class Policy(MissionNode):
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Note a step that the vehicle is ready for."""
-        payloads.check_world(payload, self.scenario)
+        payloads.check(payload, self.scenario)
         if payload.phase is messages.Phase.READY:
             self._hear(payload)
 
     def on_rates(self, payload: messages.Rates) -> None:
         """Note what has been collected by a step."""
-        payloads.check_users(payload, self.scenario)  # before it waits
+        payloads.check(payload, self.scenario)  # before it waits
         self._hear(payload)
 
     def _hear(self, payload: messages.Mission | messages.Rates) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
-from uav_dc_ros.nodes import message_types, qos
+from uav_dc_ros.nodes import message_types, qos, rclpy_private
 from uav_dc_ros.nodes.hearing import Hearing
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.topics import TOPICS, Topic
@@ -150,7 +150,7 @@ class BagNode(MissionNode):
         name = self.resolve_topic_name(topic.name)
         hearing = Hearing(self, name, topic.type, self._hear(name, topic.name, topic))
         override = f"qos_overrides.{name}.subscription."
-        overridden = any(given.startswith(override) for given in self._parameter_overrides)
+        overridden = any(given.startswith(override) for given in rclpy_private.overrides(self))
         all_of_it = replace(topic, asks_reliable=topic.reliable)
         subscription = self.create_raw_subscription(all_of_it, hearing.callback)
         hearing.add(subscription, adapts=not (topic.asks_reliable or overridden))

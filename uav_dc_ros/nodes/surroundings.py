@@ -37,7 +37,7 @@ class Surroundings:
         Raises:
             MessageError: a mission in another world, or with other users.
         """
-        payloads.check_world(payload, self._scenario)
+        payloads.check(payload, self._scenario)
         seed = self._seed + payload.mission
         if payload.seed != seed:
             raise MessageError(

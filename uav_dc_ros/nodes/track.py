@@ -2,8 +2,9 @@
 
 import math
 
+from uav_dc_ros.cdr import Pose
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.nodes.cdr import Pose
+from uav_dc_ros.recordings.thinning import Apart
 
 APART_CELLS = 0.05  # poses that lie nearer together than this, and come sooner than that, ...
 APART_NS = 2 * 10**9  # ... are one: a real vehicle tells twenty a second
@@ -30,11 +31,10 @@ class Track:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._step_ns = round(scenario.mission.step_s * 1e9)
+        self._step_ns = scenario.step_ns
         self._apart_m = APART_CELLS * scenario.grid.cell_m
-        self._apart = 1  # times `_apart_m` and APART_NS
         self.version = 0
-        self._poses: list[tuple[int, Pose]] = []  # with the time of publication
+        self._way: Apart[tuple[int, Pose]] = Apart(POSES_MAX)  # with the time of publication
         self._last: tuple[int, Pose] | None = None  # the newest one, kept or not
         self._targets: list[Pose] = []
         self._start_ns = -1  # time of the mission's start
@@ -46,19 +46,16 @@ class Track:
         self._last = published_ns, pose
         if self._poses and not self._is_apart(pose, self._poses[-1][1]):
             return
-        self._poses.append(self._last)
+        self._way.add(self._last)
         self.version += 1
-        if len(self._poses) > POSES_MAX:
-            self._poses = self._poses[::2]
-            self._apart *= 2
 
     def _is_apart(self, pose: Pose, last: Pose) -> bool:
         passed_ns = pose.stamp_ns - last.stamp_ns
         if passed_ns == 0:
             return False
-        if not 0 < passed_ns < APART_NS * self._apart:
+        if not 0 < passed_ns < APART_NS * self._way.factor:
             return True
-        return math.dist(pose.position_m, last.position_m) >= self._apart_m * self._apart
+        return math.dist(pose.position_m, last.position_m) >= self._apart_m * self._way.factor
 
     def target(self, target: Pose) -> None:
         """Add a target of before the first pose."""
@@ -78,8 +75,8 @@ class Track:
             return None
         self._start_ns = stamp_ns - step * self._step_ns
         self.version += 1
-        self._apart = 1
-        self._poses = [heard for heard in self._poses if self._is_of_now(heard, before_ns)]
+        before, self._way = self._way.kept, Apart(POSES_MAX)
+        self._way.kept += (heard for heard in before if self._is_of_now(heard, before_ns))
         if self._last is not None and not self._is_of_now(self._last, before_ns):
             self._last = None
         self._targets = [target for target in self._targets if target.stamp_ns >= self._start_ns]
@@ -103,6 +100,10 @@ class Track:
             return self._targets
         missed = [target for target in self._targets if target.stamp_ns < self._first_ns]
         return missed + [pose for _, pose in self._poses]
+
+    @property
+    def _poses(self) -> list[tuple[int, Pose]]:
+        return self._way.kept
 
     @property
     def _first_ns(self) -> int:

@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from uav_dc_ros import messages, payloads, scenarios
+from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import cdr, drawing, runtime
+from uav_dc_ros.nodes import drawing, runtime
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.track import Track
 from uav_dc_ros.topics import Topic
@@ -80,7 +80,7 @@ class Visualizer(MissionNode):
 
     def _take_users(self, name: str, data: bytes, published_ns: int) -> None:
         try:
-            heading = msgspec.json.decode(payloads.text_in_cdr(data), type=_Heading)
+            heading = msgspec.json.decode(cdr.text_in(data), type=_Heading)
         except (msgspec.DecodeError, RecursionError) as error:
             raise MessageError("malformed", str(error)) from None
         began_ns = self._track.users(
@@ -98,13 +98,8 @@ class Visualizer(MissionNode):
         if topic not in self._newest:
             return None
         try:
-            payload = messages.decode(payloads.text_in_cdr(self._newest[topic][1]), kind)
-            if isinstance(payload, messages.Mission):
-                payloads.check_world(payload, self.scenario)
-            if isinstance(payload, messages.Rates):
-                payloads.collection(payload, self.scenario)
-            if isinstance(payload, messages.Users):
-                payloads.users_m(payload, self.scenario)
+            payload = messages.decode(cdr.text_in(self._newest[topic][1]), kind)
+            payloads.check(payload, self.scenario)
         except MessageError as error:
             self.reject(topic, error)
             del self._newest[topic]

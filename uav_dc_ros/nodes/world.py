@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from rclpy.duration import Duration
 
-from uav_dc_ros import messages, payloads, scenarios
+from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
@@ -28,7 +28,7 @@ from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import cdr, convert, runtime
+from uav_dc_ros.nodes import convert, runtime
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.parameters import EXTERNAL
@@ -273,7 +273,7 @@ class World(MissionNode):
     def _tell(self) -> None:
         """Publish the state of this step. What the move waits for comes first."""
         position_m = self.scenario.grid.centre_m(self._cell, like=self._crowd.positions_m)
-        pose = cdr.pose(position_m, self._time_ns(self._step))
+        pose = cdr.pose(position_m, self.scenario.time_ns(self._mission, self._step))
         self.publish("pose", pose)
         if self._ahead is not None and self._ahead[:2] == (self._mission, self._step):
             self.say_encoded("users", self._ahead[2])
@@ -286,7 +286,7 @@ class World(MissionNode):
 
     def _users(self, step: int, users_m: Array) -> bytes:
         """The users of a step, metres `[U, 2]`, as they are said."""
-        time_ns = self._time_ns(step)
+        time_ns = self.scenario.time_ns(self._mission, step)
         return messages.encode(
             payloads.users(
                 self.scenario, users_m, mission=self._mission, step=step, time_ns=time_ns, run=self.run
@@ -309,17 +309,13 @@ class World(MissionNode):
             fingerprint=self.scenario.fingerprint,
         )
 
-    def _time_ns(self, step: int) -> int:
-        """Mission time of a step; missions follow each other one step apart."""
-        steps = self._mission * (self.scenario.mission.max_steps + 1) + step
-        return round(steps * self.scenario.mission.step_s * 1e9)
-
     def _now_ns(self) -> int:
         """Mission time now: at a pace it passes within a step, up to the next one."""
         passed_s = 0.0
         if self.pace is not None and self._phase is Phase.READY:
             passed_s = (time.monotonic() - self._step_began_s) * self.pace
-        return self._time_ns(self._step) + round(min(passed_s, self.scenario.mission.step_s) * 1e9)
+        begun_ns = self.scenario.time_ns(self._mission, self._step)
+        return begun_ns + round(min(passed_s, self.scenario.mission.step_s) * 1e9)
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
         """Where the mission stands, and whether its steps keep their time."""

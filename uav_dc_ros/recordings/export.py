@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
         if options.reward_form:
             paid = msgspec.structs.replace(scenario.reward, form=options.reward_form)
             scenario = msgspec.structs.replace(scenario, reward=paid)
-        recorded = Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
+        recorded = Steps(reader, namespace, scenario.step_ns)
         if options.transitions:
             write_transitions(
                 options.out, recorded, scenario, options.observation or "mission", printable(options.bag.name)

@@ -12,30 +12,9 @@ import numpy as np
 
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.phases import following
 from uav_dc_ros.recordings.compare import Book, Difference, difference
 from uav_dc_ros.recordings.step import RecordedStep, Told
-
-_OVER = (Phase.LANDED, Phase.TIMEOUT, Phase.ABORTED)
-_DOWN = (Phase.LANDING, Phase.ABORTED)
-# A bridge that was killed begins again at the same step (in earlier versions, at the next). It flies a move
-# that was begun to its end, so the next step may follow a take-off.
-_RESTARTED = (Phase.IDLE, Phase.CONNECTING)
-AFTER: dict[Phase, tuple[Phase, ...]] = {  # what may follow within a step
-    Phase.IDLE: (Phase.CONNECTING, *_DOWN),
-    Phase.CONNECTING: (Phase.PREFLIGHT, Phase.TAKEOFF, Phase.LANDING, *_OVER),
-    Phase.PREFLIGHT: (Phase.CONNECTING, Phase.TAKEOFF, *_DOWN),
-    Phase.TAKEOFF: (Phase.READY, *_DOWN),
-    Phase.READY: (Phase.MOVING, *_DOWN),
-    Phase.MOVING: _DOWN,
-    Phase.LANDING: _OVER,
-    Phase.LANDED: (),
-    Phase.TIMEOUT: (),
-    Phase.ABORTED: (),
-}
-NEXT_STEP: dict[Phase, tuple[Phase, ...]] = {
-    Phase.MOVING: (Phase.READY, Phase.LANDING),
-    Phase.TAKEOFF: (Phase.READY, Phase.LANDING),
-}
 
 
 @dataclass
@@ -115,7 +94,7 @@ class Flights(Book):
             (step.flight, step.mission, step.step)
         )
         self.apart.add(step, self._scenario)
-        self.holds += sum(told.holds for told in step.told)
+        self.holds += sum(told.held for told in step.told)
         if step.status is not None:
             self.not_reached[step.flight, step.mission] = step.status.steps_not_reached
         found = self._time(step)
@@ -137,12 +116,12 @@ class Flights(Book):
         found = []
         may_come: tuple[Phase, ...] | None = None
         if before is not None:
-            may_come = (*NEXT_STEP.get(before.phase, ()), *_RESTARTED)
+            may_come = following(before.phase, steps=1, restarts=True)
         for told in step.phases:
             if may_come is not None and told.phase not in may_come:
                 expected = ", ".join(may_come)
                 found.append(difference(step, "mission", "phase", told.phase.value, f"one of {expected}"))
-            may_come = (*AFTER[told.phase], *_RESTARTED)
+            may_come = following(told.phase, restarts=True)
         return found
 
     def _time(self, step: RecordedStep) -> list[Difference]:

@@ -6,41 +6,25 @@ from dataclasses import dataclass, field
 
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagDamagedError, BagError, UavDcError
+from uav_dc_ros.recordings.mission_totals import MissionTotals
 from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps, scenario
 
-NOT_OVER = "not over"
-
 
 @dataclass(kw_only=True)
-class MissionSurvey:
-    """A mission.
+class MissionSurvey(MissionTotals):
+    """A mission: of one that is not over, `reason` tells why it is as it is.
 
     Attributes:
         namespace: where it was flown, without a slash at its end.
         flight: counts runs in one bag from 0.
         mission: its index in its flight.
-        steps: steps flown.
-        outcome: `landed`, `timeout`, `aborted`, or `not over`.
-        reason: why, as a real vehicle tells; of one that is not over, why it is as it is. May be empty.
-        steps_not_reached: steps flown whose cell a real vehicle did not reach, as it says itself.
-        collected, users: users collected as the last rates tell, and all; None without rates.
-        seed, scenario, fingerprint: as the vehicle says.
         missing: messages of its steps that the bag lacks, by topic.
     """
 
     namespace: str
     flight: int
     mission: int
-    steps: int = 0
-    outcome: str = NOT_OVER
-    reason: str = ""
-    steps_not_reached: int = 0
-    collected: int | None = None
-    users: int | None = None
-    seed: int | None = None
-    scenario: str | None = None
-    fingerprint: str | None = None
     missing: dict[str, int] = field(default_factory=dict)
 
 
@@ -50,7 +34,7 @@ def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list
     found: list[MissionSurvey] = []
     try:
         try:
-            step_ns = round(scenario(reader, namespace).mission.step_s * 1e9)
+            step_ns = scenario(reader, namespace).step_ns
         except UavDcError:
             step_ns = 2**63  # the scenario is not known: the bag of another one
         steps = Steps(reader, namespace, step_ns)
@@ -64,7 +48,9 @@ def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list
                 _enter_missing(found[-1], before, last=False)
             if step.step > next_step:
                 _lack(found[-1], dict.fromkeys(STEP_TOPICS, step.step - next_step))
-            _enter(found[-1], step)
+            found[-1].add(step.step, step.status, step.rates)
+            if step.status is not None and not found[-1].is_over:
+                found[-1].reason = step.told[-1].reason if step.told else ""
             before = step
             if step.status is not None and step.status.phase.is_over:
                 _enter_missing(found[-1], step, last=True)
@@ -75,19 +61,6 @@ def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list
         return found
     problems += (f"{line}{where}" for line in steps.rejected.lines())
     return found
-
-
-def _enter(mission: MissionSurvey, step: RecordedStep) -> None:
-    mission.steps = step.step
-    if step.rates is not None:
-        mission.collected, mission.users = sum(step.rates.collected), len(step.rates.collected)
-    if step.status is not None:
-        mission.seed = step.status.seed
-        mission.steps_not_reached = step.status.steps_not_reached
-        mission.scenario, mission.fingerprint = step.status.scenario, step.status.fingerprint
-        mission.reason = step.told[-1].reason if step.told else ""
-        if step.status.phase.is_over:
-            mission.outcome, mission.reason = str(step.status.phase), step.status.reason
 
 
 def _enter_missing(mission: MissionSurvey, step: RecordedStep, *, last: bool) -> None:
@@ -123,10 +96,10 @@ def mission_problems(reader: BagReader, missions: list[MissionSurvey]) -> Iterat
             told = ", ".join(f"{n:,} {topic}" for topic, n in missing.items())
             yield f"steps{where} lack messages: {told}"
         for mission in flown:
-            if mission.outcome == NOT_OVER:
+            if not mission.is_over:
                 flight = f" of flight {mission.flight}" if mission.flight else ""
                 yield f"mission {mission.mission}{flight}{where} is not over at its step {mission.steps}"
         wanted = reader.about.get("missions", "")
-        n_flown = len({mission.mission for mission in flown if mission.outcome != NOT_OVER})
+        n_flown = len({mission.mission for mission in flown if mission.is_over})
         if wanted.isdecimal() and n_flown < int(wanted):
             yield f"{n_flown:,} of {int(wanted):,} missions{where} are there to their end"

@@ -232,11 +232,10 @@ class World(Book):
 
     def _made(self, step: RecordedStep, status: messages.Mission) -> list[Difference]:
         """What our own world makes beyond what any vehicle does."""
-        scenario, mission = self._scenario, self._scenario.mission
+        scenario = self._scenario
         first = self.seeds.setdefault(step.flight, status.seed - step.mission)
         found = self.column(step, "mission", "seed", status.seed, first + step.mission)
-        steps = step.mission * (mission.max_steps + 1) + step.step
-        time_ns = round(steps * mission.step_s * 1e9)
+        time_ns = scenario.time_ns(step.mission, step.step)
         if not self._real:
             found += self._poses(step, status, time_ns)
         if step.users is not None:
@@ -286,7 +285,7 @@ class Decisions(Book):
             if step.rates is None:
                 raise MessageError("missing", "no rates recorded")
             data_bits, collected = payloads.collection(step.rates, self._scenario)
-            payloads.check_world(status, self._scenario)
+            payloads.check(status, self._scenario)
         except MessageError as error:
             self.skip("rates or mission of another world" if error.reason != "missing" else str(error))
             return None

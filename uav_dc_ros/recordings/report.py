@@ -80,7 +80,7 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
         bag = printable(options.bag.absolute().name)
         title = f"{scenario.name}: {bag}"
         page, health = Page("mission", title), Health(reader, name)
-        recorded = steps.Steps(reader, name, round(scenario.mission.step_s * 1e9))
+        recorded = steps.Steps(reader, name, scenario.step_ns)
         flew = vehicle(reader, name)
         real = flew != SIMULATED
         taken = way(reader, name, scenario) if real else None

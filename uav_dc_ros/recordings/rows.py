@@ -11,7 +11,9 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.recordings.step import BEFORE_START, RecordedStep
+from uav_dc_ros.phases import BEFORE_START
+from uav_dc_ros.recordings.mission_totals import MissionTotals
+from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.tables import Columns
 from uav_dc_ros.topics import SIMULATED
 
@@ -82,6 +84,8 @@ REAL: dict[str, Columns] = {
         "time_s": "float",  # when it was published, since the epoch
         "phase": "text",
         "reason": "text",
+        "held": "bool",  # by a fault
+        "fault": "text",  # its kind
     },
 }
 Rows = Mapping[str, Sequence[Any]]
@@ -107,7 +111,7 @@ class Mission:
         self._scenario, self._about, self._vehicle = scenario, about, vehicle
         self._total: tuple[int, float] | None = None  # step, and r^t there
         self._last: RecordedStep | None = None
-        self._status = self._rates = None  # type: Any  # the latest that are recorded
+        self._totals = MissionTotals()
         self._recorded = 0
         self._sum_rates: list[float] = []
         self._first_ns = 2**63 - 1
@@ -120,18 +124,14 @@ class Mission:
             BagError: it is of another world.
         """
         try:
-            if step.status is not None:
-                payloads.check_world(step.status, self._scenario)
-            if step.users is not None:
-                payloads.users_m(step.users, self._scenario)
-            if step.rates is not None:
-                payloads.collection(step.rates, self._scenario)
+            for payload in filter(None, (step.status, step.users, step.rates)):
+                payloads.check(payload, self._scenario)
         except MessageError as error:
             raise BagError(f"{step.name}: {error}") from None
         before = self._last
         self._recorded += 1
-        self._last, self._status = step, step.status or self._status
-        self._rates = step.rates or self._rates
+        self._last = step
+        self._totals.add(step.step, step.status, step.rates)
         self._first_ns = min(self._first_ns, *step.log_ns.values())
         self._last_ns = max(self._last_ns, *step.log_ns.values())
         if step.rates is not None and step.step > 0:
@@ -193,33 +193,33 @@ class Mission:
 
     def summary(self) -> Rows:
         """The row of the mission, after its last step."""
-        last, status, rates = self._last, self._status, self._rates
+        last, totals = self._last, self._totals
         assert last is not None, "a mission has a step"
-        over = status is not None and status.phase.is_over
+        known = totals.seed is not None  # has the vehicle said anything
         row = {
             "flight": last.flight,
             "mission": last.mission,
-            "seed": status and status.seed,
+            "seed": totals.seed,
             "scenario": self._scenario.name,
             "scenario_fingerprint": self._scenario.fingerprint,
             "policy": self._about.get("policy"),
             "policy_sha256": self._about.get("policy_sha256"),
-            "outcome": status.phase.value if over else "unfinished",
+            "outcome": totals.outcome,
             "steps_flown": last.step,
             "steps_recorded": self._recorded,
             "first_received_ns": self._first_ns,
             "last_received_ns": self._last_ns,
             "users_total": self._scenario.n_users,
-            "users_collected": rates and sum(rates.collected),
-            "data_bits": rates and float(np.sum(rates.data_bits)),
+            "users_collected": totals.collected,
+            "data_bits": totals.data_bits,
             "mean_sum_rate_bps": float(np.mean(self._sum_rates)) if self._sum_rates else None,
             "total_reward": self._total and self._total[1],
         }
         if self._vehicle != SIMULATED:
             row |= {
                 "vehicle": self._vehicle,
-                "reason": status and status.reason,
-                "steps_not_reached": status and status.steps_not_reached,
+                "reason": totals.reason if known else None,
+                "steps_not_reached": totals.steps_not_reached if known else None,
             }
         return {name: [value] for name, value in row.items()}
 
@@ -242,6 +242,8 @@ def _phases(step: RecordedStep) -> Rows:
         "time_s": [told.publish_ns / 1e9 for told in step.told],
         "phase": [told.phase.value for told in step.told],
         "reason": [told.reason for told in step.told],
+        "held": [told.held for told in step.told],
+        "fault": [told.fault for told in step.told],
     }
 
 

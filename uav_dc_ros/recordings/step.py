@@ -9,13 +9,11 @@ import msgspec
 
 from uav_dc_ros import messages
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.messages import Mission, Phase
+from uav_dc_ros.messages import FaultKind, Mission, Phase
+from uav_dc_ros.phases import BEFORE_START
 
 POSES_KEPT = 64  # of a step
 TOLD_KEPT = 1000  # words of a vehicle on a step: one that waits for hours tells of it again and again
-HOLDS = "holds: "  # how a vehicle says that something keeps it from going on
-GROUND = (Phase.IDLE, Phase.CONNECTING, Phase.PREFLIGHT)
-BEFORE_START = (*GROUND, Phase.TAKEOFF)
 
 
 class RecordedPose(NamedTuple):
@@ -32,21 +30,19 @@ class RecordedPose(NamedTuple):
 
 
 class Told(NamedTuple):
-    """A phase that the vehicle told, why, and when that was received and published (ns).
+    """A phase that the vehicle told, why, whether a fault held it, and when that was received and published.
 
-    `clock` is how often the recorder's clock had been set back by then: only times of one clock compare.
+    Times are in ns. `clock` is how often the recorder's clock had been set back by then: only times of one
+    clock compare.
     """
 
     phase: Phase
     reason: str
+    held: bool
+    fault: FaultKind | None
     log_ns: int
     publish_ns: int
     clock: int = 0
-
-    @property
-    def holds(self) -> bool:
-        """Is this a fault, which keeps the vehicle from going on."""
-        return self.reason.startswith(HOLDS)
 
 
 @dataclass(kw_only=True)
@@ -119,12 +115,12 @@ class RecordedStep:
 
         A vehicle that says why it is in a phase may be in it twice. One that gives no reasons repeats itself.
         """
-        phase, reason = payload.phase, payload.reason
+        said = payload.phase, payload.reason, payload.held, payload.fault
         for told in self.told:
-            again = publish_ns == told.publish_ns or not reason or told is self.told[-1]
-            if again and (phase, reason) == told[:2]:
+            again = publish_ns == told.publish_ns or not payload.reason or told is self.told[-1]
+            if again and said == told[:4]:
                 return False
-        told = Told(phase, reason, log_ns, publish_ns, clock)
+        told = Told(*said, log_ns, publish_ns, clock)
         insort(self.told, told, key=lambda one: (one.clock, one.publish_ns))
         if len(self.told) > TOLD_KEPT:  # how it began, and how it ended, tells most
             del self.told[TOLD_KEPT // 2]
@@ -139,9 +135,8 @@ def printable(text: str) -> str:
 
 def with_standing_of(one: Mission, other: Mission) -> Mission:
     """A word on a step with all that may change while the step lasts as in another one."""
-    return msgspec.structs.replace(
-        one, phase=other.phase, reason=other.reason, steps_not_reached=other.steps_not_reached
-    )
+    changing = ("phase", "reason", "held", "fault", "steps_not_reached")
+    return msgspec.structs.replace(one, **{name: getattr(other, name) for name in changing})
 
 
 def is_same_status(one: Mission, other: Mission) -> bool:

@@ -8,20 +8,20 @@ from bisect import insort
 from collections import Counter, deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
 
-from uav_dc_ros import messages, payloads, scenarios, topics
-from uav_dc_ros.bags.definitions import TYPESTORE, is_defined_so
+from uav_dc_ros import cdr, messages, scenarios, topics
+from uav_dc_ros.bags.definitions import is_defined_so
 from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
 from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import BagError, MessageError, ScenarioError
 from uav_dc_ros.messages import Mission
+from uav_dc_ros.phases import GROUND
 from uav_dc_ros.recordings.step import (
-    GROUND,
     POSES_KEPT,
     RecordedPose,
     RecordedStep,
@@ -30,7 +30,6 @@ from uav_dc_ros.recordings.step import (
     outweighs,
 )
 
-FRAME = "map"
 STEP_TOPICS = ("pose", "users", "rates", "mission", "move")
 NEWER_MIN = 3  # newest steps: they may still get messages, whole or not
 OPEN_MAX = 256  # steps that are held while the oldest lacks something
@@ -154,7 +153,7 @@ class Steps:
                 if topic == "pose":
                     self._hear_pose(read_pose(message)._replace(place=place))
                     continue
-                payload = messages.decode(payloads.text_in_cdr(message.data), messages.PAYLOADS[topic])
+                payload = messages.decode(cdr.text_in(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
                 self.rejected.enter(topic, error)
                 continue
@@ -316,16 +315,6 @@ def read_pose(message: BagMessage) -> RecordedPose:
     Raises:
         MessageError: no pose, or none in the frame `map`.
     """
-    payloads.byte_order(message.data)
-    try:
-        pose: Any = TYPESTORE.deserialize_cdr(message.data, topics.POSE)
-    except Exception as error:  # of struct, numpy, rosbags: whatever the bytes make of it
-        raise MessageError("malformed", str(error)) from None
-    header, point = pose.header, pose.pose.position
-    if header.frame_id != FRAME:
-        raise MessageError("frame", f"frame {header.frame_id[:64]!r}; expected {FRAME!r}")
-    position_m = np.asarray([point.x, point.y, point.z], dtype=np.float64)
-    if not np.isfinite(position_m).all():
-        raise MessageError("not_finite", f"position {position_m.tolist()}; expected finite metres")
-    stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
-    return RecordedPose(stamp_ns, position_m, message.log_time_ns, message.publish_time_ns)
+    pose = cdr.Pose(message.data)
+    position_m = np.asarray(pose.position_m, dtype=np.float64)
+    return RecordedPose(pose.stamp_ns, position_m, message.log_time_ns, message.publish_time_ns)

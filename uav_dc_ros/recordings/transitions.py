@@ -96,7 +96,7 @@ class Transitions:
             return None
         scenario = self._scenario
         try:
-            payloads.check_world(step.status, scenario)
+            payloads.check(step.status, scenario)
             data_bits, collected = payloads.collection(step.rates, scenario)
         except MessageError as error:
             self.skipped[f"a step of another world ({error.reason})"] += 1

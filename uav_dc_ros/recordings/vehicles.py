@@ -1,6 +1,6 @@
 """Which vehicle flew the missions of a bag: our own world's, or a real one."""
 
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import cdr, messages
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
@@ -24,7 +24,7 @@ def vehicle(reader: BagReader, namespace: str) -> str:
         return told
     for message in reader.messages([f"{namespace}/mission"]):
         try:
-            status = messages.decode(payloads.text_in_cdr(message.data), Mission)
+            status = messages.decode(cdr.text_in(message.data), Mission)
         except MessageError:
             continue
         simulated = not status.reason and (status.phase is Phase.READY or status.phase.is_over)

@@ -147,7 +147,7 @@ def verify(
     world = World(scenario, seeded=seeded, lockstep=lockstep, real=real, tolerance=tolerance)
     flights = Flights(scenario) if real else None
     decisions = Decisions(scenario, policy) if policy else None
-    recorded = Steps(reader, namespace, round(scenario.mission.step_s * 1e9))
+    recorded = Steps(reader, namespace, scenario.step_ns)
     otherwise: list[str] = []
     n_missions = n_steps = n_missions_other = 0
     for _, mission in groupby(recorded, lambda step: (step.flight, step.mission)):

@@ -28,8 +28,9 @@ from sensor_msgs.msg import (  # type: ignore[import-untyped, unused-ignore]
 
 from uav_dc_ros.autopilot.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
+from uav_dc_ros.cdr import FRAME
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes.convert import FRAME, position_m, stamp_ns
+from uav_dc_ros.nodes.convert import position_m, stamp_ns
 from uav_dc_ros.nodes.vehicles import mavros_messages
 from uav_dc_ros.nodes.vehicles.mavros_commands import Commands
 from uav_dc_ros.nodes.vehicles.mavros_hearing import (

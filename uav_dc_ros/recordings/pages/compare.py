@@ -23,6 +23,7 @@ from uav_dc_ros.recordings.pages.missions import Flown, flown, significant
 from uav_dc_ros.recordings.pages.page import PAGE_MAX, Page
 from uav_dc_ros.recordings.pages.world import world
 from uav_dc_ros.recordings.step import printable
+from uav_dc_ros.recordings.thinning import spread
 
 GROUPS_MAX = 8  # more colours and dashes nobody tells apart
 TRACKS_MAX = 20  # of a group, in a picture
@@ -88,7 +89,7 @@ def page(
     title = f"{first.name}: {len(groups)} {'bags' if len(bags) > 1 else 'missions'} side by side"
     made = Page("compare", title)
     last = max(int(curve["step"][-1]) for group in groups for curve in group.curves)
-    axis = np.unique(np.linspace(0, last, min(last + 1, POINTS_MAX)).round().astype(int))
+    axis = spread(last + 1, POINTS_MAX)
     data = {
         "title": title,
         "version": __version__,
@@ -119,7 +120,7 @@ def _groups(
         name = steps.namespace(reader, namespace)
         scenario = steps.scenario(reader, name, wanted)
         policy = reader.about.get("policy", "unknown policy")
-        recorded = steps.Steps(reader, name, round(scenario.mission.step_s * 1e9))
+        recorded = steps.Steps(reader, name, scenario.step_ns)
         for one in flown(iter(recorded), scenario):
             if missions is not None and one.index not in missions:
                 continue

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from uav_dc_ros.recordings.thinning import EveryNth
+
 SERIES_MAX = 400  # points of a curve, and values of which a median is taken
 COUNTERS = ("restarts", "rejected", "step overruns", "hovered steps")  # values that only ever rise
 # Until the end of the handling; without a word, as older bags have it, of some nodes until the receipt only.
@@ -25,20 +27,20 @@ class Series:
     """Points in time, evenly thinned out when there are many."""
 
     def __init__(self) -> None:
-        self.points: list[tuple[float, float]] = []
         self.max = -math.inf
+        self._points: EveryNth[tuple[float, float]] = EveryNth(SERIES_MAX)
         self._seen = 0
-        self._stride = 1
 
     def add(self, at_s: float, value: float) -> None:
         """The next one."""
-        if self._seen % self._stride == 0:
-            self.points.append((round(at_s, 2), value))
-            if len(self.points) > SERIES_MAX:
-                self.points = self.points[::2]
-                self._stride *= 2
+        self._points.add(self._seen, (round(at_s, 2), value))
         self._seen += 1
         self.max = max(self.max, value)
+
+    @property
+    def points(self) -> list[tuple[float, float]]:
+        """Those kept: time, value."""
+        return self._points.kept
 
     def median(self) -> float:
         """Of the values kept."""

@@ -9,10 +9,12 @@ from uav_dc_ros import topics
 from uav_dc_ros.bags.definitions import TYPESTORE
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TOLD_MAX, Phase
+from uav_dc_ros.recordings.mission_totals import UNFINISHED
 from uav_dc_ros.recordings.pages.diagnostics import Node, Report
-from uav_dc_ros.recordings.pages.missions import NO_END, Flown
+from uav_dc_ros.recordings.pages.missions import Flown
 from uav_dc_ros.recordings.step import RecordedStep
 from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps
+from uav_dc_ros.recordings.thinning import EveryNth
 
 SAMPLES_MAX = 100_000  # of a latency: percentiles need no more
 FAULTS_MAX = 300  # rows told one by one
@@ -27,16 +29,11 @@ class Samples:
     def __init__(self) -> None:
         self.count = 0
         self.max_ns: int | None = None
-        self._values_ns: list[int] = []
-        self._stride = 1
+        self._values_ns: EveryNth[int] = EveryNth(SAMPLES_MAX)
 
     def add(self, value_ns: int) -> None:
         """One more."""
-        if self.count % self._stride == 0:
-            self._values_ns.append(value_ns)
-            if len(self._values_ns) > SAMPLES_MAX:
-                self._values_ns = self._values_ns[::2]
-                self._stride *= 2
+        self._values_ns.add(self.count, value_ns)
         self.count += 1
         self.max_ns = value_ns if self.max_ns is None else max(self.max_ns, value_ns)
 
@@ -44,7 +41,7 @@ class Samples:
         """Count, median, 99th percentile and maximum, milliseconds; None without any."""
         if self.max_ns is None:
             return {"count": 0, "p50_ms": None, "p99_ms": None, "max_ms": None}
-        p50, p99 = np.percentile(np.asarray(self._values_ns), (50, 99)) * 1e-6
+        p50, p99 = np.percentile(np.asarray(self._values_ns.kept), (50, 99)) * 1e-6
         return {
             "count": self.count,
             "p50_ms": round(float(p50), 3),
@@ -104,12 +101,12 @@ class Health:
         name = f"mission {flown.index}" + (f" of flight {flown.flight}" if flown.flight else "")
         for what, count in flown.faults.items():
             self._fault(flown.last_ns, name, f"{what}: {count}")
-        if flown.outcome in (Phase.ABORTED, NO_END):
-            told = "aborted" if flown.outcome == Phase.ABORTED else "its end is not in the bag"
+        if flown.totals.outcome in (Phase.ABORTED, UNFINISHED):
+            told = "aborted" if flown.totals.is_over else "its end is not in the bag"
             why = f": {flown.reason}" if flown.reason else ""
-            self._fault(flown.last_ns, name, f"{told}, after step {flown.steps}{why}")
+            self._fault(flown.last_ns, name, f"{told}, after step {flown.totals.steps}{why}")
         for step, word in flown.journey.words if flown.journey else ():
-            if word.holds:
+            if word.held:
                 self._fault(word.log_ns, name, f"step {step}: {word.reason}")
 
     def read(self) -> None:

@@ -6,7 +6,7 @@ step, every fourth, and so on. Its numbers (data, distance, rates) are always th
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,13 +16,14 @@ from uav_dc_ros.core import mission, radio, reward, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
+from uav_dc_ros.recordings.mission_totals import MissionTotals
 from uav_dc_ros.recordings.pages.vehicle import Journey
 from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.thinning import EveryNth, spread
 
 STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart
 VALUES_MAX = 60_000  # steps times users: what a page can draw, and hold
 USERS_MAX = 2_000  # shown
-NO_END = "no end"  # outcome of a mission whose end is not in the bag
 WAITING, SERVED, COLLECTED = "012"  # a user's state, as a page knows it
 
 
@@ -35,15 +36,10 @@ class Flown:
         real: was it flown by a real vehicle?
 
     Attributes:
-        seed: of its users; None where the bag does not tell.
-        outcome: how it ended.
-        reason: why, as a real vehicle tells.
-        steps: steps flown.
-        steps_not_reached: those of them whose cell a real vehicle did not reach, as it says itself.
+        totals: the mission in numbers.
         data_bits, collected: of each user at the end, `[U]`.
         distance_m: length of the path flown, metres.
         faults: what is missing or cannot be true, counted in words.
-        stride: every how many steps one is kept.
         last_ns: when the last message of it was received.
         journey: what a real vehicle told of it; None of a simulated one.
     """
@@ -52,21 +48,17 @@ class Flown:
         n_users = scenario.n_users
         self.scenario = scenario
         self.flight, self.index = flight, index
-        self.seed: int | None = None
-        self.outcome: str = NO_END
-        self.reason = ""
+        self.totals = MissionTotals()
         self.journey = Journey(scenario) if real else None
-        self.steps = self.steps_not_reached = 0
         self.data_bits: Array = np.zeros(n_users)
         self.collected: Array = np.zeros(n_users, dtype=bool)
         self.distance_m = 0.0
         self.faults: Counter[str] = Counter()
-        self.stride = 1
         self.last_ns = 0
-        self.shown_users = _spread(n_users, USERS_MAX)
-        self._kept: list[dict[str, Any]] = []
+        self.shown_users = spread(n_users, USERS_MAX)
+        most = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
+        self._steps: EveryNth[dict[str, Any]] = EveryNth(most)
         self._last: dict[str, Any] | None = None  # the newest step, kept or not
-        self._kept_max = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
         self._position_m: Array | None = None
         self._cell: Array | None = None
         self._expected = 0
@@ -80,13 +72,10 @@ class Flown:
         if step.step > self._expected:
             self.faults["steps that are not in the bag"] += step.step - self._expected
         self._expected = step.step + 1
-        self.steps = max(self.steps, step.step)
         self.last_ns = max(step.log_ns.values(), default=self.last_ns)
         if self.journey is not None:
             self.journey.add(step)
-        status = self._fitting(step.status, lambda it: payloads.check_world(it, self.scenario))
-        rates = self._fitting(step.rates, lambda it: payloads.collection(it, self.scenario))
-        users = self._fitting(step.users, lambda it: payloads.users_m(it, self.scenario))
+        status, rates, users = map(self._fitting, (step.status, step.rates, step.users))
         for name, there in (
             ("mission", status),
             ("users", users),
@@ -96,32 +85,34 @@ class Flown:
             if not there and (name == "mission" or step.is_measured):
                 self.faults[f"steps without {name}"] += 1
         if status is not None:
-            self.seed = status.seed
-            self.steps_not_reached = status.steps_not_reached
             self._cell = np.asarray(status.cell)
-            if status.phase.is_over:
-                self.outcome, self.reason = status.phase.value, status.reason
+        self.totals.add(step.step, status, rates)
         if rates is not None:
             self._book(step.step, rates)
         self._keep(step, self._fly(step.position_m, status if step.is_measured else None), users, rates)
 
+    @property
+    def reason(self) -> str:
+        """Why it ended, as a real vehicle tells."""
+        return self.totals.reason if self.totals.is_over else ""
+
     def summary(self) -> dict[str, Any]:
         """The mission in numbers, as run_all's `--summary` has them."""
-        total, n = self._sum_rates_bps
+        (total, n), totals = self._sum_rates_bps, self.totals
         return {
             **({"reason": self.reason} if self.reason else {}),
-            **({"steps_not_reached": self.steps_not_reached} if self.steps_not_reached else {}),
+            **({"steps_not_reached": totals.steps_not_reached} if totals.steps_not_reached else {}),
             "flight": self.flight,
             "mission": self.index,
-            "seed": self.seed,
-            "outcome": self.outcome,
-            "steps": self.steps,
+            "seed": totals.seed,
+            "outcome": totals.outcome,
+            "steps": totals.steps,
             "users_collected": int(self.collected.sum()),
             "users_total": self.scenario.n_users,
             "data_bits": float(self.data_bits.sum()),
             "sum_rate_bps": total / max(n, 1),
             "distance_m": self.distance_m,
-            "reward": self.rewards(self._cell, self.data_bits)[2] if self.steps else 0.0,
+            "reward": self.rewards(self._cell, self.data_bits)[2] if totals.steps else 0.0,
         }
 
     def rewards(self, cell: Array | None, data_bits: Array) -> tuple[float, float, float]:
@@ -136,8 +127,13 @@ class Flown:
 
     def course(self) -> list[dict[str, Any]]:
         """The steps that are shown, in their order; the last one is always among them."""
-        kept = self._kept
+        kept = self._steps.kept
         return kept if self._last is None or self._last is kept[-1] else [*kept, self._last]
+
+    @property
+    def stride(self) -> int:
+        """Every how many steps one is shown."""
+        return self._steps.stride
 
     def table(self) -> dict[str, list[Any]]:
         """Columns, an entry per user shown; SINR and rate are means over the steps in which it was served."""
@@ -156,11 +152,9 @@ class Flown:
             "rate_bps": _finite(np.where(served > 0, rate_bps, math.nan)),
         }
 
-    def _fitting(self, payload: Any, check: Callable[[Any], object]) -> Any:
-        if payload is None:
-            return None
+    def _fitting(self, payload: Any) -> Any:
         try:
-            check(payload)
+            payloads.check(payload, self.scenario)
         except MessageError as error:
             kind = type(payload).__name__.lower()
             self.faults[f"{kind} messages of another world ({error.reason})"] += 1
@@ -216,12 +210,7 @@ class Flown:
             "sum_rate_bps": rates.sum_rate_bps if rates and step.step else None,
             "reward": _finite(np.asarray(self.rewards(self._cell, self.data_bits))),
         }
-        # The first step heard, whatever its number: a mission that was joined late begins there.
-        if not self._kept or step.step % self.stride == 0:
-            self._kept.append(self._last)
-        if len(self._kept) > self._kept_max:
-            self.stride *= 2
-            self._kept = self._kept[:1] + [it for it in self._kept[1:] if it["step"] % self.stride == 0]
+        self._steps.add(step.step, self._last)
 
 
 def flown(steps: Iterator[RecordedStep], scenario: Scenario, real: bool = False) -> Iterator[Flown]:
@@ -253,8 +242,3 @@ def _users_m(users: messages.Users, shown: Array) -> list[list[float]]:
 
 def _finite(values: Array) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
-
-
-def _spread(n: int, most: int) -> Array:
-    """Indices of at most `most` of `n`, evenly spread, the first and the last among them."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))

@@ -10,7 +10,7 @@ function vehicle(journey) {
     make("div", { class: "grid halves" },
       make("div", { class: "stack" },
         card("Altitude", make("div", { class: "chart", id: "altitude", style: "height: 230px" }),
-          make("ul", { class: "legend" }, swatch("accent", "flown"), swatch("dock", "its cells"), words.some((word) => word.holds) ? swatch("warm", "held: something kept it from going on") : null)),
+          make("ul", { class: "legend" }, swatch("accent", "flown"), swatch("dock", "its cells"), words.some((word) => word.held) ? swatch("warm", "held: something kept it from going on") : null)),
         card("Distance from the centre of the cell, where it was measured", cells.step.length
           ? make("div", { class: "chart", id: "off" }) : make("p", { class: "note" }, "It never came to a cell."))),
       card("Phases", table([
@@ -18,7 +18,7 @@ function vehicle(journey) {
         { name: "lasted, s", text: (row) => fixed(row.lasted_s, 1), value: by("lasted_s") },
         { name: "step", text: (row) => String(row.step), value: by("step") },
         { name: "phase", text: by("phase"), value: by("phase"), cls: "phase" },
-        { name: "reason", text: (row) => (row.holds ? make("b", { class: "bad" }, row.reason) : row.reason || NONE), cls: "text" },
+        { name: "reason", text: (row) => (row.held ? make("b", { class: "bad" }, row.reason) : row.reason || NONE), cls: "text" },
       ], words, { label: "Phases", caption: left > 0 ? `${words.length} of ${journey.words_total}` : "" }))));
 }
 
@@ -31,7 +31,7 @@ function drawVehicle(journey) {
   const end = Math.max(1, ...way.s, ...words.map((word) => word.s));
   const seconds = (more) => axis({ range: [0, end], zeroline: false, nticks: 8, ...more });
   // A hold lasts until the next word.
-  const held = words.filter((word) => word.holds);
+  const held = words.filter((word) => word.held);
   const band = (word) => ({ type: "rect", xref: "x", yref: "paper", x0: word.s, x1: word.s + Math.max(word.lasted_s, end / 300), y0: 0, y1: 1, fillcolor: faded("warm", 0.3), line: { width: 0 } });
   const turned = words.filter((word, i) => i === 0 || word.phase !== words[i - 1].phase);
   const named = turned.filter((word) => ["takeoff", "landing", "landed", "timeout", "aborted"].includes(word.phase));

@@ -9,8 +9,10 @@ from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.recordings.step import BEFORE_START, RecordedPose, RecordedStep, Told
+from uav_dc_ros.phases import BEFORE_START
+from uav_dc_ros.recordings.step import RecordedPose, RecordedStep, Told
 from uav_dc_ros.recordings.steps import read_pose
+from uav_dc_ros.recordings.thinning import Apart
 
 WORDS_MAX = 1000  # phases and reasons that are shown of a mission
 CELLS_MAX = 1000  # steps whose distance from the cell is shown
@@ -24,24 +26,20 @@ class Way:
 
     def __init__(self, scenario: Scenario) -> None:
         self._apart_m = APART_CELLS * scenario.grid.cell_m
-        self._apart_ns = APART_NS
-        self._poses: list[RecordedPose] = []
+        self._poses: Apart[RecordedPose] = Apart(WAY_MAX)
 
     def add(self, pose: RecordedPose) -> None:
         """The next one, in the order in which they were received."""
-        if self._poses:
-            last = self._poses[-1]
-            far = math.dist(pose.position_m, last.position_m) >= self._apart_m
-            if not far and pose.publish_ns - last.publish_ns < self._apart_ns:
+        if self._poses.kept:
+            last, factor = self._poses.kept[-1], self._poses.factor
+            far = math.dist(pose.position_m, last.position_m) >= self._apart_m * factor
+            if not far and pose.publish_ns - last.publish_ns < APART_NS * factor:
                 return
-        self._poses.append(pose)
-        if len(self._poses) > WAY_MAX:
-            self._poses = self._poses[::2]
-            self._apart_m, self._apart_ns = 2 * self._apart_m, 2 * self._apart_ns
+        self._poses.add(pose)
 
     def columns(self, begun_ns: int, ended_ns: int) -> dict[str, list[float]]:
         """Seconds from `begun_ns`, x, y, altitude (m) of the poses published up to `ended_ns`."""
-        shown = [pose for pose in self._poses if begun_ns <= pose.publish_ns <= ended_ns]
+        shown = [pose for pose in self._poses.kept if begun_ns <= pose.publish_ns <= ended_ns]
         seconds = [round((pose.publish_ns - begun_ns) * 1e-9, 2) for pose in shown]
         places = np.round(np.asarray([pose.position_m for pose in shown]).reshape(-1, 3), 2)
         return {"s": seconds, **dict(zip("xyz", places.T.tolist(), strict=True))}
@@ -108,7 +106,7 @@ class Journey:
                     "step": step,
                     "phase": told.phase.value,
                     "reason": told.reason,
-                    "holds": told.holds,
+                    "held": told.held,
                 }
                 for (step, told), end_ns in zip(self.words, ends_ns, strict=True)
             ],
