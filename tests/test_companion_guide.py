@@ -1,5 +1,6 @@
 """The companion guide's commands, parameters, figures and units are those of the code."""
 
+import argparse
 import configparser
 import itertools
 import json
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.doc_commands import parameter, parsed
-from uav_dc_ros import resources, scenarios
+from uav_dc_ros import resources, run_all, scenarios
 from uav_dc_ros.autopilot import beat, fence, systems
 from uav_dc_ros.autopilot.links import Address
 from uav_dc_ros.autopilot.watch import Settings
@@ -110,7 +111,7 @@ def test_a_wrong_command_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize("words", RUNS, ids=" ".join)
 def test_run_all_would_start_what_the_guide_says(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = parsed(monkeypatch, ["uav_dc_ros.run_all", *words])
-    started = options.nodes(wanted)
+    started = options.nodes(run_all._config(argparse.Namespace(**vars(wanted))))
     real = wanted.vehicle != "simulated"
     assert ("bridge" in started) == (real and wanted.nodes is None)
     assert wanted.datum is not None or not wanted.arm, "who arms says where the grid lies"

@@ -20,7 +20,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import usage
 from uav_dc_ros.nodes.table import NODES
-from uav_dc_ros.recordings.flights import AFTER, NEXT_STEP
+from uav_dc_ros.phases import TRANSITIONS
 from uav_dc_ros.topics import TOPICS
 
 DOCS, PACKAGE = ROOT / "docs", ROOT / "uav_dc_ros"
@@ -180,7 +180,7 @@ def test_the_diagrams_show_every_row_of_the_tables() -> None:
         "live_view",
     }
     drawn = {(source, target) for source, target, _ in tool.transitions()}
-    assert drawn == {(a.value, b.value) for table in (AFTER, NEXT_STEP) for a in table for b in table[a]}
+    assert drawn == {(one.before.value, one.after.value) for one in TRANSITIONS}
     picture = (DOCS / "figures" / "phases.svg").read_text("utf-8")
     assert all(f">{phase.value}</text>" in picture for phase in Phase)
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))

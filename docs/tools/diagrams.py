@@ -15,7 +15,7 @@ from pathlib import Path
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.parameters import EVERY, Parameter
 from uav_dc_ros.nodes.table import NODES, rows
-from uav_dc_ros.recordings.flights import AFTER, NEXT_STEP
+from uav_dc_ros.phases import TRANSITIONS
 from uav_dc_ros.topics import TOPICS, Topic
 
 DOCS = Path(__file__).parents[1]
@@ -154,12 +154,10 @@ _PLACE: dict[str, tuple[float, float, float, float]] = {
 
 def transitions() -> Iterator[tuple[str, str, bool]]:
     """From, to, and whether the transition begins the next step."""
-    for table, next_step in ((AFTER, False), (NEXT_STEP, True)):
-        for phase, following in table.items():
-            for after in following:
-                if next_step and after in AFTER[phase]:
-                    continue
-                yield phase.value, after.value, next_step
+    within = {(one.before, one.after) for one in TRANSITIONS if not one.steps}
+    for one in TRANSITIONS:
+        if not (one.steps and (one.before, one.after) in within):
+            yield one.before.value, one.after.value, bool(one.steps)
 
 
 def phase_picture() -> str:

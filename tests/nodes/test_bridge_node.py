@@ -12,14 +12,14 @@ from std_msgs.msg import String
 
 from tests.conftest import Ros
 from tests.nodes.mavros_flight import node_in
-from uav_dc_ros import messages
+from uav_dc_ros import cdr, messages
 from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.autopilot.links import Address
 from uav_dc_ros.autopilot.mavlink import Mavlink
 from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import bridge, cdr, datums, vehicles
+from uav_dc_ros.nodes import bridge, datums, vehicles
 from uav_dc_ros.nodes.bridge import AutopilotBridge
 from uav_dc_ros.nodes.journal import Journal
 

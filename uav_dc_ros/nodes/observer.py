@@ -18,7 +18,8 @@ from uav_dc_ros.nodes import rivals
 from uav_dc_ros.nodes.mission_node import MissionNode
 from uav_dc_ros.nodes.pairs import StepPairs
 
-ALONE_S = 1.0  # nobody else was found for so long, before any node of this mission may begin
+ALONE_S = 1.0  # nobody else was found for so long, before any node of this mission may begin,
+STARTED_S = 0.5  # and for so long since all nodes of this run_all have started
 LOOK_S = 0.1  # for others, until this mission has begun
 LOOK_LATER_S = 1.0  # for others, afterwards
 TELL_S = 3.0  # both who publishes and for which run are told, if they are known within this time
@@ -139,6 +140,7 @@ class Observer(MissionNode):
         self._has_begun = False  # a mission of this run
         self._other_run: str | None = None  # of which a message came before that
         self._since_s = self._look_s = time.monotonic()
+        self._started_s = math.inf  # when all nodes of this run_all had started
         self._found_s: float | None = None  # when another mission was noticed
         self._noted: set[str] = set()  # nodes that publish for nobody of this mission
         self._steps = StepPairs()
@@ -174,7 +176,9 @@ class Observer(MissionNode):
         if found.foreign.keys() - self._noted:
             self._noted |= found.foreign.keys()
             self._on_note(f"{found.told()}; its payloads are ignored, its poses may be recorded")
-        self.is_alone |= have_started and now_s - self._since_s >= ALONE_S
+        if have_started:
+            self._started_s = min(self._started_s, now_s)
+        self.is_alone |= now_s - self._since_s >= ALONE_S and now_s - self._started_s >= STARTED_S
 
     def _look_for_peers(self) -> None:
         if self.is_alone:  # otherwise another mission's nodes of these names would do
