@@ -329,7 +329,7 @@ def test_a_landing_that_comes_no_lower_has_an_end(obeys: bool) -> None:
     flight.vehicle.battery, flight.vehicle.stuck, flight.vehicle.deaf = 0.1, True, not obeys
     flight.until(Phase.ABORTED, 200.0)
     what = "it lands" if obeys else "mode COMMANDED"
-    assert f"{what}, and has neither come lower nor disarmed for 120 s" in flight.bridge.reason
+    assert f"{what}, and has neither descended nor disarmed for 120 s" in flight.bridge.reason
     assert flight.bridge.reason.startswith("battery 10%")
 
 

@@ -351,7 +351,8 @@ def test_a_full_disk_costs_nothing(tmp_path: Path) -> None:
     before = content(bag)
     size = len(before["bag_0.mcap"])
     mended = subprocess.run(
-        [sys.executable, "-c", "import sys; from pathlib import Path; from uav_dc_ros.bags.mend import mend\n"
+        [sys.executable, "-c", "import sys\nfrom pathlib import Path\n"
+         "from uav_dc_ros.bags.mend import mend\n"
          "from uav_dc_ros.errors import BagError\n"
          "try: mend(Path(sys.argv[1]))\nexcept BagError as error: print(error)", str(bag)],
         cwd=ROOT, capture_output=True, text=True, check=True,

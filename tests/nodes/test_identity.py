@@ -94,7 +94,7 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
     for i in range(tries):
         _, summary = refused(ros, options, f"try{i}")
         told = summary["reason"]
-        # By run_all itself; or by its world, where the machine was too busy to find others before that starts.
+        # By run_all itself; or by its world, where the machine was too busy to find others before.
         assert "another mission is being flown here by /world" in told, told
         assert f"(run {run}): give this one" in told or "the container of world" in told
     status, rest = stopped(first)

@@ -197,5 +197,5 @@ class Descent:
             return f"it returns, and has come no nearer to home{far} for {limit_s:g} s"
         if landing_s > settings.landing_progress_s:
             what = "it lands" if known.mode is Mode.LAND else f"mode {known.mode_name or known.mode.value}"
-            return f"{what}, and has neither come lower nor disarmed for {settings.landing_progress_s:g} s"
+            return f"{what}, and has neither descended nor disarmed for {settings.landing_progress_s:g} s"
         return None
