@@ -175,7 +175,7 @@ print(json.dumps([uav_dc_ros.__file__, int(env.reset(seed=1)[1]["step"])]))
 def test_the_core_imports_nothing_heavy():
     program = """
 import json, sys
-import uav_dc_ros.core.world, uav_dc_ros.scenarios, uav_dc_ros.env.observations
+import uav_dc_ros.core.world, uav_dc_ros.scenarios, uav_dc_ros.core.observations
 print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
 """
     answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -4,8 +4,8 @@ import gymnasium
 import numpy as np
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.env.registration import ENV_ID
 
 

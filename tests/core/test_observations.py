@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uav_dc_ros.env import observations
+from uav_dc_ros.core import observations
 
 KINDS = ("position", "mission", "map")
 

@@ -13,7 +13,6 @@ import pytest
 from tests.small_worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
-from uav_dc_ros.core.bootstrap import interval
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.experiments import evaluate_cli
 from uav_dc_ros.experiments.evaluate import (
@@ -28,6 +27,7 @@ from uav_dc_ros.experiments.evaluate import (
 )
 from uav_dc_ros.experiments.evaluate_cli import main
 from uav_dc_ros.experiments.fly import flight, fly
+from uav_dc_ros.stats import interval
 
 
 def command(*arguments):

@@ -9,7 +9,7 @@ import pytest
 
 from tests.experiments.paper_sweeps import realistic
 from uav_dc_ros import scenarios
-from uav_dc_ros.env.track import Track
+from uav_dc_ros.env.trajectory import Track
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.fly import flight
 from uav_dc_ros.experiments.paper.figures import draw, drawable

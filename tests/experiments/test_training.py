@@ -11,8 +11,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.small_worlds import population, run, tiny
 from uav_dc_ros.agents import network
-from uav_dc_ros.env import observations
-from uav_dc_ros.env.batch import BatchWorld, observe
+from uav_dc_ros.core import observations
+from uav_dc_ros.core.batch import BatchWorld, observe
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments import validation

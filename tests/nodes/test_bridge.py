@@ -24,8 +24,8 @@ from tests.autopilot.flight import Fake, fake
 from tests.conftest import Ros, finish, read_bag, wait_for
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.env.registration import ENV_ID
 
 STEPS = 7  # of the low world's missions

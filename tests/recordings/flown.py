@@ -20,9 +20,9 @@ from uav_dc_ros.autopilot.vehicle import Mode
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagMessage
 from uav_dc_ros.core import world
-from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.messages import Phase
 
 TICK_S = 0.1  # from one position to the next: ten a second

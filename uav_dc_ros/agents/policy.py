@@ -17,11 +17,11 @@ from safetensors import SafetensorError
 
 from uav_dc_ros import files, resources
 from uav_dc_ros.agents import network
+from uav_dc_ros.core import observations
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario, from_values
-from uav_dc_ros.env import observations
-from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import PolicyError, ScenarioError
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z"

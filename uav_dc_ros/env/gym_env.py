@@ -9,14 +9,13 @@ from gymnasium import spaces
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core import world
+from uav_dc_ros.core import observations, world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env import observations
-from uav_dc_ros.env.batch import observe
-from uav_dc_ros.env.observations import Observation
-from uav_dc_ros.env.track import Track
+from uav_dc_ros.env.trajectory import Track
 
 RENDER_MODES = ("rgb_array",)
 ACTIONS_TEXT = ", ".join(f"{action.value} {action.label}" for action in Action)

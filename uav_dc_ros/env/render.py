@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 from uav_dc_ros import files
 from uav_dc_ros.core import mission, radio
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.env.track import Track
+from uav_dc_ros.env.trajectory import Track
 
 INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
 WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"

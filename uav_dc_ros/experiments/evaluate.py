@@ -11,11 +11,11 @@ import numpy as np
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.bootstrap import interval
+from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env.batch import observe
 from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.fly import Act, Missions, fly
+from uav_dc_ros.stats import interval
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
 TEST_SEEDS = range(100)

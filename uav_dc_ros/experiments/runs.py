@@ -8,10 +8,10 @@ from msgspec import Meta
 
 from uav_dc_ros.agents import network
 from uav_dc_ros.agents.policy import Algorithm, Hyperparameters
+from uav_dc_ros.core import observations
 from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Reward, Scenario
-from uav_dc_ros.env import observations
-from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import TrainingError
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env.track import Track
+from uav_dc_ros.env.trajectory import Track
 from uav_dc_ros.experiments.fly import Act, flight
 
 

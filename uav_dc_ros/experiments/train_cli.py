@@ -16,9 +16,9 @@ import msgspec
 from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import network, policy
 from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Algorithm, Hyperparameters, PolicyConfig
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
-from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.card import card, checkpoint_card
 from uav_dc_ros.experiments.evaluate import TEST_SEEDS, save_mission_picture, steer

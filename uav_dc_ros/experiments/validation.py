@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.world import State
-from uav_dc_ros.env.batch import observe
 from uav_dc_ros.experiments.fly import Missions, fly
 from uav_dc_ros.experiments.runs import layout
 from uav_dc_ros.experiments.training import Training, rewards

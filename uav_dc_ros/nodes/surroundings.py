@@ -5,8 +5,8 @@ the next pose, so that the monitor measures them from where the vehicle was then
 """
 
 from uav_dc_ros import messages, payloads
-from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 

@@ -24,8 +24,8 @@ from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import convert, runtime

@@ -17,10 +17,10 @@ import numpy as np
 
 from uav_dc_ros import __version__, files
 from uav_dc_ros.bags.read import BagReader
+from uav_dc_ros.core import observations
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardForm
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env import observations
-from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.recordings import rows, steps
 from uav_dc_ros.recordings.rows import Mission

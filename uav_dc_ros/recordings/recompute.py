@@ -18,9 +18,9 @@ from uav_dc_ros import messages, payloads
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.crowd import Crowd
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings.compare import Book, Difference, difference

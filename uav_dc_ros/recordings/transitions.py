@@ -12,13 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from uav_dc_ros import payloads
+from uav_dc_ros.core import observations, world
 from uav_dc_ros.core import reward as core_reward
-from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env import observations
-from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.recordings.step import RecordedStep
 

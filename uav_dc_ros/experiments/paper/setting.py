@@ -14,8 +14,8 @@ import msgspec
 
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents.policy import Algorithm, Hyperparameters
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardForm, RPlus
-from uav_dc_ros.env.observations import Observation
 from uav_dc_ros.experiments.runs import Run
 
 Ratio: TypeAlias = tuple[float, float]

@@ -13,9 +13,9 @@ from uav_dc_ros import files, scenarios
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env.batch import observe
-from uav_dc_ros.env.track import Track
+from uav_dc_ros.env.trajectory import Track
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments import shards
 from uav_dc_ros.experiments.paper.plan import FIGURES

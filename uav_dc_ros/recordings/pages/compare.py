@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from uav_dc_ros import __version__
+from uav_dc_ros import __version__, stats
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.core import bootstrap
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
@@ -169,7 +168,7 @@ def _interval(values: Array) -> dict[str, float | None]:
     """Mean, and the ends of its interval; of one value there is none."""
     if len(values) < 2:
         return {"mean": float(values.mean()), "low": None, "high": None}
-    return bootstrap.interval(values)._asdict()
+    return stats.interval(values)._asdict()
 
 
 def _paired(group: Group, first: Group) -> dict[str, Any] | None:
@@ -198,7 +197,7 @@ def _band(group: Group, name: str, axis: Array) -> dict[str, list[float]]:
         row = curve[name][np.maximum(place, 0)]
         over = axis > curve["step"][-1]
         rows.append(np.where(over, 0.0, row) if name == "sum_rate_bps" else row)
-    told = bootstrap.band(np.asarray(rows))
+    told = stats.band(np.asarray(rows))
     return {key: significant(values) for key, values in zip(("mean", "low", "high"), told, strict=True)}
 
 

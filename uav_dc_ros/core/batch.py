@@ -5,12 +5,11 @@ The trainer and the vector environment both stand on it, so there is one physics
 
 from dataclasses import fields
 
-from uav_dc_ros.core import world
+from uav_dc_ros.core import observations, world
 from uav_dc_ros.core.arrays import Array, array_namespace
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env import observations
-from uav_dc_ros.env.observations import Observation
 
 
 def select(where: Array, chosen: world.State, other: world.State) -> world.State:
