@@ -25,8 +25,8 @@ from pathlib import Path
 from mcap.writer import Writer
 
 from uav_dc_ros import cdr
-from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.bags.read import BagReader
+from uav_dc_ros.bags.salvage.repair import mend
 
 SECONDS = 3.0  # that a rate is held
 SETTLE_S = 1.0

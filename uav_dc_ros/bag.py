@@ -17,7 +17,7 @@ VERBS = {
     "record": ("uav_dc_ros.nodes.record", "record topics into a new bag"),
     "play": ("uav_dc_ros.nodes.play", "publish a bag's messages again, with their timing and QoS"),
     "info": ("uav_dc_ros.recordings.info", "show what a bag holds, and whether it is complete"),
-    "recover": ("uav_dc_ros.bags.recover", "make a whole bag of what a killed recorder left"),
+    "recover": ("uav_dc_ros.bags.salvage.recover", "make a whole bag of what a killed recorder left"),
     "verify": ("uav_dc_ros.recordings.verify", "recompute everything that a bag holds of its missions"),
     "report": (
         "uav_dc_ros.recordings.report",

@@ -17,9 +17,9 @@ from rosbags.rosbag2 import StoragePlugin
 from tests.bags.made import QOS, STRING, bare, in_bag, text
 from tests.bags.test_read import by_rosbags, messages
 from uav_dc_ros import bag as command
-from uav_dc_ros.bags import definitions, mcap_storage
+from uav_dc_ros.bags import mcap_storage, message_definitions
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.bags.recover import recover, told
+from uav_dc_ros.bags.salvage.recover import recover, told
 from uav_dc_ros.errors import BagDamagedError, BagError
 from uav_dc_ros.recordings.survey import survey
 
@@ -280,9 +280,9 @@ def test_what_may_not_be_read_is_named() -> None:
 
 def test_a_definition_with_the_line_ends_of_windows_is_the_same() -> None:
     for type in (STRING, "geometry_msgs/msg/PoseStamped"):
-        text_of_it = definitions.definition(type)
-        assert definitions.is_defined_so(type, "ros2msg", text_of_it.replace(b"\n", b"\r\n"))
-    assert not definitions.is_defined_so(STRING, "ros2msg", b"int8 data\r\n")
+        text_of_it = message_definitions.definition(type)
+        assert message_definitions.is_defined_so(type, "ros2msg", text_of_it.replace(b"\n", b"\r\n"))
+    assert not message_definitions.is_defined_so(STRING, "ros2msg", b"int8 data\r\n")
 
 
 def test_mistakes_of_ours_are_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from tests.bags.made import STRING, in_bag, in_mcap, information, text
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.bags.recover import recover
+from uav_dc_ros.bags.salvage.recover import recover
 from uav_dc_ros.bags.write import BagWriter
 
 INTEROP = Path(__file__).with_name("interop")

@@ -33,10 +33,10 @@ from tests.bags.made import (
     mcap_file,
     text,
 )
-from uav_dc_ros.bags import mend as mending
-from uav_dc_ros.bags import part
-from uav_dc_ros.bags.mend import Mended, mend
-from uav_dc_ros.bags.part import CHUNK_BYTES
+from uav_dc_ros.bags import part_writer
+from uav_dc_ros.bags.part_writer import CHUNK_BYTES
+from uav_dc_ros.bags.salvage import repair as mending
+from uav_dc_ros.bags.salvage.repair import Mended, mend
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
 
@@ -85,7 +85,7 @@ def ends_of_messages(file: bytes) -> list[int]:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """For thousands of files at once: no disk that keeps them; JSON, which is YAML too, inside of them."""
     monkeypatch.setattr(os, "fsync", lambda _: None)
-    monkeypatch.setattr(part, "to_yaml", json.dumps)
+    monkeypatch.setattr(part_writer, "to_yaml", json.dumps)
 
 
 @pytest.fixture
@@ -352,7 +352,7 @@ def test_a_full_disk_costs_nothing(tmp_path: Path) -> None:
     size = len(before["bag_0.mcap"])
     mended = subprocess.run(
         [sys.executable, "-c", "import sys\nfrom pathlib import Path\n"
-         "from uav_dc_ros.bags.mend import mend\n"
+         "from uav_dc_ros.bags.salvage.repair import mend\n"
          "from uav_dc_ros.errors import BagError\n"
          "try: mend(Path(sys.argv[1]))\nexcept BagError as error: print(error)", str(bag)],
         cwd=ROOT, capture_output=True, text=True, check=True,
@@ -371,7 +371,7 @@ def test_a_mending_that_is_killed_can_be_done_again(tmp_path: Path, step: str) -
     where = "os" if step == "fsync" else "PartWriter"
     killed = subprocess.run(
         [sys.executable, "-c", "import os, signal, sys; from pathlib import Path\n"
-         "from uav_dc_ros.bags.mend import PartWriter, mend\n"
+         "from uav_dc_ros.bags.salvage.repair import PartWriter, mend\n"
          f"{where}.{step} = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
          "mend(Path(sys.argv[1]))", str(bag)],
         cwd=ROOT, check=False,

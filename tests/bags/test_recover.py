@@ -31,8 +31,8 @@ from tests.bags.made import (
     text,
 )
 from uav_dc_ros import bag as command
-from uav_dc_ros.bags import part
-from uav_dc_ros.bags.recover import Recovered, recover, told
+from uav_dc_ros.bags import part_writer
+from uav_dc_ros.bags.salvage.recover import Recovered, recover, told
 from uav_dc_ros.errors import BagError
 
 Message = tuple[str, int, int, int, bytes]
@@ -43,7 +43,7 @@ COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none"
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """For hundreds of files at once: no disk that keeps them."""
     monkeypatch.setattr(os, "fsync", lambda _: None)
-    monkeypatch.setattr(part, "to_yaml", lambda _: "")
+    monkeypatch.setattr(part_writer, "to_yaml", lambda _: "")
 
 
 @pytest.fixture
@@ -274,7 +274,7 @@ def test_a_killed_recorder(tmp_path: Path) -> None:
     recovered = recover(tmp_path / "bag", tmp_path / "out")
     assert content(tmp_path / "bag") == before
     n = recovered.whole.message_count
-    assert (written - n) * 500 <= part.CHUNK_BYTES
+    assert (written - n) * 500 <= part_writer.CHUNK_BYTES
     assert [int(data[:9]) for *_, data in in_bag(tmp_path / "out")] == list(range(n))
     assert information(tmp_path / "out")["message_count"] == n
     assert information(tmp_path / "out")["custom_data"]["seed"] == "3"
@@ -373,7 +373,7 @@ def test_memory_stays_flat_and_garbage_does_not_hang(tmp_path: Path) -> None:
         file.write(random.Random(1).randbytes(20_000_000))
     code = (
         "import resource, sys; from pathlib import Path\n"
-        "from uav_dc_ros.bags.recover import recover\nfrom uav_dc_ros.bags.read import BagReader\n"
+        "from uav_dc_ros.bags.salvage.recover import recover\nfrom uav_dc_ros.bags.read import BagReader\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "n = recover(Path(sys.argv[1]), Path(sys.argv[2])).whole.message_count\n"
         "with BagReader(Path(sys.argv[2])) as reader: assert sum(1 for _ in reader.messages()) == n\n"

@@ -22,9 +22,9 @@ from tests.bags.made import (
     killed_writer,
     text,
 )
-from uav_dc_ros.bags import series
-from uav_dc_ros.bags.mend import mend
-from uav_dc_ros.bags.part import FolderLock, PartWriter
+from uav_dc_ros.bags import split_writer
+from uav_dc_ros.bags.part_writer import FolderLock, PartWriter
+from uav_dc_ros.bags.salvage.repair import mend
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
 
@@ -211,7 +211,7 @@ def test_a_failure_lets_the_folder_go(tmp_path: Path, monkeypatch: pytest.Monkey
         bag.add_topic("/a", STRING)
         bag.write("/a", text("x"), log_time_ns=1, publish_time_ns=1)
     monkeypatch.undo()
-    monkeypatch.setattr(series, "PartWriter", full)
+    monkeypatch.setattr(split_writer, "PartWriter", full)
     with pytest.raises(BagError, match="cannot be written: No space left"):
         BagWriter(tmp_path / "bag", {}, resume=True)
     monkeypatch.undo()

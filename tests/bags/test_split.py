@@ -14,9 +14,9 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from tests.bags.made import QOS, ROOT, STRING, in_bag, in_mcap, information, text
 from uav_dc_ros.bags.compression import COMPRESSIONS
-from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.bags.series import CHUNKS_OF_A_PART
+from uav_dc_ros.bags.salvage.repair import mend
+from uav_dc_ros.bags.split_writer import CHUNKS_OF_A_PART
 from uav_dc_ros.bags.write import BagWriter
 
 S = 10**9

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from uav_dc_ros.bags.metadata import METADATA_NAME
-from uav_dc_ros.bags.part import CHUNK_BYTES
+from uav_dc_ros.bags.part_writer import CHUNK_BYTES
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
 

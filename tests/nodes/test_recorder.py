@@ -13,8 +13,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from tests.conftest import Ros, finish, wait_for
-from uav_dc_ros.bags.mend import mend
 from uav_dc_ros.bags.read import BagReader
+from uav_dc_ros.bags.salvage.repair import mend
 
 MIB = 2**20
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import cdr, messages, payloads, topics
-from uav_dc_ros.bags.definitions import TYPESTORE
+from uav_dc_ros.bags.message_definitions import TYPESTORE
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core import world
 from uav_dc_ros.core.grid import ACTION_LABELS

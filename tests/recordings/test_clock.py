@@ -15,7 +15,7 @@ from tests.recordings import flown
 from tests.recordings.made import BEGUN_NS, about, flight, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, plain, read
 from tests.small_worlds import tiny
-from uav_dc_ros.bags import receipt
+from uav_dc_ros.bags import receive_order
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core.scenario import Scenario
@@ -108,7 +108,7 @@ def test_any_setting_of_the_clock_and_any_delay_in_writing_give_the_same_steps(
 
     class Recorded(InMemory):
         def received(self, names: object) -> Iterator[tuple[int, BagMessage]]:
-            return receipt.in_order(message for *_, message in sorted(places, key=itemgetter(0, 1)))
+            return receive_order.in_order(message for *_, message in sorted(places, key=itemgetter(0, 1)))
 
     stream = Steps(Recorded(told), "", STEP_NS)
     assert [plain(step) for step in stream] == WHOLE
@@ -123,18 +123,18 @@ def test_the_order_of_receipt() -> None:
         for i in range(3000)
     ]
     late = told[:100] + told[101:103] + [told[100]] + told[103:]
-    assert list(receipt.in_order(late)) == [(0, m) for m in told]
+    assert list(receive_order.in_order(late)) == [(0, m) for m in told]
     resent = [*told]
     resent[100] = told[100]._replace(log_time_ns=told[100].log_time_ns + SECOND)
-    assert receipt.set_back_ns(resent) == 0
+    assert receive_order.set_back_ns(resent) == 0
     alone = [m._replace(log_time_ns=m.log_time_ns - SECOND) if i >= 1500 else m for i, m in enumerate(told)]
     for back in (alone, set_by(told, 1500, -SECOND)):
-        assert list(receipt.in_order(back)) == [(int(i >= 1500), m) for i, m in enumerate(back)]
-        assert receipt.set_back_ns(back) > SECOND * 0.99
+        assert list(receive_order.in_order(back)) == [(int(i >= 1500), m) for i, m in enumerate(back)]
+        assert receive_order.set_back_ns(back) > SECOND * 0.99
 
 
 def test_memory_of_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(receipt, "WAITING_BYTES", 10 * (receipt.MESSAGE_BYTES + 100))
+    monkeypatch.setattr(receive_order, "WAITING_BYTES", 10 * (receive_order.MESSAGE_BYTES + 100))
     taken = 0
 
     def stream():
@@ -142,7 +142,7 @@ def test_memory_of_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
         for taken in range(1, 1001):
             yield BagMessage("/a", "", bytes(100), taken, taken)
 
-    for n, (_, message) in enumerate(receipt.in_order(stream()), 1):
+    for n, (_, message) in enumerate(receive_order.in_order(stream()), 1):
         assert message.log_time_ns == n
         assert taken - n <= 10
 

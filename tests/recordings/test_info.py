@@ -14,7 +14,7 @@ from tests.bags.made import QOS, STRING, TYPES, content, information, text
 from tests.recordings import made
 from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, messages, scenarios, topics
-from uav_dc_ros.bags.recover import recover
+from uav_dc_ros.bags.salvage.recover import recover
 from uav_dc_ros.bags.write import BagWriter
 
 N_USERS = 4

@@ -12,9 +12,9 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Message, Metadata, Schema
 from mcap.summary import Summary
 
-from uav_dc_ros.bags.frames import CDR, COMPRESSIONS, FRAME, MAGIC, TIME_MAX_NS, plain
 from uav_dc_ros.bags.metadata import Part
-from uav_dc_ros.bags.scan import Scan, has_end, metadata_records
+from uav_dc_ros.bags.records import CDR, COMPRESSIONS, FRAME, MAGIC, TIME_MAX_NS, plain
+from uav_dc_ros.bags.salvage.scan import Scan, has_end, metadata_records
 from uav_dc_ros.bags.storage import (
     RECOVER,
     BagMessage,

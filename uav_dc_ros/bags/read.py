@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from uav_dc_ros.bags import receipt
+from uav_dc_ros.bags import receive_order
 from uav_dc_ros.bags.mcap_storage import open_mcap
 from uav_dc_ros.bags.sqlite_storage import open_sqlite
 from uav_dc_ros.bags.storage import (
@@ -135,7 +135,7 @@ class BagReader:
         if not self._is_side_by_side:
             for before, after in pairwise(part for part in self.storages if _names(part)):
                 goes_back_ns = max(goes_back_ns, before.last_ns - after.first_ns)
-        return receipt.set_back_ns(self._recorded(None)) if goes_back_ns > receipt.LEAST_NS else 0
+        return receive_order.set_back_ns(self._recorded(None)) if goes_back_ns > receive_order.LEAST_NS else 0
 
     def received(self, topics: Collection[str]) -> Iterator[tuple[int, BagMessage]]:
         """Messages in the order of their receipt, each with how often the clock had been set back by then.
@@ -148,7 +148,7 @@ class BagReader:
         """
         if not self.set_back_ns:
             return ((0, message) for message in self.messages(topics))
-        return receipt.in_order(self._recorded(topics))
+        return receive_order.in_order(self._recorded(topics))
 
     def _recorded(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
         """Messages in the order in which they were recorded."""

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from uav_dc_ros.bags.frames import CDR, plain
+from uav_dc_ros.bags.records import CDR, plain
 from uav_dc_ros.bags.storage import BagMessage, RecordedTopic, Storage, damage, goes_back_ns
 
 ROWS = 1000  # read at a time

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import zstandard
 from mcap.exceptions import McapError
 
-from uav_dc_ros.bags.part import part_paths
-from uav_dc_ros.bags.scan import Damage
+from uav_dc_ros.bags.part_writer import part_paths
+from uav_dc_ros.bags.salvage.scan import Damage
 from uav_dc_ros.errors import BagDamagedError, BagError
 
 SQLITE = ".db3"

@@ -19,11 +19,11 @@ from typing import Self
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from uav_dc_ros.bags import definitions
-from uav_dc_ros.bags.mend import mend_parts
+from uav_dc_ros.bags import message_definitions
 from uav_dc_ros.bags.metadata import FILE_NAME, Part, is_latched, to_yaml, total, write_metadata
-from uav_dc_ros.bags.part import FolderLock, part_paths
-from uav_dc_ros.bags.series import PartSeries, Row
+from uav_dc_ros.bags.part_writer import FolderLock, part_paths
+from uav_dc_ros.bags.salvage.repair import mend_parts
+from uav_dc_ros.bags.split_writer import PartSeries, Row
 from uav_dc_ros.bags.sync import DiskSync
 from uav_dc_ros.errors import BagError
 
@@ -147,7 +147,7 @@ class BagWriter:
                 qos = earlier["offered_qos_profiles"]
         if not definition:
             definition = _definition(name, type)
-            type_hash = definitions.TYPESTORE.hash_rihs01(type)
+            type_hash = message_definitions.TYPESTORE.hash_rihs01(type)
         row = Row(
             type=type,
             definition=definition,
@@ -275,6 +275,6 @@ def _earlier_parts(folder: Path) -> list[Part]:
 
 def _definition(topic: str, type: str) -> bytes:
     try:
-        return definitions.definition(type)
+        return message_definitions.definition(type)
     except BagError as error:
         raise BagError(f"topic {topic} is of type {error}") from None

@@ -260,7 +260,9 @@ class Flight:
         """Make a whole bag of one whose recorder did not close it; 1 if that cannot be."""
         if self.bag is None or not self.bag.is_dir() or (self.bag / "metadata.yaml").is_file():
             return 0
-        from uav_dc_ros.bags.mend import mend  # brings what reads bags, for the few that must be mended
+        from uav_dc_ros.bags.salvage.repair import (
+            mend,  # brings what reads bags, for the few that must be mended
+        )
 
         try:
             mended = mend(self.bag)

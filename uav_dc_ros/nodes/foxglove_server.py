@@ -10,7 +10,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from uav_dc_ros.bags.definitions import ENCODING, definition
+from uav_dc_ros.bags.message_definitions import ENCODING, definition
 from uav_dc_ros.errors import NodeError, ParameterError
 from uav_dc_ros.topics import Topic
 

@@ -40,10 +40,10 @@ def definition(type: str) -> bytes:
     Raises:
         LookupError: it, or a type inside it, is not installed.
     """
-    from uav_dc_ros.bags import definitions  # brings rosbags, which only few need, and late
+    from uav_dc_ros.bags import message_definitions  # brings rosbags, which only few need, and late
 
-    if type in definitions.TYPESTORE.fielddefs:
-        return definitions.definition(type)
+    if type in message_definitions.TYPESTORE.fielddefs:
+        return message_definitions.definition(type)
     texts: dict[str, str] = {}
     _describe(type, texts)
     own = texts.pop(type)

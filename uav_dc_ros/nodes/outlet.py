@@ -6,9 +6,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from uav_dc_ros.bags.definitions import ENCODING
-from uav_dc_ros.bags.frames import CDR
+from uav_dc_ros.bags.message_definitions import ENCODING
 from uav_dc_ros.bags.read import BagMessage, RecordedTopic
+from uav_dc_ros.bags.records import CDR
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes import message_types, recorded_qos
 

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import cdr, messages, scenarios, topics
-from uav_dc_ros.bags.definitions import is_defined_so
+from uav_dc_ros.bags.message_definitions import is_defined_so
 from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
 from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.core.scenario import Scenario, from_values

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from uav_dc_ros import topics
-from uav_dc_ros.bags.definitions import TYPESTORE
-from uav_dc_ros.bags.frames import TIME_MAX_NS
+from uav_dc_ros.bags.message_definitions import TYPESTORE
 from uav_dc_ros.bags.metadata import FILE_NAME, LOST, Part, is_told, read_metadata
 from uav_dc_ros.bags.read import BagMessage, BagReader
+from uav_dc_ros.bags.records import TIME_MAX_NS
 from uav_dc_ros.bags.storage import Storage
 from uav_dc_ros.errors import BagDamagedError, BagError
 from uav_dc_ros.recordings.missions import MissionSurvey, look_through, mission_problems

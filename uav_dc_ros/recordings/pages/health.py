@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from uav_dc_ros import topics
-from uav_dc_ros.bags.definitions import TYPESTORE
+from uav_dc_ros.bags.message_definitions import TYPESTORE
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TOLD_MAX, Phase
 from uav_dc_ros.recordings.mission_totals import UNFINISHED

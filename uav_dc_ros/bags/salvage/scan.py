@@ -23,7 +23,8 @@ from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metad
 from mcap.summary import Summary
 
 from uav_dc_ros import cdr
-from uav_dc_ros.bags.frames import (
+from uav_dc_ros.bags.metadata import Part, is_latched
+from uav_dc_ros.bags.records import (
     CDR,
     COMPRESSIONS,
     FOOTER_BYTES,
@@ -39,7 +40,6 @@ from uav_dc_ros.bags.frames import (
     plain,
     unpack,
 )
-from uav_dc_ros.bags.metadata import Part, is_latched
 from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.errors import BagDamagedError, BagError, MessageError
 from uav_dc_ros.topics import JSON

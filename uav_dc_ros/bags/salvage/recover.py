@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from uav_dc_ros import files
-from uav_dc_ros.bags.mend import copy
 from uav_dc_ros.bags.metadata import LOST, METADATA_NAME, Part, total, write_metadata
-from uav_dc_ros.bags.part import PartWriter
-from uav_dc_ros.bags.scan import Damage, Scan, has_end
+from uav_dc_ros.bags.part_writer import PartWriter
+from uav_dc_ros.bags.salvage.repair import copy
+from uav_dc_ros.bags.salvage.scan import Damage, Scan, has_end
 from uav_dc_ros.bags.storage import foreign, storage_files
 from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.errors import BagError

@@ -15,8 +15,8 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from uav_dc_ros import files
 from uav_dc_ros.bags import metadata
 from uav_dc_ros.bags.metadata import Part, is_told, total, write_metadata
-from uav_dc_ros.bags.part import FolderLock, PartWriter, part_paths
-from uav_dc_ros.bags.scan import Scan, has_end
+from uav_dc_ros.bags.part_writer import FolderLock, PartWriter, part_paths
+from uav_dc_ros.bags.salvage.scan import Scan, has_end
 from uav_dc_ros.errors import BagError
 
 

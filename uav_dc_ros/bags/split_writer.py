@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from uav_dc_ros.bags import definitions
+from uav_dc_ros.bags import message_definitions
 from uav_dc_ros.bags.metadata import DROPPED_NAME, METADATA_NAME, REPEATED_NAME, Part
-from uav_dc_ros.bags.part import CHUNK_BYTES, PartWriter, number
+from uav_dc_ros.bags.part_writer import CHUNK_BYTES, PartWriter, number
 
 CHUNKS_OF_A_PART = 8  # at least, so that its size comes near to what was asked for
 CHUNK_LEAST_BYTES = 1024
@@ -101,7 +101,9 @@ class PartSeries:
     def _announce(self, name: str, row: Row) -> None:
         """Enter a topic into the part."""
         if row.type not in self._schemas:
-            self._schemas[row.type] = self.current.add_schema(row.type, definitions.ENCODING, row.definition)
+            self._schemas[row.type] = self.current.add_schema(
+                row.type, message_definitions.ENCODING, row.definition
+            )
         row.channel_id = self.current.add_channel(name, "cdr", self._schemas[row.type], row.channel)
         if row.latest:
             self._head.append(name)
