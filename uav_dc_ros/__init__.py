@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from uav_dc_ros.experiments.evaluate import evaluate as evaluate_policy
     from uav_dc_ros.experiments.fly import Missions as Missions
     from uav_dc_ros.mission_summary import Summary as Summary
-    from uav_dc_ros.recordings.step import RecordedStep as RecordedStep
+    from uav_dc_ros.recordings.recorded_step import RecordedStep as RecordedStep
     from uav_dc_ros.run_all import fly as fly
     from uav_dc_ros.run_config import RunConfig as RunConfig
     from uav_dc_ros.scenarios import load as load_scenario
@@ -42,7 +42,7 @@ _PUBLIC = {
     "Evaluation": "uav_dc_ros.experiments.evaluate:Evaluation",
     "Missions": "uav_dc_ros.experiments.fly:Missions",
     "Policy": "uav_dc_ros.agents.policy:Policy",
-    "RecordedStep": "uav_dc_ros.recordings.step:RecordedStep",
+    "RecordedStep": "uav_dc_ros.recordings.recorded_step:RecordedStep",
     "RunConfig": "uav_dc_ros.run_config:RunConfig",
     "Scenario": "uav_dc_ros.core.scenario:Scenario",
     "Summary": "uav_dc_ros.mission_summary:Summary",

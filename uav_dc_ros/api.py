@@ -8,8 +8,8 @@ from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate import TEST_SEEDS, steer
 from uav_dc_ros.experiments.fly import Act, Missions, fly
-from uav_dc_ros.recordings import steps
-from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings import step_reader
+from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
 def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Missions:
@@ -42,6 +42,6 @@ def read_steps(bag: str | Path, namespace: str | None = None) -> Iterator[Record
         ScenarioError: the bag's own scenario cannot be read.
     """
     with BagReader(Path(bag)) as reader:
-        name = steps.namespace(reader, namespace)
-        step_s = steps.scenario(reader, name).mission.step_s
-        yield from steps.Steps(reader, name, round(step_s * 1e9))
+        name = step_reader.namespace(reader, namespace)
+        step_s = step_reader.scenario(reader, name).mission.step_s
+        yield from step_reader.Steps(reader, name, round(step_s * 1e9))

@@ -16,14 +16,20 @@ DESCRIPTION = "Record, play, recover, verify and explain bags."
 VERBS = {
     "record": ("uav_dc_ros.nodes.record", "record topics into a new bag"),
     "play": ("uav_dc_ros.nodes.play", "publish a bag's messages again, with their timing and QoS"),
-    "info": ("uav_dc_ros.recordings.info", "show what a bag holds, and whether it is complete"),
+    "info": ("uav_dc_ros.recordings.info.command", "show what a bag holds, and whether it is complete"),
     "recover": ("uav_dc_ros.bags.salvage.recover", "make a whole bag of what a killed recorder left"),
-    "verify": ("uav_dc_ros.recordings.verify", "recompute everything that a bag holds of its missions"),
+    "verify": (
+        "uav_dc_ros.recordings.verify.command",
+        "recompute everything that a bag holds of its missions",
+    ),
     "report": (
         "uav_dc_ros.recordings.report",
         "write a page about missions, or compare several bags",
     ),
-    "export": ("uav_dc_ros.recordings.export", "write missions as tables, or as transitions to learn from"),
+    "export": (
+        "uav_dc_ros.recordings.export.command",
+        "write missions as tables, or as transitions to learn from",
+    ),
 }
 
 

@@ -21,7 +21,7 @@ from uav_dc_ros.bags import mcap_storage, message_definitions
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.salvage.recover import recover, told
 from uav_dc_ros.errors import BagDamagedError, BagError
-from uav_dc_ros.recordings.survey import survey
+from uav_dc_ros.recordings.info.survey import survey
 
 N = 60
 ABOUT = {"seed": "3", "policy": "p"}

@@ -19,7 +19,7 @@ from uav_dc_ros.bags import receive_order
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.recordings.steps import Steps
+from uav_dc_ros.recordings.step_reader import Steps
 
 SCENARIO = tiny()
 FLIGHT = flight(SCENARIO, missions=3)

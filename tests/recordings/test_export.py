@@ -16,7 +16,7 @@ from uav_dc_ros import bag as command
 from uav_dc_ros import messages
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.env.gym_env import DataCollectionEnv
-from uav_dc_ros.recordings.rows import TABLES
+from uav_dc_ros.recordings.export.rows import TABLES
 
 TINY = tiny()
 MISSIONS, STEPS, SEED = 3, TINY.mission.max_steps, 4
@@ -253,7 +253,7 @@ def test_csv_needs_no_pyarrow_and_parquet_says_what_it_needs(bag, tmp_path):
 
 
 def test_many_rows_come_in_row_groups(tmp_path, capsys, monkeypatch):
-    from uav_dc_ros.recordings import tables
+    from uav_dc_ros.recordings.export import tables
 
     monkeypatch.setattr(tables, "ROWS", 20)
     bag = write(tmp_path / "bag", flight(TINY, missions=3), about(TINY))

@@ -24,13 +24,13 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.messages import FaultKind, Phase
-from uav_dc_ros.recordings.missions import look_through
+from uav_dc_ros.recordings.info.missions import look_through
 from uav_dc_ros.recordings.pages import missions as pages
 from uav_dc_ros.recordings.pages.vehicle import WAY_MAX, Way
-from uav_dc_ros.recordings.step import TOLD_KEPT, RecordedPose
-from uav_dc_ros.recordings.steps import Steps
-from uav_dc_ros.recordings.vehicles import vehicle
-from uav_dc_ros.recordings.verify import verify
+from uav_dc_ros.recordings.recorded_step import TOLD_KEPT, RecordedPose
+from uav_dc_ros.recordings.recorded_vehicle import vehicle
+from uav_dc_ros.recordings.step_reader import Steps
+from uav_dc_ros.recordings.verify.command import verify
 
 TINY = tiny()
 LONG = tiny(mission={"max_steps": 60})

@@ -14,8 +14,8 @@ from uav_dc_ros import messages
 from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
 from uav_dc_ros.errors import BagError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.recordings import steps
-from uav_dc_ros.recordings.steps import OPEN_MAX, Steps
+from uav_dc_ros.recordings import step_reader
+from uav_dc_ros.recordings.step_reader import OPEN_MAX, Steps
 
 SCENARIO = tiny()
 STEP_NS = round(SCENARIO.mission.step_s * 1e9)
@@ -66,7 +66,7 @@ def test_a_flight_in_order():
         assert step.status.phase.is_over == over
         assert step.users.step == step.rates.step == step.status.step == step.step
         assert step.position_m.tolist() == [100.0 * step.status.cell[0], 100.0 * step.status.cell[1], 100.0]
-        assert set(step.log_ns) == set(steps.STEP_TOPICS) - ({"move"} if over else set())
+        assert set(step.log_ns) == set(step_reader.STEP_TOPICS) - ({"move"} if over else set())
         assert step.log_ns == step.publish_ns
         assert not step.others
     assert not stream.orphans + stream.repeated + stream.rejected
@@ -262,10 +262,12 @@ def test_the_first_pose_of_the_steps_own_time_is_its_position():
 
 
 def test_poses_without_users_do_not_fill_the_memory():
-    told = [said("pose", pose((0, 0, 100), i * 10**6), BEGUN_NS + i) for i in range(steps.POSES_MAX + 50)]
+    told = [
+        said("pose", pose((0, 0, 100), i * 10**6), BEGUN_NS + i) for i in range(step_reader.POSES_MAX + 50)
+    ]
     stream = Steps(InMemory(told), "")
     assert list(stream) == []
-    assert len(stream._poses) == steps.POSES_MAX
+    assert len(stream._poses) == step_reader.POSES_MAX
 
 
 def test_what_cannot_be_read_is_counted(tmp_path):
@@ -286,13 +288,13 @@ def test_namespaces(tmp_path):
     told = sorted([*FLIGHT, *second], key=lambda message: message.log_time_ns)
     bag = write(tmp_path / "bag", [stranger, *told])
     with BagReader(bag) as reader:
-        assert steps.namespaces(reader) == ["", "/uav2"]
+        assert step_reader.namespaces(reader) == ["", "/uav2"]
         with pytest.raises(BagError, match=r"holds missions in /, /uav2; expected one of them"):
-            steps.namespace(reader)
+            step_reader.namespace(reader)
         with pytest.raises(BagError, match=r"no mission in namespace 'uav3'; expected /, /uav2"):
-            steps.namespace(reader, "uav3")
-        assert [plain(s) for s in Steps(reader, steps.namespace(reader, "/"), STEP_NS)] == WHOLE
-        other = list(Steps(reader, steps.namespace(reader, "uav2"), STEP_NS))
+            step_reader.namespace(reader, "uav3")
+        assert [plain(s) for s in Steps(reader, step_reader.namespace(reader, "/"), STEP_NS)] == WHOLE
+        other = list(Steps(reader, step_reader.namespace(reader, "uav2"), STEP_NS))
     assert {step.status.seed for step in other} == {5}
     assert len(other) == LAST + 1
 
@@ -311,11 +313,11 @@ def test_the_scenario_of_a_bag(tmp_path):
     shipped = scenarios.load("three_clusters")
     bag = write(tmp_path / "foreign", flight(shipped, steps=1))
     with BagReader(bag) as reader:
-        assert steps.scenario(reader, "") == shipped, "by the fingerprint that its missions tell"
-        assert steps.scenario(reader, "", "five_clusters").name == "five_clusters"
+        assert step_reader.scenario(reader, "") == shipped, "by the fingerprint that its missions tell"
+        assert step_reader.scenario(reader, "", "five_clusters").name == "five_clusters"
     bag = write(tmp_path / "unknown", flight(SCENARIO, steps=1))
     with (
         BagReader(bag) as reader,
         pytest.raises(BagError, match=r"fly 'tiny' \([0-9a-f]{12}\); expected --sc"),
     ):
-        steps.scenario(reader, "")
+        step_reader.scenario(reader, "")

@@ -11,8 +11,8 @@ from uav_dc_ros.errors import TrainingError
 
 if TYPE_CHECKING:  # most trainings begin without bags: what reads them is imported when it is needed
     from uav_dc_ros.experiments.training import Training
-    from uav_dc_ros.recordings.step import RecordedStep
-    from uav_dc_ros.recordings.steps import Steps
+    from uav_dc_ros.recordings.recorded_step import RecordedStep
+    from uav_dc_ros.recordings.step_reader import Steps
 
 
 class Remembered(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,7 +51,7 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
         BagError: a bag cannot be read.
     """
     from uav_dc_ros.bags.read import BagReader
-    from uav_dc_ros.recordings import steps
+    from uav_dc_ros.recordings import step_reader
     from uav_dc_ros.recordings.transitions import Transitions
 
     population = training.population
@@ -66,8 +66,8 @@ def remember(training: "Training", bags: Sequence[Path]) -> Remembered:
     for i, bag in enumerate(bags):
         n_before, unreadable = n, list[str]()
         with BagReader(bag) as reader:
-            for namespace in steps.namespaces(reader):
-                recorded = steps.Steps(reader, namespace, scenario.step_ns)
+            for namespace in step_reader.namespaces(reader):
+                recorded = step_reader.Steps(reader, namespace, scenario.step_ns)
                 ours = Transitions(_checked(recorded, scenario, bag), scenario, population.observation)
                 for transition in ours:
                     training.remember(transition)

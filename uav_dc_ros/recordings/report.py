@@ -10,15 +10,15 @@ from typing import Any
 from uav_dc_ros import __version__, cli, files
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagError, ParameterError
-from uav_dc_ros.recordings import steps
+from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.pages import compare
 from uav_dc_ros.recordings.pages.health import Health
 from uav_dc_ros.recordings.pages.missions import Flown, flown
 from uav_dc_ros.recordings.pages.page import Page
 from uav_dc_ros.recordings.pages.vehicle import Way, way
 from uav_dc_ros.recordings.pages.world import world
-from uav_dc_ros.recordings.step import RecordedStep, printable
-from uav_dc_ros.recordings.vehicles import vehicle
+from uav_dc_ros.recordings.recorded_step import RecordedStep, printable
+from uav_dc_ros.recordings.recorded_vehicle import vehicle
 from uav_dc_ros.topics import SIMULATED
 
 SUMMARIES_MAX = 2_000  # rows in the list of missions
@@ -75,12 +75,12 @@ def run(options: argparse.Namespace) -> int:
 def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
     """The page of one bag, and what is in it, in words."""
     with BagReader(options.bag) as reader:
-        name = steps.namespace(reader, options.namespace)
-        scenario = steps.scenario(reader, name, options.scenario)
+        name = step_reader.namespace(reader, options.namespace)
+        scenario = step_reader.scenario(reader, name, options.scenario)
         bag = printable(options.bag.absolute().name)
         title = f"{scenario.name}: {bag}"
         page, health = Page("mission", title), Health(reader, name)
-        recorded = steps.Steps(reader, name, scenario.step_ns)
+        recorded = step_reader.Steps(reader, name, scenario.step_ns)
         flew = vehicle(reader, name)
         real = flew != SIMULATED
         taken = way(reader, name, scenario) if real else None
@@ -126,7 +126,7 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
     return page, f"{len(held)}{left} mission{'s' if total > 1 else ''}"
 
 
-def _heard(recorded: steps.Steps, health: Health) -> Iterator[RecordedStep]:
+def _heard(recorded: step_reader.Steps, health: Health) -> Iterator[RecordedStep]:
     for step in recorded:
         health.hear(step)
         yield step

@@ -19,7 +19,7 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
 class Transition(NamedTuple):

@@ -17,11 +17,11 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.recordings import steps
+from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.pages.missions import Flown, flown, significant
 from uav_dc_ros.recordings.pages.page import PAGE_MAX, Page
 from uav_dc_ros.recordings.pages.world import world
-from uav_dc_ros.recordings.step import printable
+from uav_dc_ros.recordings.recorded_step import printable
 from uav_dc_ros.recordings.thinning import spread
 
 GROUPS_MAX = 8  # more colours and dashes nobody tells apart
@@ -116,10 +116,10 @@ def _groups(
     """The group of a bag; or, `apart`, a group for each of its missions."""
     groups: list[Group] = []
     with BagReader(bag) as reader:
-        name = steps.namespace(reader, namespace)
-        scenario = steps.scenario(reader, name, wanted)
+        name = step_reader.namespace(reader, namespace)
+        scenario = step_reader.scenario(reader, name, wanted)
         policy = reader.about.get("policy", "unknown policy")
-        recorded = steps.Steps(reader, name, scenario.step_ns)
+        recorded = step_reader.Steps(reader, name, scenario.step_ns)
         for one in flown(iter(recorded), scenario):
             if missions is not None and one.index not in missions:
                 continue

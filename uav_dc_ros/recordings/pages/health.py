@@ -12,8 +12,8 @@ from uav_dc_ros.messages import TOLD_MAX, Phase
 from uav_dc_ros.recordings.mission_totals import UNFINISHED
 from uav_dc_ros.recordings.pages.diagnostics import Node, Report
 from uav_dc_ros.recordings.pages.missions import Flown
-from uav_dc_ros.recordings.step import RecordedStep
-from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps
+from uav_dc_ros.recordings.recorded_step import RecordedStep
+from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps
 from uav_dc_ros.recordings.thinning import EveryNth
 
 SAMPLES_MAX = 100_000  # of a latency: percentiles need no more

@@ -18,7 +18,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.recordings.mission_totals import MissionTotals
 from uav_dc_ros.recordings.pages.vehicle import Journey
-from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.recorded_step import RecordedStep
 from uav_dc_ros.recordings.thinning import EveryNth, spread
 
 STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart

@@ -10,8 +10,8 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.phases import BEFORE_START
-from uav_dc_ros.recordings.step import RecordedPose, RecordedStep, Told
-from uav_dc_ros.recordings.steps import read_pose
+from uav_dc_ros.recordings.recorded_step import RecordedPose, RecordedStep, Told
+from uav_dc_ros.recordings.step_reader import read_pose
 from uav_dc_ros.recordings.thinning import Apart
 
 WORDS_MAX = 1000  # phases and reasons that are shown of a mission

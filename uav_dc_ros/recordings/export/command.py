@@ -22,13 +22,14 @@ from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardForm
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
-from uav_dc_ros.recordings import rows, steps
-from uav_dc_ros.recordings.rows import Mission
-from uav_dc_ros.recordings.step import printable
-from uav_dc_ros.recordings.steps import Steps
-from uav_dc_ros.recordings.tables import Format, Table
+from uav_dc_ros.recordings import step_reader
+from uav_dc_ros.recordings.export import rows
+from uav_dc_ros.recordings.export.rows import Mission
+from uav_dc_ros.recordings.export.tables import Format, Table
+from uav_dc_ros.recordings.recorded_step import printable
+from uav_dc_ros.recordings.recorded_vehicle import vehicle
+from uav_dc_ros.recordings.step_reader import Steps
 from uav_dc_ros.recordings.transitions import Transition, Transitions
-from uav_dc_ros.recordings.vehicles import vehicle
 from uav_dc_ros.topics import SIMULATED
 
 ALL = tuple(rows.tables(real=True))
@@ -91,8 +92,8 @@ def run(options: argparse.Namespace) -> int:
     """
     _check(options)
     with BagReader(options.bag) as reader:
-        namespace = steps.namespace(reader, options.namespace)
-        scenario = steps.scenario(reader, namespace, options.scenario)
+        namespace = step_reader.namespace(reader, options.namespace)
+        scenario = step_reader.scenario(reader, namespace, options.scenario)
         if options.reward_form:
             paid = msgspec.structs.replace(scenario.reward, form=options.reward_form)
             scenario = msgspec.structs.replace(scenario, reward=paid)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from uav_dc_ros.recordings.step import RecordedStep
+from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
 @dataclass(frozen=True, kw_only=True)

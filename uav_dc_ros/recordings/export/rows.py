@@ -12,9 +12,9 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.phases import BEFORE_START
+from uav_dc_ros.recordings.export.tables import Columns
 from uav_dc_ros.recordings.mission_totals import MissionTotals
-from uav_dc_ros.recordings.step import RecordedStep
-from uav_dc_ros.recordings.tables import Columns
+from uav_dc_ros.recordings.recorded_step import RecordedStep
 from uav_dc_ros.topics import SIMULATED
 
 _WHICH: Columns = {"flight": "int", "mission": "int", "step": "int"}

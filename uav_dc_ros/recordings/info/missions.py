@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagDamagedError, BagError, UavDcError
 from uav_dc_ros.recordings.mission_totals import MissionTotals
-from uav_dc_ros.recordings.step import RecordedStep
-from uav_dc_ros.recordings.steps import STEP_TOPICS, Steps, scenario
+from uav_dc_ros.recordings.recorded_step import RecordedStep
+from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps, scenario
 
 
 @dataclass(kw_only=True)

@@ -16,9 +16,9 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.records import TIME_MAX_NS
 from uav_dc_ros.bags.storage import Storage
 from uav_dc_ros.errors import BagDamagedError, BagError
-from uav_dc_ros.recordings.missions import MissionSurvey, look_through, mission_problems
-from uav_dc_ros.recordings.step import printable
-from uav_dc_ros.recordings.steps import namespaces
+from uav_dc_ros.recordings.info.missions import MissionSurvey, look_through, mission_problems
+from uav_dc_ros.recordings.recorded_step import printable
+from uav_dc_ros.recordings.step_reader import namespaces
 
 HARDWARE_ID = "uav_dc_ros"  # of our nodes' diagnostics
 TOLD_MAX = 3  # damaged places of a file that are told one by one

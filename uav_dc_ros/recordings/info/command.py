@@ -13,9 +13,9 @@ from rich.text import Text
 
 from uav_dc_ros import files
 from uav_dc_ros.bags.storage import RECOVER
-from uav_dc_ros.recordings.missions import MissionSurvey
-from uav_dc_ros.recordings.step import printable
-from uav_dc_ros.recordings.survey import Survey, TopicSurvey, start_text, survey
+from uav_dc_ros.recordings.info.missions import MissionSurvey
+from uav_dc_ros.recordings.info.survey import Survey, TopicSurvey, start_text, survey
+from uav_dc_ros.recordings.recorded_step import printable
 
 WIDTH = 80  # where there is no terminal
 MISSIONS_MAX = 30  # that are told one by one

@@ -17,13 +17,13 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, PolicyError
-from uav_dc_ros.recordings import steps
-from uav_dc_ros.recordings.compare import Book
-from uav_dc_ros.recordings.flights import Flights
-from uav_dc_ros.recordings.recompute import Channel, Decisions, World
-from uav_dc_ros.recordings.step import RecordedStep
-from uav_dc_ros.recordings.steps import Steps
-from uav_dc_ros.recordings.vehicles import is_real, vehicle
+from uav_dc_ros.recordings import step_reader
+from uav_dc_ros.recordings.recorded_step import RecordedStep
+from uav_dc_ros.recordings.recorded_vehicle import is_real, vehicle
+from uav_dc_ros.recordings.step_reader import Steps
+from uav_dc_ros.recordings.verify.differences import Book
+from uav_dc_ros.recordings.verify.recompute import Channel, Decisions, World
+from uav_dc_ros.recordings.verify.vehicle_flights import Flights
 from uav_dc_ros.topics import SIMULATED
 
 NEEDED = ("pose", "users", "rates", "mission")  # topics without which nothing can be recomputed
@@ -86,9 +86,9 @@ def run(options: argparse.Namespace) -> int:
         BagError: nothing of the bag can be recomputed.
     """
     with BagReader(options.bag) as reader:
-        namespace = steps.namespace(reader, options.namespace)
+        namespace = step_reader.namespace(reader, options.namespace)
         _check_topics(reader, namespace, ("mission",) if is_real(reader, namespace) else NEEDED)
-        scenario = steps.scenario(reader, namespace, options.scenario)
+        scenario = step_reader.scenario(reader, namespace, options.scenario)
         other = Decisions(scenario, policies.load(options.policy)) if options.policy else None
         found = verify(reader, namespace, scenario, other, options.policy_dir, options.tolerance)
         print(f"{options.bag}: {found.flown}")

@@ -13,8 +13,8 @@ import numpy as np
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.phases import following
-from uav_dc_ros.recordings.compare import Book, Difference, difference
-from uav_dc_ros.recordings.step import RecordedStep, Told
+from uav_dc_ros.recordings.recorded_step import RecordedStep, Told
+from uav_dc_ros.recordings.verify.differences import Book, Difference, difference
 
 
 @dataclass

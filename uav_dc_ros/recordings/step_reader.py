@@ -21,7 +21,7 @@ from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import BagError, MessageError, ScenarioError
 from uav_dc_ros.messages import Mission
 from uav_dc_ros.phases import GROUND
-from uav_dc_ros.recordings.step import (
+from uav_dc_ros.recordings.recorded_step import (
     POSES_KEPT,
     RecordedPose,
     RecordedStep,

@@ -23,8 +23,8 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.recordings.compare import Book, Difference, difference
-from uav_dc_ros.recordings.step import RecordedStep, is_later_only, with_standing_of
+from uav_dc_ros.recordings.recorded_step import RecordedStep, is_later_only, with_standing_of
+from uav_dc_ros.recordings.verify.differences import Book, Difference, difference
 
 COLUMNS = ("sinr", "rate_bps", "served", "sum_rate_bps", "data_bits", "collected")  # causes before effects
 FIELDS = {"users": "users", "rates": "rates", "mission": "status", "move": "move"}
