@@ -18,8 +18,8 @@ from typing import IO, Any
 import hypothesis
 import pytest
 
-from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.errors import MessageError
+from uav_dc_ros.offboard.mission.controller import Bridge
 
 Bridge.is_strict = True  # a phase that cannot follow fails the test; in the air it would end the mission
 MARK = "UAV_DC_TEST"

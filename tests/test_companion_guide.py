@@ -17,12 +17,14 @@ import pytest
 
 from tests.doc_commands import parameter, parsed
 from uav_dc_ros import resources, run_all, scenarios
-from uav_dc_ros.autopilot import beat, fence, systems
-from uav_dc_ros.autopilot.links import Address
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.nodes import datums, lease, options, supervisor
+from uav_dc_ros.nodes import lease, options, supervisor
 from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.offboard import datums, send_timer
+from uav_dc_ros.offboard.mavlink import systems
+from uav_dc_ros.offboard.mavlink.connection import Address
+from uav_dc_ros.offboard.mission import geofence
+from uav_dc_ros.offboard.mission.fault_detector import Settings
 
 ROOT = Path(__file__).parents[1]
 GUIDE = (ROOT / "docs" / "companion.md").read_text("utf-8")
@@ -164,10 +166,10 @@ def test_every_parameter_in_the_text_is_the_bridge_s() -> None:
 
 def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert f"system {systems.SYSTEM}, component {systems.COMPONENT}" in GUIDE
-    assert (beat.STREAM_S, beat.HEARTBEAT_S, beat.LIFE_S) == (1 / 20, 1.0, 1.0)
+    assert (send_timer.STREAM_S, send_timer.HEARTBEAT_S, send_timer.LIFE_S) == (1 / 20, 1.0, 1.0)
     assert "streams the setpoint 20 times a second" in GUIDE
     assert "end a second after its last decision" in GUIDE
-    assert fence.MARGIN_M == 20.0
+    assert geofence.MARGIN_M == 20.0
     assert "The fence is the grid with 20 m around it and above its top layer" in GUIDE
     assert Settings().returning_tries == 3
     assert "refuses to return three times" in GUIDE.replace("\n", " ")

@@ -58,7 +58,7 @@ def loaded(code: str, *modules: str) -> list[str]:
             "nodes.flight",
             (
                 *("rosbags", "mcap", "ruamel", "rich", "matplotlib", "gymnasium"),
-                *("uav_dc_ros.nodes.vehicles", "uav_dc_ros.autopilot.mavlink", "pymavlink"),
+                *("uav_dc_ros.nodes.vehicles", "uav_dc_ros.offboard.mavlink.vehicle", "pymavlink"),
             ),
         ),
     ],
@@ -72,7 +72,7 @@ def test_a_simulated_run_brings_no_way_to_an_autopilot() -> None:
         "from uav_dc_ros.nodes.flight import Flight\nfrom uav_dc_ros.run_config import RunConfig\n"
         "Flight(RunConfig(record=False))"
     )
-    vehicles = ("uav_dc_ros.nodes.vehicles", "uav_dc_ros.nodes.datums", "pymavlink", "pymap3d", "px4_msgs")
+    vehicles = ("uav_dc_ros.nodes.vehicles", "uav_dc_ros.offboard.datums", "pymavlink", "pymap3d", "px4_msgs")
     assert loaded(code, *vehicles) == []
 
 

@@ -7,9 +7,9 @@ import pytest
 from tests.autopilot.simulated import ARMING, Flight, fly_to_step
 from tests.recordings import flown
 from tests.small_worlds import tiny
-from uav_dc_ros.autopilot.bridge import Bridge
 from uav_dc_ros.errors import PhaseError
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.mission.controller import Bridge
 from uav_dc_ros.phases import RESTART, STEERED, TRANSITIONS, Transition, following, impossible
 
 OVER = {phase for phase in Phase if phase.is_over}

@@ -17,10 +17,10 @@ from typing import Any
 import msgspec
 
 from tests.autopilot.flight import ROOT, SCENARIO, Flight, fake
-from uav_dc_ros.autopilot.priority import run_when_due
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.realtime import run_when_due
 
 SPEED = 100.0
 AT_ONCE = 4

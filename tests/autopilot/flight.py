@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.frames import Enu, Ned, to_enu
-from uav_dc_ros.autopilot.mavlink import Mavlink
-from uav_dc_ros.autopilot.vehicle import Telemetry
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.frames import Enu, Ned, to_enu
+from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.vehicle import Telemetry
 
 ROOT = Path(__file__).parents[2]
 SCENARIO = scenarios.load("five_clusters")

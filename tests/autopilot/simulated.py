@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry, Wish
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry, Wish
 
 SPEED_MPS = {"across": 10.0, "up": 2.5, "down": 1.5}
 RETURN_M = 15.0  # least altitude of a return

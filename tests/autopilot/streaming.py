@@ -19,10 +19,10 @@ import numpy as np
 from pymavlink import mavutil
 
 from tests.autopilot.flight import ROOT, Fake, fake
-from uav_dc_ros.autopilot.beat import STREAM_S
-from uav_dc_ros.autopilot.mavlink import Mavlink
-from uav_dc_ros.autopilot.priority import run_when_due
-from uav_dc_ros.autopilot.session import POSITION_ONLY
+from uav_dc_ros.offboard.mavlink.session import POSITION_ONLY
+from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.realtime import run_when_due
+from uav_dc_ros.offboard.send_timer import STREAM_S
 
 BURN = "while True: pass"
 LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_dueling')"

@@ -2,8 +2,8 @@
 
 import pytest
 
-from uav_dc_ros.autopilot.battery import Battery
-from uav_dc_ros.autopilot.vehicle import Telemetry
+from uav_dc_ros.offboard.mission.battery import Battery
+from uav_dc_ros.offboard.vehicle import Telemetry
 
 LEAST = 0.2
 REST_V = 12.6

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step, way_home
-from uav_dc_ros.autopilot.bridge import Standing
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.controller import Standing
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff
 
 
 def test_a_whole_mission_from_the_ground_to_the_dock() -> None:

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uav_dc_ros.autopilot.dialects import ARDUCOPTER
-from uav_dc_ros.autopilot.frames import (
+from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER
+from uav_dc_ros.offboard.frames import (
     Enu,
     Geodetic,
     LocalFrame,
@@ -19,7 +20,6 @@ from uav_dc_ros.autopilot.frames import (
     wrapped,
     yaw_of_heading,
 )
-from uav_dc_ros.errors import VehicleError
 
 ZURICH = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
 QUARTER = math.pi / 2

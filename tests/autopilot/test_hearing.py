@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
-from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned
-from uav_dc_ros.autopilot.hearing import Hearing
-from uav_dc_ros.autopilot.limits import ASKED
-from uav_dc_ros.autopilot.vehicle import Limits, Telemetry
+from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
+from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
+from uav_dc_ros.offboard.limits import ASKED
+from uav_dc_ros.offboard.mavlink.telemetry import Hearing
+from uav_dc_ros.offboard.vehicle import Limits, Telemetry
 
 HOME = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
 HERE = (473977420, 85455940, 488000)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
-from uav_dc_ros.autopilot.bridge import Standing
-from uav_dc_ros.autopilot.fence import Fence
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Limits, Mode, SetMode, TakeOff, Telemetry
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import FaultKind, Phase
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.controller import Standing
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.geofence import Fence
+from uav_dc_ros.offboard.vehicle import Limits, Mode, SetMode, TakeOff, Telemetry
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
 STEP_S = SCENARIO.mission.step_s

@@ -15,13 +15,13 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.autopilot.flight import ROOT, Fake, fake, free_udp_port
-from uav_dc_ros.autopilot.beat import LIFE_S, Heartbeat
-from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.links import Address, LinkDown
-from uav_dc_ros.autopilot.mavlink import Mavlink
-from uav_dc_ros.autopilot.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry
 from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
+from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.mavlink.connection import Address, LinkDown
+from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.send_timer import LIFE_S, Heartbeat
+from uav_dc_ros.offboard.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry
 
 HOME = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
 
@@ -87,7 +87,7 @@ def test_what_cannot_be_opened_now_is_told_and_tried_again(tmp_path: Path) -> No
 def test_a_missing_package_is_told_with_its_extra(package: str, address: str) -> None:
     code = (
         f"import sys; sys.modules['{package}'] = None\n"
-        "from uav_dc_ros.autopilot.mavlink import Mavlink\n"
+        "from uav_dc_ros.offboard.mavlink.vehicle import Mavlink\n"
         "from uav_dc_ros.errors import VehicleError\n"
         f"try: Mavlink('{address}')\n"
         "except VehicleError as error: print(error)\n"
@@ -98,7 +98,9 @@ def test_a_missing_package_is_told_with_its_extra(package: str, address: str) ->
 
 
 def test_nothing_here_imports_pymavlink_unless_it_is_used() -> None:
-    code = "import sys, uav_dc_ros.autopilot.mavlink; print([m for m in sys.modules if 'pymavlink' in m])"
+    code = (
+        "import sys, uav_dc_ros.offboard.mavlink.vehicle; print([m for m in sys.modules if 'pymavlink' in m])"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 

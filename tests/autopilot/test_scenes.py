@@ -15,10 +15,10 @@ from tests.autopilot.autopilot import Autopilot
 from tests.autopilot.copter import Copter
 from tests.autopilot.flight import KINDS
 from tests.autopilot.virtual import VirtualFlight, short
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
 
 STEPS = list(range(6))
 

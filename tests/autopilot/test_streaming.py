@@ -8,8 +8,8 @@ import time
 import pytest
 
 from tests.autopilot.streaming import off_beat_ms
-from uav_dc_ros.autopilot.mavlink import Mavlink
-from uav_dc_ros.autopilot.priority import run_when_due
+from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.realtime import run_when_due
 
 AIM_MS = 10.0
 

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from tests.autopilot.simulated import ARMING, Flight, Vehicle, way_home
 from uav_dc_ros import scenarios
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Limits, Mode, Telemetry
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.vehicle import Limits, Mode, Telemetry
 
 FIELD = scenarios.load(Path(__file__).parents[2] / "docs" / "field.toml")
 TICK_S = 0.2

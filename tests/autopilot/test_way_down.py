@@ -6,11 +6,11 @@ import msgspec
 import pytest
 
 from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
-from uav_dc_ros.autopilot.bridge import Standing
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Mode, SetMode
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.controller import Standing
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.vehicle import Mode, SetMode
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
 

@@ -14,15 +14,15 @@ import msgspec
 from tests.autopilot.autopilot import Autopilot, Control
 from tests.autopilot.copter import TICK_S, Copter
 from tests.autopilot.flight import SCENARIO, way_home
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.hearing import Hearing
-from uav_dc_ros.autopilot.mavlink import load_codec
-from uav_dc_ros.autopilot.session import Session
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.mavlink.session import Session
+from uav_dc_ros.offboard.mavlink.telemetry import Hearing
+from uav_dc_ros.offboard.mavlink.vehicle import load_codec
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
 
 LOOKS = 2  # after so many ticks of the vehicle the bridge looks: half as often as its node does
 

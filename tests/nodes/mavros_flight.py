@@ -13,13 +13,13 @@ import rclpy
 
 from tests.conftest import Ros
 from tests.small_worlds import changed
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.vehicles.mavros import Mavros
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
 
 START = Enu(20.0, 0.0, 0.0)  # on the ground below it
 SCENARIO = changed(

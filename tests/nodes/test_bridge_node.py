@@ -13,15 +13,16 @@ from std_msgs.msg import String
 from tests.conftest import Ros
 from tests.nodes.mavros_flight import node_in
 from uav_dc_ros import cdr, messages
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.links import Address
-from uav_dc_ros.autopilot.mavlink import Mavlink
-from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import bridge, datums, vehicles
+from uav_dc_ros.nodes import bridge, vehicles
 from uav_dc_ros.nodes.bridge import AutopilotBridge
 from uav_dc_ros.nodes.journal import Journal
+from uav_dc_ros.offboard import datums
+from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.mavlink.connection import Address
+from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Wish
 
 DATUM = Geodetic(latitude_deg=47.4, longitude_deg=8.5, altitude_m=400.0)
 FLIES = Telemetry(

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from uav_dc_ros import run_all, scenarios
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
 from uav_dc_ros.errors import NodeError, ParameterError, VehicleError
-from uav_dc_ros.nodes import datums, options
+from uav_dc_ros.nodes import options
+from uav_dc_ros.offboard import datums
+from uav_dc_ros.offboard.frames import Enu, Geodetic
 
 FIVE, THREE = scenarios.load("five_clusters"), scenarios.load("three_clusters")
 DATUM = Geodetic(latitude_deg=-35.363261, longitude_deg=149.16523, altitude_m=584.0)

@@ -10,15 +10,15 @@ from geometry_msgs.msg import PoseStamped
 
 from tests.conftest import Ros
 from tests.nodes.mavros_flight import START, Fake, Flight, fake, mavros_of, node_in, spin
-from uav_dc_ros.autopilot.fence import Fence
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Telemetry
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.executor import DirectExecutor
 from uav_dc_ros.nodes.vehicles.mavros import Mavros
-from uav_dc_ros.nodes.vehicles.stream import LIFE_S
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.geofence import Fence
+from uav_dc_ros.offboard.setpoint_stream import LIFE_S
+from uav_dc_ros.offboard.vehicle import Telemetry
 
 STANDS = "-7,11,3"  # where the copter stands in MAVROS's frame: east, north, up
 ORIGIN = Enu(27.0, -11.0, -3.0)  # of that frame, in the grid's

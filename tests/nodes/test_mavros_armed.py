@@ -20,13 +20,13 @@ from rclpy.task import Future
 from tests.autopilot.autopilot import TICK_S, Autopilot, Copter
 from tests.nodes.mavros_flight import SCENARIO, START, way_home
 from tests.nodes.test_mavros_parts import HEALTHY, PACKAGE, Message, estimator
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.frames import Enu, Ned, to_enu, to_ned
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import convert
 from uav_dc_ros.nodes.vehicles import mavros
 from uav_dc_ros.nodes.vehicles.mavros import Mavros
+from uav_dc_ros.offboard.frames import Enu, Ned, to_enu, to_ned
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
 
 STANDS = Enu(-7.0, 11.0, 3.0)
 READY_S = 5.0

@@ -17,17 +17,17 @@ import numpy as np
 import pytest
 from rclpy.task import Future
 
-from uav_dc_ros.autopilot.dialects import ARDUCOPTER, PX4
-from uav_dc_ros.autopilot.frames import Enu, Geodetic, tilt_rad
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Wish
-from uav_dc_ros.autopilot.watch import Settings, Watch
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.nodes.vehicles import mavros_messages
 from uav_dc_ros.nodes.vehicles.mavros_commands import ASK_AGAIN_S, Commands
-from uav_dc_ros.nodes.vehicles.mavros_diagnostics import OTHERS_S
-from uav_dc_ros.nodes.vehicles.mavros_hearing import Hearing
-from uav_dc_ros.nodes.vehicles.mavros_time import PATIENCE_S, VehicleTime
-from uav_dc_ros.nodes.vehicles.stream import LIFE_S, Stream
+from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
+from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
+from uav_dc_ros.offboard.mavros.diagnostics import OTHERS_S
+from uav_dc_ros.offboard.mavros.telemetry import Hearing
+from uav_dc_ros.offboard.mavros.vehicle_time import PATIENCE_S, VehicleTime
+from uav_dc_ros.offboard.mission.fault_detector import Settings, Watch
+from uav_dc_ros.offboard.setpoint_stream import LIFE_S, Stream
+from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
 
 PLACE = Enu(20.0, 0.0, 0.0)
 LINK = "uas:///uas1"

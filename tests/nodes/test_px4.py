@@ -22,18 +22,19 @@ from tests.conftest import Ros, each_once
 from tests.nodes import px4_messages
 from tests.nodes.conftest import SMALL
 from uav_dc_ros import scenarios
-from uav_dc_ros.autopilot.beat import LIFE_S, STREAM_S
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned, to_enu
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import fastdds
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.vehicles import px4, px4_hearing
-from uav_dc_ros.nodes.vehicles.px4_hearing import Px4Hearing
+from uav_dc_ros.nodes.vehicles import px4
+from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned, to_enu
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.px4 import telemetry
+from uav_dc_ros.offboard.px4.telemetry import Px4Hearing
+from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S
+from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
 
 # One worker builds the messages, once.
 pytestmark = pytest.mark.xdist_group("px4")
@@ -263,9 +264,9 @@ def test_numbers_are_those_of_the_definitions(msg: Any) -> None:
     ]
     assert len(told) == 9
     assert {int(number): name.removeprefix(prefix) for name, number in told}.items() <= (
-        px4_hearing.MODE_NAMES.items()
+        telemetry.MODE_NAMES.items()
     )
-    assert px4_hearing.MODES == {
+    assert telemetry.MODES == {
         state.NAVIGATION_STATE_OFFBOARD: Mode.COMMANDED,
         state.NAVIGATION_STATE_AUTO_LOITER: Mode.HOLD,
         state.NAVIGATION_STATE_AUTO_RTL: Mode.RETURN,
@@ -273,7 +274,7 @@ def test_numbers_are_those_of_the_definitions(msg: Any) -> None:
         state.NAVIGATION_STATE_AUTO_PRECLAND: Mode.LAND,
         state.NAVIGATION_STATE_DESCEND: Mode.LAND,
     }
-    assert px4_hearing.ARMED == state.ARMING_STATE_ARMED
+    assert telemetry.ARMED == state.ARMING_STATE_ARMED
     assert (px4.RETURN, px4.LAND, px4.SET_MODE, px4.ARM) == (
         command.VEHICLE_CMD_NAV_RETURN_TO_LAUNCH,
         command.VEHICLE_CMD_NAV_LAND,

@@ -14,16 +14,16 @@ from tests.autopilot.simulated import Vehicle
 from tests.recordings.made import BEGUN_NS, about, pose, said, write
 from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.agents.policy import Policy
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.frames import Enu
-from uav_dc_ros.autopilot.vehicle import Mode
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagMessage
 from uav_dc_ros.core import world
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.vehicle import Mode
 
 TICK_S = 0.1  # from one position to the next: ten a second
 LATENCY_NS = 700_000

@@ -21,9 +21,9 @@ from tests.small_worlds import saved, tiny
 from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, messages
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.messages import FaultKind, Phase
+from uav_dc_ros.offboard.mission.fault_detector import Settings
 from uav_dc_ros.recordings.info.missions import look_through
 from uav_dc_ros.recordings.pages import missions as pages
 from uav_dc_ros.recordings.pages.vehicle import WAY_MAX, Way

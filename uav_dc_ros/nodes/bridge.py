@@ -1,6 +1,6 @@
 """The vehicle beside an autopilot: tells the mission's steps, flies the moves that come, and keeps it safe.
 
-What it decides is in `uav_dc_ros.autopilot`; how it reaches the vehicle, in `vehicles`. It is a process of
+What it decides is in `uav_dc_ros.offboard`; how it reaches the vehicle, in `vehicles`. It is a process of
 its own: a policy that loads, hangs or dies disturbs no setpoint. A bridge that was killed finds in its
 journal where the mission stood, and takes it up in the air; it never arms a second time.
 """
@@ -14,21 +14,22 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import cdr, messages, scenarios
-from uav_dc_ros.autopilot.bridge import Bridge
-from uav_dc_ros.autopilot.course import Standing
-from uav_dc_ros.autopilot.fence import Fence
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.plausibility import Plausibility
-from uav_dc_ros.autopilot.priority import run_when_due
-from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Vehicle
-from uav_dc_ros.autopilot.watch import Settings
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError, UavDcError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import datums, runtime, vehicles
+from uav_dc_ros.nodes import runtime, vehicles
 from uav_dc_ros.nodes.journal import Journal
 from uav_dc_ros.nodes.lease import Lease
 from uav_dc_ros.nodes.mission_node import MissionNode
+from uav_dc_ros.offboard import datums
+from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.geofence import Fence
+from uav_dc_ros.offboard.mission.plausibility import Plausibility
+from uav_dc_ros.offboard.mission.progress import Standing
+from uav_dc_ros.offboard.realtime import run_when_due
+from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.02  # vehicle time

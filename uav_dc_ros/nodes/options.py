@@ -124,7 +124,8 @@ def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> No
     if config.missions != 1:
         raise ParameterError(f"--missions {config.missions}: expected 1 with --vehicle {config.vehicle}")
     if "bridge" in nodes:
-        from uav_dc_ros.nodes import datums, vehicles  # a simulated run needs no way to an autopilot
+        from uav_dc_ros.nodes import vehicles
+        from uav_dc_ros.offboard import datums  # a simulated run needs no way to an autopilot
 
         datums.parse(config.datum or "", scenario, config.vehicle, arm=config.arm)
         vehicles.check(config.vehicle, config.connect or "", config.system or 0, config.arm)

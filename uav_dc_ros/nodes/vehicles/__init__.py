@@ -5,15 +5,15 @@ from typing import Any
 
 from rclpy.node import Node
 
-from uav_dc_ros.autopilot.frames import Enu, Geodetic
-from uav_dc_ros.autopilot.links import Address
-from uav_dc_ros.autopilot.mavlink import Mavlink, load_codec
-from uav_dc_ros.autopilot.vehicle import Vehicle
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.nodes.vehicles import mavros_messages
 from uav_dc_ros.nodes.vehicles.mavros import Mavros
 from uav_dc_ros.nodes.vehicles.px4 import Px4, load_messages
+from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.mavlink.connection import Address
+from uav_dc_ros.offboard.mavlink.vehicle import Mavlink, load_codec
+from uav_dc_ros.offboard.vehicle import Vehicle
 
 
 def make(

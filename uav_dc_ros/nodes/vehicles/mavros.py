@@ -26,14 +26,14 @@ from sensor_msgs.msg import (  # type: ignore[import-untyped, unused-ignore]
     NavSatStatus,
 )
 
-from uav_dc_ros.autopilot.frames import Enu, Geodetic, tilt_rad
-from uav_dc_ros.autopilot.vehicle import Mode, Telemetry, Wish
 from uav_dc_ros.cdr import FRAME
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.convert import position_m, stamp_ns
 from uav_dc_ros.nodes.vehicles import mavros_messages
 from uav_dc_ros.nodes.vehicles.mavros_commands import Commands
-from uav_dc_ros.nodes.vehicles.mavros_hearing import (
+from uav_dc_ros.nodes.vehicles.other_setpoints import OtherPublishers
+from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
+from uav_dc_ros.offboard.mavros.telemetry import (
     ESTIMATOR_STATUS,
     EXTENDED_STATE,
     FIX,
@@ -45,8 +45,8 @@ from uav_dc_ros.nodes.vehicles.mavros_hearing import (
     TARGET,
     Hearing,
 )
-from uav_dc_ros.nodes.vehicles.other_publishers import OtherPublishers
-from uav_dc_ros.nodes.vehicles.stream import Stream
+from uav_dc_ros.offboard.setpoint_stream import Stream
+from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Wish
 
 SETPOINT = "mavros/setpoint_position/local"
 DIAGNOSTICS = "/diagnostics"  # absolute, as diagnostic_updater publishes it

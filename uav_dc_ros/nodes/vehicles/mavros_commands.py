@@ -6,10 +6,10 @@ from typing import Any
 
 from rclpy.node import Node
 
-from uav_dc_ros.autopilot.dialects import Dialect
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, TakeOff, Wish
-from uav_dc_ros.nodes.vehicles.mavros_hearing import ESTIMATOR_STATUS, EXTENDED_STATE, POSE
 from uav_dc_ros.nodes.vehicles.mavros_messages import PACKAGE, MavrosMsgs
+from uav_dc_ros.offboard.flight_stacks import Dialect
+from uav_dc_ros.offboard.mavros.telemetry import ESTIMATOR_STATUS, EXTENDED_STATE, POSE
+from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
 
 SET_MODE, ARM, TAKE_OFF = "mavros/set_mode", "mavros/cmd/arming", "mavros/cmd/takeoff"
 SET_INTERVAL = "mavros/set_message_interval"

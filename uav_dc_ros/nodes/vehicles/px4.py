@@ -18,14 +18,14 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from uav_dc_ros.autopilot import dialects
-from uav_dc_ros.autopilot.beat import STREAM_VEHICLE_S
-from uav_dc_ros.autopilot.frames import Enu, Geodetic, Ned
-from uav_dc_ros.autopilot.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 from uav_dc_ros.errors import VehicleError
-from uav_dc_ros.nodes.vehicles.other_publishers import OtherPublishers
-from uav_dc_ros.nodes.vehicles.px4_hearing import COMPANION, Px4Hearing
-from uav_dc_ros.nodes.vehicles.stream import Stream
+from uav_dc_ros.nodes.vehicles.other_setpoints import OtherPublishers
+from uav_dc_ros.offboard import flight_stacks
+from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
+from uav_dc_ros.offboard.px4.telemetry import COMPANION, Px4Hearing
+from uav_dc_ros.offboard.send_timer import STREAM_VEHICLE_S
+from uav_dc_ros.offboard.setpoint_stream import Stream
+from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 
 POSE_S = 0.5
 LOOK_S = 1.0  # between two looks at which topics there are
@@ -140,7 +140,7 @@ class Px4:
     def kind(self) -> str:
         """Name of the autopilot; empty until it has spoken."""
         with self._lock:
-            return dialects.PX4.name if self._hearing.status is not None else ""
+            return flight_stacks.PX4.name if self._hearing.status is not None else ""
 
     @property
     def datum(self) -> Geodetic | None:
@@ -177,7 +177,7 @@ class Px4:
             case SetMode(Mode.LAND):  # here, heading as it does
                 self._command(LAND, param4=math.nan, param5=math.nan, param6=math.nan, param7=math.nan)
             case SetMode(mode):
-                main, sub = dialects.PX4.mode_parameters(mode)
+                main, sub = flight_stacks.PX4.mode_parameters(mode)
                 self._command(SET_MODE, param1=CUSTOM_MODE, param2=main, param3=sub)
             case Arm():
                 self._command(ARM, param1=1.0)

@@ -1,0 +1,64 @@
+"""The autopilot's own limits beside the field: targets that it would refuse, steps that take it too long."""
+
+import math
+
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.vehicle import Limits
+
+
+def misfit(scenario: Scenario, settings: Settings, limits: Limits, home: Enu) -> str | None:
+    """Why the autopilot would refuse some cell's centre, with tolerance around it; None: it takes all.
+
+    Args:
+        scenario: whose start and dock are cells, too.
+        settings: the tolerance.
+        limits: of the autopilot.
+        home: what they are measured from, in the grid's ENU frame, metres.
+    """
+    grid, room_m = scenario.grid, settings.tolerance_m
+    corners = [
+        (x * grid.cell_m, y * grid.cell_m) for x in (0, grid.n_x - 1) for y in (0, grid.n_y - 1)
+    ]  # no cell is farther away
+    far_m, far = max((math.dist(home[:2], corner), corner) for corner in corners)
+    bottom_m = grid.altitude_min_m - home.up_m
+    top_m = bottom_m + (grid.n_z - 1) * grid.altitude_step_m
+    radius_m, ceiling_m, floor_m = limits.fence_radius_m, limits.fence_ceiling_m, limits.fence_floor_m
+    if radius_m is not None and far_m + room_m > radius_m:
+        return (
+            f"the autopilot's circular fence ends {radius_m:g} m from home, and the cell at {far[0]:g} m "
+            f"east, {far[1]:g} m north is {far_m:.0f} m from there; expected at least "
+            f"{far_m + room_m:.0f} m (FENCE_RADIUS, GF_MAX_HOR_DIST)"
+        )
+    if ceiling_m is not None and top_m + room_m > ceiling_m:
+        return (
+            f"the autopilot's fence ends {ceiling_m:g} m above home, and the top layer is {top_m:.0f} m "
+            f"above it; expected at least {top_m + room_m:.0f} m (FENCE_ALT_MAX, GF_MAX_VER_DIST)"
+        )
+    if floor_m is not None and bottom_m - room_m < floor_m:
+        return (
+            f"the autopilot's fence begins {floor_m:g} m above home, and the lowest layer is "
+            f"{bottom_m:.0f} m above it; expected at most {bottom_m - room_m:.0f} m (FENCE_ALT_MIN)"
+        )
+    return None
+
+
+def warnings(scenario: Scenario, settings: Settings, limits: Limits) -> list[str]:
+    """What a user should know of the autopilot's limits, though the mission can be flown."""
+    grid, found = scenario.grid, []
+    if limits.polygon_fence:
+        found.append("the autopilot has a fence of another shape, which was not compared with the field")
+    ways = (
+        ("to the next cell", grid.cell_m if max(grid.n_x, grid.n_y) > 1 else 0.0, limits.speed_mps),
+        ("a layer up", grid.altitude_step_m if grid.n_z > 1 else 0.0, limits.climb_mps),
+        ("a layer down", grid.altitude_step_m if grid.n_z > 1 else 0.0, limits.descent_mps),
+    )
+    slow = [
+        f"{name} takes {way_m / speed_mps + settings.dwell_s:.0f} s at {speed_mps:g} m/s"
+        for name, way_m, speed_mps in ways
+        if speed_mps and way_m / speed_mps + settings.dwell_s > scenario.mission.step_s
+    ]
+    if slow:
+        found.append(f"{', '.join(slow)}, and a step has {scenario.mission.step_s:g} s")
+    return found
