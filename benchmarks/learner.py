@@ -29,8 +29,8 @@ import torch
 
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents.policy import Hyperparameters
-from uav_dc_ros.experiments.runs import Population, Run
-from uav_dc_ros.experiments.training import Training, prepare_torch
+from uav_dc_ros.experiments.train.population import Population, Run
+from uav_dc_ros.experiments.train.training import Training, prepare_torch
 
 SHARD = 128
 PEER = Path(__file__).with_name("sb3_dqn.py")

@@ -10,7 +10,7 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.agents import network, policy
 from uav_dc_ros.agents.policy import Hyperparameters, PolicyConfig
 from uav_dc_ros.core.scenario import Reward, Scenario, from_values
-from uav_dc_ros.experiments.runs import Population, Run
+from uav_dc_ros.experiments.train.population import Population, Run
 
 
 def changed(shipped: str, **tables: Any) -> Scenario:

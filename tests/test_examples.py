@@ -10,7 +10,7 @@ import pytest
 from tests.conftest import ROOT, Ros, finish
 from uav_dc_ros import scenarios, uav_dc
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.experiments.evaluate import judge
+from uav_dc_ros.experiments.evaluate.evaluation import judge
 from uav_dc_ros.planners import PLANNERS
 
 EXAMPLES = ROOT / "examples"

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from uav_dc_ros.env.gym_env import DataCollectionEnv as DataCollectionEnv
     from uav_dc_ros.env.vector_env import DataCollectionVectorEnv as DataCollectionVectorEnv
     from uav_dc_ros.errors import UavDcError as UavDcError
-    from uav_dc_ros.experiments.evaluate import Evaluation as Evaluation
-    from uav_dc_ros.experiments.evaluate import evaluate as evaluate_policy
-    from uav_dc_ros.experiments.fly import Missions as Missions
+    from uav_dc_ros.experiments.evaluate.evaluation import Evaluation as Evaluation
+    from uav_dc_ros.experiments.evaluate.evaluation import evaluate as evaluate_policy
+    from uav_dc_ros.experiments.evaluate.rollout import Missions as Missions
     from uav_dc_ros.mission_summary import Summary as Summary
     from uav_dc_ros.recordings.recorded_step import RecordedStep as RecordedStep
     from uav_dc_ros.run_all import fly as fly
@@ -39,15 +39,15 @@ _PUBLIC = {
     "Action": "uav_dc_ros.core.grid:Action",
     "DataCollectionEnv": "uav_dc_ros.env.gym_env:DataCollectionEnv",
     "DataCollectionVectorEnv": "uav_dc_ros.env.vector_env:DataCollectionVectorEnv",
-    "Evaluation": "uav_dc_ros.experiments.evaluate:Evaluation",
-    "Missions": "uav_dc_ros.experiments.fly:Missions",
+    "Evaluation": "uav_dc_ros.experiments.evaluate.evaluation:Evaluation",
+    "Missions": "uav_dc_ros.experiments.evaluate.rollout:Missions",
     "Policy": "uav_dc_ros.agents.policy:Policy",
     "RecordedStep": "uav_dc_ros.recordings.recorded_step:RecordedStep",
     "RunConfig": "uav_dc_ros.run_config:RunConfig",
     "Scenario": "uav_dc_ros.core.scenario:Scenario",
     "Summary": "uav_dc_ros.mission_summary:Summary",
     "UavDcError": "uav_dc_ros.errors:UavDcError",
-    "evaluate_policy": "uav_dc_ros.experiments.evaluate:evaluate",
+    "evaluate_policy": "uav_dc_ros.experiments.evaluate.evaluation:evaluate",
     "fly": "uav_dc_ros.run_all:fly",
     "load_policy": "uav_dc_ros.agents.policy:load",
     "load_scenario": "uav_dc_ros.scenarios:load",

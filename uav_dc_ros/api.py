@@ -6,8 +6,8 @@ from pathlib import Path
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.experiments.evaluate import TEST_SEEDS, steer
-from uav_dc_ros.experiments.fly import Act, Missions, fly
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, steer
+from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, fly
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.recorded_step import RecordedStep
 

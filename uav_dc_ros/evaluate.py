@@ -1,6 +1,6 @@
 """`python -m uav_dc_ros.evaluate`: how trained policies do, over many missions."""
 
-from uav_dc_ros.experiments.evaluate_cli import main
+from uav_dc_ros.experiments.evaluate.cli import main
 
 if __name__ == "__main__":
     main()

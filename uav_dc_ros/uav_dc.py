@@ -12,8 +12,8 @@ DESCRIPTION = "Fly, train, evaluate and study a UAV that collects data from IoT 
 # Module of each verb, with `main(arguments)`, and what it does.
 VERBS = {
     "fly": ("uav_dc_ros.run_all", "fly recorded missions with a trained policy, on ROS 2"),
-    "train": ("uav_dc_ros.experiments.train_cli", "train a policy for a scenario"),
-    "evaluate": ("uav_dc_ros.experiments.evaluate_cli", "fly policies over many missions, and compare them"),
+    "train": ("uav_dc_ros.experiments.train.cli", "train a policy for a scenario"),
+    "evaluate": ("uav_dc_ros.experiments.evaluate.cli", "fly policies over many missions, and compare them"),
     "paper": ("uav_dc_ros.experiments.paper.cli", "reproduce every figure of the paper, and test its claims"),
     "bag": ("uav_dc_ros.bag", "record, play, recover, verify and explain bags"),
     "scenario": ("uav_dc_ros.scenario", "list, show and check scenarios"),

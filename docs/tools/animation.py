@@ -13,8 +13,8 @@ from PIL import Image
 
 from uav_dc_ros.agents.policy import load
 from uav_dc_ros.env.render import Track, picture
-from uav_dc_ros.experiments.evaluate import steer
-from uav_dc_ros.experiments.fly import flight
+from uav_dc_ros.experiments.evaluate.evaluation import steer
+from uav_dc_ros.experiments.evaluate.rollout import flight
 
 OUT = Path(__file__).parents[1] / "mission.gif"
 POLICY, SEED = "five_clusters_dueling", 0

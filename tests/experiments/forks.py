@@ -91,7 +91,7 @@ def kill_at(path: str, call: int, when: str) -> None:
 
 def train(moment: tuple[str, int, str] | None, arguments: list[str], output: str) -> int:
     """Become the process that was ordered; its exit status."""
-    from uav_dc_ros.experiments import train_cli
+    from uav_dc_ros.experiments.train import cli
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for file, flags, ends in ((os.devnull, os.O_RDONLY, (0,)), (output, os.O_WRONLY, (1, 2))):
@@ -100,7 +100,7 @@ def train(moment: tuple[str, int, str] | None, arguments: list[str], output: str
     if moment:
         kill_at(*moment)
     try:
-        train_cli.main(arguments)
+        cli.main(arguments)
     except SystemExit as exit:
         return exit.code if isinstance(exit.code, int) else int(exit.code is not None)
     except BaseException:
@@ -115,7 +115,7 @@ def main() -> None:
     import torch._dynamo
     import torch.utils.tensorboard  # noqa: F401
 
-    from uav_dc_ros.experiments import pictures, train_cli, training  # noqa: F401
+    from uav_dc_ros.experiments.train import cli, learning_curve, training  # noqa: F401
 
     for line in sys.stdin:
         Path(json.loads(line)[2]).touch()

@@ -12,8 +12,8 @@ import torch
 
 from tests.small_worlds import population, run, tiny
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments import checkpoint
-from uav_dc_ros.experiments.training import Training
+from uav_dc_ros.experiments.train import checkpoint
+from uav_dc_ros.experiments.train.training import Training
 
 CPU = torch.device("cpu")
 # 2.5 episodes fill the buffer; a target network is copied in the midst of the second, fourth and fifth.

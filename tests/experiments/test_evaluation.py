@@ -14,8 +14,9 @@ from tests.small_worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.env.gym_env import DataCollectionEnv
-from uav_dc_ros.experiments import evaluate_cli
-from uav_dc_ros.experiments.evaluate import (
+from uav_dc_ros.experiments.evaluate import cli
+from uav_dc_ros.experiments.evaluate.cli import main
+from uav_dc_ros.experiments.evaluate.evaluation import (
     Evaluation,
     Figure,
     Report,
@@ -25,8 +26,7 @@ from uav_dc_ros.experiments.evaluate import (
     rows,
     steer,
 )
-from uav_dc_ros.experiments.evaluate_cli import main
-from uav_dc_ros.experiments.fly import flight, fly
+from uav_dc_ros.experiments.evaluate.rollout import flight, fly
 from uav_dc_ros.stats import interval
 
 
@@ -179,8 +179,8 @@ def test_scenarios_of_one_name_are_refused(tmp_path, capsys):
 
 def test_nothing_is_flown_before_all_is_known_to_fit(tmp_path, capsys, monkeypatch):
     made = str(saved(tmp_path / "made", scenarios.load("three_clusters")))
-    monkeypatch.setattr(evaluate_cli, "judge", None)
-    monkeypatch.setattr(evaluate_cli, "save_mission_picture", None)
+    monkeypatch.setattr(cli, "judge", None)
+    monkeypatch.setattr(cli, "save_mission_picture", None)
     scenario = ["--scenario", "three_clusters", "five_clusters"]
     for arguments, complaint in (
         (["tour", made, *scenario], "'test' does not fit scenario 'five_clusters'"),
@@ -265,7 +265,7 @@ def test_it_needs_no_torch(tmp_path):
     made = saved(tmp_path / "made", scenarios.load("three_clusters"))
     code = (
         "import sys\n"
-        "from uav_dc_ros.experiments.evaluate_cli import main\n"
+        "from uav_dc_ros.experiments.evaluate.cli import main\n"
         "try:\n"
         f"    main(['--policy', {str(made)!r}, '--seeds', '1'])\n"
         "except SystemExit as exit:\n"

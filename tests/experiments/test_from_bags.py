@@ -14,9 +14,9 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import BagError, TrainingError
-from uav_dc_ros.experiments.from_bags import remember
-from uav_dc_ros.experiments.train_cli import main
-from uav_dc_ros.experiments.training import Training
+from uav_dc_ros.experiments.train.cli import main
+from uav_dc_ros.experiments.train.replay_from_bags import remember
+from uav_dc_ros.experiments.train.training import Training
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

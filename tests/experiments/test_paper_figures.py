@@ -11,7 +11,7 @@ from tests.experiments.paper_sweeps import realistic
 from uav_dc_ros import scenarios
 from uav_dc_ros.env.trajectory import Track
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.fly import flight
+from uav_dc_ros.experiments.evaluate.rollout import flight
 from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.setting import FULL, SMOKE

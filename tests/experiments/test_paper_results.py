@@ -11,7 +11,7 @@ from tests.experiments.paper_sweeps import SHORT, WORLDS, realistic
 from tests.small_worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.fly import fly
+from uav_dc_ros.experiments.evaluate.rollout import fly
 from uav_dc_ros.experiments.paper.results import CURVES_FILE, GREEDY, METRICS, RUNS_FILE, Results, World
 from uav_dc_ros.experiments.paper.setting import SMOKE, Setting
 from uav_dc_ros.planners import PLANNERS

@@ -9,10 +9,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from tests.small_worlds import population, run, tiny
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments import checkpoint
-from uav_dc_ros.experiments.books import CURVES
-from uav_dc_ros.experiments.scalars import Scalars
-from uav_dc_ros.experiments.training import Training
+from uav_dc_ros.experiments.train import checkpoint
+from uav_dc_ros.experiments.train.episode_stats import CURVES
+from uav_dc_ros.experiments.train.tensorboard import Scalars
+from uav_dc_ros.experiments.train.training import Training
 
 CPU = torch.device("cpu")
 

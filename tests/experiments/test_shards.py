@@ -16,10 +16,10 @@ from tests.small_worlds import tiny
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Hyperparameters
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments import local_workers, ray_workers, shards
-from uav_dc_ros.experiments.local_workers import train_here
-from uav_dc_ros.experiments.runs import Population, Run
-from uav_dc_ros.experiments.shards import Shard
+from uav_dc_ros.experiments.paper import local_workers, ray_workers, shards
+from uav_dc_ros.experiments.paper.local_workers import train_here
+from uav_dc_ros.experiments.paper.shards import Shard
+from uav_dc_ros.experiments.train.population import Population, Run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -154,8 +154,8 @@ def test_only_code_that_trains_changes_the_name(tmp_path):
 
 def test_the_closure_has_what_training_really_imports():
     code = (
-        "import sys, uav_dc_ros.experiments.shards, uav_dc_ros.experiments.checkpoint\n"
-        "import uav_dc_ros.experiments.training, uav_dc_ros.experiments.validation\n"
+        "import sys, uav_dc_ros.experiments.paper.shards, uav_dc_ros.experiments.train.checkpoint\n"
+        "import uav_dc_ros.experiments.train.training, uav_dc_ros.experiments.train.validation\n"
         "print(*[name for name in sys.modules if name.startswith('uav_dc_ros')])"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

@@ -14,8 +14,8 @@ from tests.conftest import PATIENCE_S, until
 from tests.experiments.forks import Forks
 from tests.small_worlds import tiny
 from uav_dc_ros.agents import policy
-from uav_dc_ros.experiments.evaluate import evaluate, rows
-from uav_dc_ros.experiments.train_cli import main
+from uav_dc_ros.experiments.evaluate.evaluation import evaluate, rows
+from uav_dc_ros.experiments.train.cli import main
 
 TINY = """
 name = "tiny"
@@ -187,7 +187,7 @@ def test_an_existing_folder_is_refused_before_training(tmp_path, field, existing
 def test_without_torch_there_is_one_line_that_helps(tmp_path, field):
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "from uav_dc_ros.experiments.train_cli import main\n"
+        "from uav_dc_ros.experiments.train.cli import main\n"
         f"main(['--scenario', {str(field)!r}, '--algo', 'dqn', '--out', {str(tmp_path / 'made')!r}])\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -215,7 +215,7 @@ def test_ctrl_c_before_the_first_checkpoint_leaves_nothing(tmp_path, field, caps
     def interrupted(training):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("uav_dc_ros.experiments.training.Training.fly_episode", interrupted)
+    monkeypatch.setattr("uav_dc_ros.experiments.train.training.Training.fly_episode", interrupted)
     with pytest.raises(SystemExit) as exit:
         main(["--scenario", str(field), "--algo", "dqn", "--out", str(tmp_path / "made")])
     assert exit.value.code == 130
@@ -237,14 +237,14 @@ MOMENTS = {
     "before a state takes its name": (("pathlib.Path.replace", 4, "before"), [20, 30]),  # policy, state
     "in the midst of writing a best policy": (("uav_dc_ros.agents.policy.load", 2, "before"), [20, 30]),
     "between a best policy and its state": (
-        ("uav_dc_ros.experiments.train_cli._save_best", 2, "after"),
+        ("uav_dc_ros.experiments.train.cli._save_best", 2, "after"),
         [20, 30],
     ),
     "between two checkpoints": (
-        ("uav_dc_ros.experiments.training.Training.fly_episode", 23, "after"),
+        ("uav_dc_ros.experiments.train.training.Training.fly_episode", 23, "after"),
         [30],
     ),
-    "in the midst of writing the result": (("uav_dc_ros.experiments.train_cli._draw", 1, "before"), []),
+    "in the midst of writing the result": (("uav_dc_ros.experiments.train.cli._draw", 1, "before"), []),
 }
 
 

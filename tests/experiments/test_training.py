@@ -15,14 +15,14 @@ from uav_dc_ros.core import observations
 from uav_dc_ros.core.batch import BatchWorld, observe
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments import validation
-from uav_dc_ros.experiments.books import CURVES, Books
-from uav_dc_ros.experiments.evaluate import TEST_SEEDS
-from uav_dc_ros.experiments.fly import Missions, fly
-from uav_dc_ros.experiments.progress import Report
-from uav_dc_ros.experiments.runs import architecture
-from uav_dc_ros.experiments.training import Training
-from uav_dc_ros.experiments.validation import VALIDATION_SEEDS, fly_greedily, validate
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS
+from uav_dc_ros.experiments.evaluate.rollout import Missions, fly
+from uav_dc_ros.experiments.train import validation
+from uav_dc_ros.experiments.train.episode_stats import CURVES, Books
+from uav_dc_ros.experiments.train.population import architecture
+from uav_dc_ros.experiments.train.progress import Report
+from uav_dc_ros.experiments.train.training import Training
+from uav_dc_ros.experiments.train.validation import VALIDATION_SEEDS, fly_greedily, validate
 
 CPU = torch.device("cpu")
 ENDS = ["at_time_limit", "on_arrival"]

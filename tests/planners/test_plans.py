@@ -8,8 +8,8 @@ import pytest
 from tests.small_worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.experiments.evaluate_cli import main
-from uav_dc_ros.experiments.fly import flight, fly
+from uav_dc_ros.experiments.evaluate.cli import main
+from uav_dc_ros.experiments.evaluate.rollout import flight, fly
 from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.planners.plans import ENOUGH, EXACT_TOUR_MAX
 

@@ -20,10 +20,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.local_workers import train_here
+from uav_dc_ros.experiments.paper.local_workers import train_here
+from uav_dc_ros.experiments.paper.ray_workers import train_on_ray
 from uav_dc_ros.experiments.paper.setting import SCALES
-from uav_dc_ros.experiments.ray_workers import train_on_ray
-from uav_dc_ros.experiments.shards import Shard
+from uav_dc_ros.experiments.paper.shards import Shard
 
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.paper.results import Results

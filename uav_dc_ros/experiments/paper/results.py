@@ -18,8 +18,8 @@ from uav_dc_ros import __version__, files
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.books import CURVES
 from uav_dc_ros.experiments.paper.setting import Planned, Scale, Setting
+from uav_dc_ros.experiments.train.episode_stats import CURVES
 
 # Of the missions flown to learn, exploration included, as in the paper's curves: `CURVES` without the loss.
 METRICS = CURVES[:-1]

@@ -16,7 +16,7 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.agents.policy import Algorithm, Hyperparameters
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardForm, RPlus
-from uav_dc_ros.experiments.runs import Run
+from uav_dc_ros.experiments.train.population import Run
 
 Ratio: TypeAlias = tuple[float, float]
 

@@ -17,13 +17,13 @@ from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.trajectory import Track
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments import shards
+from uav_dc_ros.experiments.evaluate.trajectory import fly_track
+from uav_dc_ros.experiments.paper import shards
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results
 from uav_dc_ros.experiments.paper.setting import HIDDEN, OBSERVATION, Planned, Scale, Setting
-from uav_dc_ros.experiments.runs import Population, architecture, layout
-from uav_dc_ros.experiments.shards import Shard, Trained
-from uav_dc_ros.experiments.tracks import fly_track
+from uav_dc_ros.experiments.paper.shards import Shard, Trained
+from uav_dc_ros.experiments.train.population import Population, architecture, layout
 
 # Runs of a shard: enough to hide the overhead of an operation, few enough for a core's cache, and enough
 # shards to keep the workers busy to the end.

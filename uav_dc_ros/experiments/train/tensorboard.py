@@ -6,7 +6,7 @@ from types import TracebackType
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.training import Training
+from uav_dc_ros.experiments.train.training import Training
 
 
 class Scalars:

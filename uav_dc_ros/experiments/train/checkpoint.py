@@ -9,8 +9,8 @@ from safetensors import SafetensorError, safe_open
 
 from uav_dc_ros import files
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.runs import Population
-from uav_dc_ros.experiments.training import Training
+from uav_dc_ros.experiments.train.population import Population
+from uav_dc_ros.experiments.train.training import Training
 
 _FORMAT = 1
 # What reading bytes that are no state can end in.

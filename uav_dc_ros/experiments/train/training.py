@@ -20,8 +20,8 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import BatchWorld
 from uav_dc_ros.core.reward import Rewards
-from uav_dc_ros.experiments.books import CURVES, Books
-from uav_dc_ros.experiments.runs import Population, Run, architecture, layout
+from uav_dc_ros.experiments.train.episode_stats import CURVES, Books
+from uav_dc_ros.experiments.train.population import Population, Run, architecture, layout
 from uav_dc_ros.recordings.transitions import Transition
 
 # Makes a run's stream another one than that of the mission with the same seed.

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
-    from uav_dc_ros.experiments.training import Training
+    from uav_dc_ros.experiments.train.training import Training
 
 # Episodes of each run that the figures of a `Report` look back on.
 _LATEST = 20

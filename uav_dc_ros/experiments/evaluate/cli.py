@@ -16,7 +16,7 @@ from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments.evaluate import (
+from uav_dc_ros.experiments.evaluate.evaluation import (
     COLUMNS,
     TITLES,
     Evaluation,
@@ -30,7 +30,7 @@ from uav_dc_ros.experiments.evaluate import (
     save_mission_picture,
     steer,
 )
-from uav_dc_ros.experiments.fly import Act
+from uav_dc_ros.experiments.evaluate.rollout import Act
 from uav_dc_ros.planners import PLANNERS
 
 PROG = "python -m uav_dc_ros.evaluate"

@@ -11,7 +11,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.shards import Shard, Tell, checkpoint_file, keep, train_shard
+from uav_dc_ros.experiments.paper.shards import Shard, Tell, checkpoint_file, keep, train_shard
 
 # Times that a shard is tried before the fault is taken to be its own.
 _TRIES = 3

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from uav_dc_ros import __version__
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.shards import Shard, Tell, code, keep, train_shard
+from uav_dc_ros.experiments.paper.shards import Shard, Tell, code, keep, train_shard
 
 # Times that Ray starts a shard anew when its worker or its node dies.
 _RETRIES = 5

@@ -3,8 +3,8 @@
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.experiments.evaluate import COLUMNS, TEST_SEEDS, evaluate, rows
-from uav_dc_ros.experiments.from_bags import Remembered
+from uav_dc_ros.experiments.evaluate.evaluation import COLUMNS, TEST_SEEDS, evaluate, rows
+from uav_dc_ros.experiments.train.replay_from_bags import Remembered
 
 _ALGORITHMS = {"dqn": "DQN", "dueling_dqn": "Dueling DQN"}
 _LIMITS = {

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.env.render import COLLECTED, FAINT, INK, PAPER
-from uav_dc_ros.experiments.training import Training
+from uav_dc_ros.experiments.train.training import Training
 
 # Curve, title, and its scale: what a reader asks first.
 _PANELS = (

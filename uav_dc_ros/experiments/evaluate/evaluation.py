@@ -14,7 +14,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments.fly import Act, Missions, fly
+from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, fly
 from uav_dc_ros.stats import interval
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
@@ -214,7 +214,7 @@ def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) ->
     try:
         # Slow to import, and not always there.
         from uav_dc_ros.env.render import save_picture
-        from uav_dc_ros.experiments.tracks import fly_track
+        from uav_dc_ros.experiments.evaluate.trajectory import fly_track
     except ModuleNotFoundError:
         raise UavDcError(
             'matplotlib is not installed; expected it from: pip install "uav_dc_ros[train]"'

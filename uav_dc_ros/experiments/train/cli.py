@@ -20,16 +20,16 @@ from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.card import card, checkpoint_card
-from uav_dc_ros.experiments.evaluate import TEST_SEEDS, save_mission_picture, steer
-from uav_dc_ros.experiments.from_bags import Remembered, check_remembered, remember
-from uav_dc_ros.experiments.progress import Display, Report
-from uav_dc_ros.experiments.runs import Population, Run
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture, steer
+from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
+from uav_dc_ros.experiments.train.population import Population, Run
+from uav_dc_ros.experiments.train.progress import Display, Report
+from uav_dc_ros.experiments.train.replay_from_bags import Remembered, check_remembered, remember
 
 if TYPE_CHECKING:
     import torch
 
-    from uav_dc_ros.experiments.training import Training
+    from uav_dc_ros.experiments.train.training import Training
 
 PROG = "python -m uav_dc_ros.train"
 # Every hyperparameter is an option.
@@ -94,10 +94,10 @@ def _train(options: argparse.Namespace, command: str) -> int:
     population = _population(config, shipped.name, options.runs)
     device = _device(options.device, options.threads)
     # These need torch, which _device() has asked for.
-    from uav_dc_ros.experiments import checkpoint
-    from uav_dc_ros.experiments.scalars import Scalars
-    from uav_dc_ros.experiments.training import Training
-    from uav_dc_ros.experiments.validation import validate
+    from uav_dc_ros.experiments.train import checkpoint
+    from uav_dc_ros.experiments.train.tensorboard import Scalars
+    from uav_dc_ros.experiments.train.training import Training
+    from uav_dc_ros.experiments.train.validation import validate
 
     folder = options.out.with_name(f"{options.out.name}.checkpoints")
     saved = folder / "training.safetensors"
@@ -240,7 +240,7 @@ def _save_best(
 def _draw(folder: Path, made: policy.Policy, scenario: Scenario, training: "Training") -> None:
     """The pictures in a policy's folder: how it learnt, and a mission as it flies it."""
     try:
-        from uav_dc_ros.experiments.pictures import save_learning_curve  # needs matplotlib
+        from uav_dc_ros.experiments.train.learning_curve import save_learning_curve  # needs matplotlib
     except ModuleNotFoundError:
         # The policy is worth more than its pictures.
         print(
@@ -305,7 +305,7 @@ def _device(name: str, n_threads: int) -> "torch.device":
         raise TrainingError(
             'torch is not installed; expected it from: pip install "uav_dc_ros[train]"'
         ) from None
-    from uav_dc_ros.experiments.training import prepare_torch
+    from uav_dc_ros.experiments.train.training import prepare_torch
 
     prepare_torch(n_threads)
     if name.partition(":")[0] not in ("cpu", "cuda"):

@@ -10,7 +10,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
 
 if TYPE_CHECKING:  # most trainings begin without bags: what reads them is imported when it is needed
-    from uav_dc_ros.experiments.training import Training
+    from uav_dc_ros.experiments.train.training import Training
     from uav_dc_ros.recordings.recorded_step import RecordedStep
     from uav_dc_ros.recordings.step_reader import Steps
 

@@ -24,8 +24,8 @@ from uav_dc_ros import __version__, files
 from uav_dc_ros.agents import network
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.fly import Missions
-from uav_dc_ros.experiments.runs import Population
+from uav_dc_ros.experiments.evaluate.rollout import Missions
+from uav_dc_ros.experiments.train.population import Population
 
 # Hears of the progress of a shard: its name, and the episodes that each of its runs has flown.
 Tell = Callable[[str, int], None]
@@ -34,7 +34,7 @@ _CHECKPOINT_EVERY_S = 30.0
 
 
 # What trains a shard; all that these import decides its result.
-_ROOTS = ("uav_dc_ros.experiments.shards", "uav_dc_ros.experiments.checkpoint")
+_ROOTS = ("uav_dc_ros.experiments.paper.shards", "uav_dc_ros.experiments.train.checkpoint")
 
 
 @cache
@@ -173,9 +173,9 @@ def train_shard(shard: Shard, checkpoint: Path | None = None, tell: Tell | None 
     """
     import torch  # a process that only plans and collects need not load it
 
-    from uav_dc_ros.experiments import checkpoint as checkpoints
-    from uav_dc_ros.experiments.training import Training, prepare_torch
-    from uav_dc_ros.experiments.validation import fly_greedily
+    from uav_dc_ros.experiments.train import checkpoint as checkpoints
+    from uav_dc_ros.experiments.train.training import Training, prepare_torch
+    from uav_dc_ros.experiments.train.validation import fly_greedily
 
     prepare_torch(n_threads=1)
     training = Training(shard.population, torch.device("cpu"))

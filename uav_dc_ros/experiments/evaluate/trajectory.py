@@ -7,7 +7,7 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.trajectory import Track
-from uav_dc_ros.experiments.fly import Act, flight
+from uav_dc_ros.experiments.evaluate.rollout import Act, flight
 
 
 def fly_track(scenario: Scenario, act: Act, seed: int, layout: Array | None = None) -> Track:

@@ -8,9 +8,9 @@ import torch
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.world import State
-from uav_dc_ros.experiments.fly import Missions, fly
-from uav_dc_ros.experiments.runs import layout
-from uav_dc_ros.experiments.training import Training, rewards
+from uav_dc_ros.experiments.evaluate.rollout import Missions, fly
+from uav_dc_ros.experiments.train.population import layout
+from uav_dc_ros.experiments.train.training import Training, rewards
 
 # Missions that choose among runs and checkpoints; those that judge the chosen one are seeds 0 to 99.
 VALIDATION_SEEDS = range(1_000_000, 1_000_100)
