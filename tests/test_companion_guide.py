@@ -18,13 +18,14 @@ import pytest
 from tests.doc_commands import parameter, parsed
 from uav_dc_ros import resources, run_all, scenarios
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.nodes import lease, options, supervisor
+from uav_dc_ros.nodes import lease
 from uav_dc_ros.nodes.table import NODES
 from uav_dc_ros.offboard import datums, send_timer
 from uav_dc_ros.offboard.mavlink import systems
 from uav_dc_ros.offboard.mavlink.connection import Address
 from uav_dc_ros.offboard.mission import geofence
 from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.runner import run_options, supervisor
 
 ROOT = Path(__file__).parents[1]
 GUIDE = (ROOT / "docs" / "companion.md").read_text("utf-8")
@@ -113,7 +114,7 @@ def test_a_wrong_command_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize("words", RUNS, ids=" ".join)
 def test_run_all_would_start_what_the_guide_says(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = parsed(monkeypatch, ["uav_dc_ros.run_all", *words])
-    started = options.nodes(run_all._config(argparse.Namespace(**vars(wanted))))
+    started = run_options.nodes(run_all._config(argparse.Namespace(**vars(wanted))))
     real = wanted.vehicle != "simulated"
     assert ("bridge" in started) == (real and wanted.nodes is None)
     assert wanted.datum is not None or not wanted.arm, "who arms says where the grid lies"

@@ -158,7 +158,7 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
 
         environment.prepare(alone=config.nodes is None)  # before ROS is imported
         from uav_dc_ros.nodes import runtime
-        from uav_dc_ros.nodes.flight import Flight
+        from uav_dc_ros.runner.mission_runner import Flight
 
         try:
             flight = Flight(config)
@@ -206,7 +206,7 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
 
         environment.prepare(alone=config.nodes is None)  # before ROS is imported
         from uav_dc_ros.messages import Phase
-        from uav_dc_ros.nodes.flight import Flight
+        from uav_dc_ros.runner.mission_runner import Flight
 
         flight = Flight(config, show=show)
         handler = signal.signal(signal.SIGINT, flight.interrupt) if in_main else None

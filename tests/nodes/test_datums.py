@@ -7,9 +7,9 @@ import pytest
 
 from uav_dc_ros import run_all, scenarios
 from uav_dc_ros.errors import NodeError, ParameterError, VehicleError
-from uav_dc_ros.nodes import options
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.runner import run_options
 
 FIVE, THREE = scenarios.load("five_clusters"), scenarios.load("three_clusters")
 DATUM = Geodetic(latitude_deg=-35.363261, longitude_deg=149.16523, altitude_m=584.0)
@@ -27,7 +27,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def check(*given: str) -> None:
     """What run_all checks of the options of a vehicle."""
     wanted = run_all.parser().parse_args(["--vehicle", "mavlink", "--connect", "tcp:127.0.0.1:1", *given])
-    options.check_vehicle(wanted, ["bridge"], FIVE)
+    run_options.check_vehicle(wanted, ["bridge"], FIVE)
 
 
 def test_a_datum_with_a_minus_is_a_value() -> None:

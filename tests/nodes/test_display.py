@@ -8,8 +8,8 @@ from rich.console import Console
 
 from tests.nodes.test_drawing import MISSION, SCENARIO
 from uav_dc_ros.messages import FaultKind, Phase
-from uav_dc_ros.nodes.display import Display
-from uav_dc_ros.nodes.output import Output
+from uav_dc_ros.output import Output
+from uav_dc_ros.runner.console import Display
 
 FLIGHT = (
     (Phase.TAKEOFF, "takes off", None),

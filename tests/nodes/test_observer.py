@@ -13,9 +13,10 @@ from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import observer, rivals
-from uav_dc_ros.nodes.observer import ALONE_S, STARTED_S, TELL_S, MissionSoFar, Observer
+from uav_dc_ros.nodes import rivals
 from uav_dc_ros.nodes.rivals import AnotherMissionError
+from uav_dc_ros.runner import monitor
+from uav_dc_ros.runner.monitor import ALONE_S, STARTED_S, TELL_S, MissionSoFar, Observer
 
 STEPS = 3
 MBIT = 1e6
@@ -63,7 +64,7 @@ class Bench:
         self.notes: list[str] = []
         self.publishers: dict[str, list[str]] = {}  # by topic
         self.nodes: list[Observer] = []
-        patch.setattr(observer.time, "monotonic", lambda: self.now_s)
+        patch.setattr(monitor.time, "monotonic", lambda: self.now_s)
         patch.setattr(rivals, "publishers", lambda node: self.publishers)
 
     def observer(self, run: str = RUN) -> Observer:

@@ -10,7 +10,7 @@ import pytest
 
 from tests.conftest import Ros
 from uav_dc_ros import cli
-from uav_dc_ros.nodes import options
+from uav_dc_ros.runner import run_options
 
 NODES = "world,channel_monitor,policy,recorder"
 
@@ -170,8 +170,8 @@ def test_no_bag_is_overwritten_by_another_of_the_same_second(
             return cls(2026, 11, 22, 3, 52, 10, tzinfo=tz)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(options, "datetime", Still)
+    monkeypatch.setattr(run_options, "datetime", Still)
     for name in ("2026-11-22_03-52-10", "2026-11-22_03-52-10_2", "2026-11-22_03-52-10_3"):
-        bag = options.new_bag(None)
+        bag = run_options.new_bag(None)
         assert bag == tmp_path / "bags" / name
         bag.mkdir(parents=True, exist_ok=True)

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Ros
-from uav_dc_ros.nodes import output
-from uav_dc_ros.nodes.output import Output
+from uav_dc_ros import output
+from uav_dc_ros.output import Output
 
 MISSION = ("--pace", "lockstep", "--no-record", "--nodes", "world,channel_monitor,policy", "--compose")
 MISSION = (*MISSION, "--scenario", "three_clusters", "--summary")

@@ -7,7 +7,7 @@ import pytest
 
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes.control import NodeReport, command
-from uav_dc_ros.nodes.supervisor import Supervised, Supervisor
+from uav_dc_ros.runner.supervisor import Supervised, Supervisor
 
 
 class Process:

@@ -13,9 +13,9 @@ from rich.table import Table
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
-from uav_dc_ros.nodes.observer import MissionSoFar
-from uav_dc_ros.nodes.output import Output
+from uav_dc_ros.output import Output
 from uav_dc_ros.phases import DECIDED
+from uav_dc_ros.runner.monitor import MissionSoFar
 
 REFRESH_S = 0.05
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal

@@ -19,18 +19,18 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
 from uav_dc_ros.mission_summary import Summary
-from uav_dc_ros.nodes import options as run_options
 from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.observer import MissionSoFar, Observer, summary
 from uav_dc_ros.nodes.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.rivals import AnotherMissionError
-from uav_dc_ros.nodes.supervisor import Supervisor
 from uav_dc_ros.nodes.table import rows
 from uav_dc_ros.run_config import RunConfig
+from uav_dc_ros.runner import run_options as run_options
+from uav_dc_ros.runner.monitor import MissionSoFar, Observer, summary
+from uav_dc_ros.runner.supervisor import Supervisor
 from uav_dc_ros.topics import SIMULATED
 
 if TYPE_CHECKING:
-    from uav_dc_ros.nodes.display import Display
+    from uav_dc_ros.runner.console import Display
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
@@ -125,7 +125,7 @@ class Flight:
         """What the user sees; made when it is first needed, since the nodes can start meanwhile."""
         with self._making:
             if self._display is None:
-                from uav_dc_ros.nodes.display import Display
+                from uav_dc_ros.runner.console import Display
 
                 self._display = Display(self.scenario, self.config.missions, show=self._show)
             return self._display

@@ -9,9 +9,9 @@ from typing import Self
 
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes.control import ACTIVATE, CONFIGURE
-from uav_dc_ros.nodes.launcher import NodeProcess
 from uav_dc_ros.nodes.runtime import GAVE_UP, NOT_BEGUN
 from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.runner.node_process import NodeProcess
 
 RESTART_WINDOW_S = 60.0  # deaths longer ago are forgiven
 BACK_OFF_S = 0.2  # before the first restart; twice as long before each further one
