@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.write import BagWriter
-from uav_dc_ros.nodes import recorded_qos
+from uav_dc_ros.nodes.ros import recorded_qos
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 STRING = "std_msgs/msg/String"

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 from ruamel.yaml import YAML
 
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 ATTRIBUTES = {
     "launch": set(),

@@ -10,8 +10,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from uav_dc_ros import cli
-from uav_dc_ros.nodes.parameters import EVERY
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.framework.parameters import EVERY
 
 
 class Parsed(BaseException):

@@ -15,9 +15,9 @@ from typing import Any
 import uav_dc_ros.bag
 import uav_dc_ros.nodes.channel_monitor
 import uav_dc_ros.nodes.container
-import uav_dc_ros.nodes.play
+import uav_dc_ros.nodes.play.bag_play
 import uav_dc_ros.nodes.policy
-import uav_dc_ros.nodes.record
+import uav_dc_ros.nodes.record.bag_record
 import uav_dc_ros.nodes.recorder
 import uav_dc_ros.nodes.world
 import uav_dc_ros.run_all  # noqa: F401

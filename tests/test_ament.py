@@ -18,7 +18,7 @@ import pytest
 from tests import ament_launch
 from tests.conftest import ROOT, copy_repository, finish, read_bag, wait_for
 from uav_dc_ros import run_all
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 # One worker builds the workspace, once.
 pytestmark = pytest.mark.xdist_group("ament")

@@ -18,8 +18,8 @@ import pytest
 from tests.doc_commands import parameter, parsed
 from uav_dc_ros import resources, run_all, scenarios
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.nodes import lease
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.ros import liveliness
 from uav_dc_ros.offboard import datums, send_timer
 from uav_dc_ros.offboard.mavlink import systems
 from uav_dc_ros.offboard.mavlink.connection import Address
@@ -177,7 +177,7 @@ def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert NODES["policy"].restarts == 3
     assert supervisor.RESTART_WINDOW_S == 60
     assert "three times within a minute" in GUIDE
-    assert lease.MISSED_S + lease.CONFIRMED_S < 2.0
+    assert liveliness.MISSED_S + liveliness.CONFIRMED_S < 2.0
     assert "stops where it is, within two seconds" in GUIDE
     assert datums.MOVED_M == 5.0
     assert "as a warning from 5 m on" in GUIDE

@@ -14,8 +14,8 @@ PROG = "python -m uav_dc_ros.bag"
 DESCRIPTION = "Record, play, recover, verify and explain bags."
 # Module of each verb, with `add_options(parser)` and `run(options) -> exit status`, and what it does.
 VERBS = {
-    "record": ("uav_dc_ros.nodes.record", "record topics into a new bag"),
-    "play": ("uav_dc_ros.nodes.play", "publish a bag's messages again, with their timing and QoS"),
+    "record": ("uav_dc_ros.nodes.record.bag_record", "record topics into a new bag"),
+    "play": ("uav_dc_ros.nodes.play.bag_play", "publish a bag's messages again, with their timing and QoS"),
     "info": ("uav_dc_ros.recordings.info.command", "show what a bag holds, and whether it is complete"),
     "recover": ("uav_dc_ros.bags.salvage.recover", "make a whole bag of what a killed recorder left"),
     "verify": (

@@ -154,17 +154,17 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
     def command() -> int:
         nonlocal has_flown
         config = _config(parser(prog).parse_args(arguments))
-        from uav_dc_ros.nodes import environment, fastdds
+        from uav_dc_ros.nodes.ros import environment, fastdds
 
         environment.prepare(alone=config.nodes is None)  # before ROS is imported
-        from uav_dc_ros.nodes import runtime
+        from uav_dc_ros.nodes.framework import node_main
         from uav_dc_ros.runner.mission_runner import Flight
 
         try:
             flight = Flight(config)
             signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the terminal is gone: the mission goes on
             cli.on_stop(flight.interrupt)
-            runtime.give_way()
+            node_main.give_way()
             has_flown = True
             return flight.run()
         finally:
@@ -202,7 +202,7 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
     before = dict(os.environ)
     in_main = threading.current_thread() is threading.main_thread()
     try:
-        from uav_dc_ros.nodes import environment, fastdds
+        from uav_dc_ros.nodes.ros import environment, fastdds
 
         environment.prepare(alone=config.nodes is None)  # before ROS is imported
         from uav_dc_ros.messages import Phase

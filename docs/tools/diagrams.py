@@ -13,8 +13,8 @@ from html import escape
 from pathlib import Path
 
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes.parameters import EVERY, Parameter
-from uav_dc_ros.nodes.table import NODES, rows
+from uav_dc_ros.nodes.framework.node_table import NODES, rows
+from uav_dc_ros.nodes.framework.parameters import EVERY, Parameter
 from uav_dc_ros.phases import TRANSITIONS
 from uav_dc_ros.topics import TOPICS, Topic
 

@@ -28,7 +28,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, NavSatFix
 
 from tests.autopilot.autopilot import FOLLOWS, OFFBOARD_GAP_S, OFFBOARD_PROOF_S, TICK_S, Copter, tell
-from uav_dc_ros.nodes import convert
+from uav_dc_ros.nodes.ros import convert
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned, to_enu, to_ned
 
 POSE_S = 1 / 30

@@ -27,8 +27,8 @@ import px4_msgs.msg as px4
 import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from uav_dc_ros.nodes import fastdds
-from uav_dc_ros.nodes.executor import DirectExecutor
+from uav_dc_ros.nodes.ros import fastdds
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 
 State = px4.VehicleStatus
 WALL_S, TICK_S = 0.01, 0.02

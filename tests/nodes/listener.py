@@ -20,8 +20,8 @@ from typing import Any
 import rclpy
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from uav_dc_ros.nodes import fastdds
-from uav_dc_ros.nodes.executor import DirectExecutor
+from uav_dc_ros.nodes.ros import fastdds
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 
 QUIET_S = 0.4
 

@@ -15,7 +15,7 @@ from tests.conftest import Ros
 from tests.small_worlds import changed
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes.executor import DirectExecutor
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.nodes.vehicles.mavros import Mavros
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import Bridge

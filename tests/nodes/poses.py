@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from geometry_msgs.msg import PoseStamped
 
 from uav_dc_ros.cdr import FRAME
-from uav_dc_ros.nodes.convert import stamp
+from uav_dc_ros.nodes.ros.convert import stamp
 
 
 def pose(position_m: Sequence[float], time_ns: int) -> PoseStamped:

@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from uav_dc_ros.nodes import convert, qos
+from uav_dc_ros.nodes.ros import convert, qos
 from uav_dc_ros.topics import TOPICS
 
 SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of it

@@ -25,8 +25,8 @@ from std_msgs.msg import Int32, String
 
 from tests.nodes.garbage import JSON_TOPICS, TOPICS, garbage, oversized
 from uav_dc_ros import scenarios
-from uav_dc_ros.nodes import qos
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.topics import TOPICS as ROWS
 
 BURST = 500

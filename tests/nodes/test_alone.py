@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from tests.conftest import Ros, finish, wait_for
-from uav_dc_ros.nodes.parameters import EVERY
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.framework.parameters import EVERY
 
 RUN = "fedcba9876543210"
 NAMESPACE = ("-r", "__ns:=/uav1")

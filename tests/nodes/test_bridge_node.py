@@ -17,7 +17,7 @@ from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import bridge, vehicles
 from uav_dc_ros.nodes.bridge import AutopilotBridge
-from uav_dc_ros.nodes.journal import Journal
+from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address

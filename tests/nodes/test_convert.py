@@ -15,7 +15,7 @@ from tests.nodes import poses
 from tests.small_worlds import tiny
 from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import convert
+from uav_dc_ros.nodes.ros import convert
 
 ANY_NUMBER = st.floats(allow_nan=True, allow_infinity=True)
 LATEST_NS = 2**31 * 10**9 - 1  # of a ROS time: its seconds have 32 bits

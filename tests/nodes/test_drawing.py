@@ -17,9 +17,9 @@ from tests.nodes.poses import pose as pose_message
 from uav_dc_ros import cdr, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
-from uav_dc_ros.nodes import drawing
-from uav_dc_ros.nodes.drawing import Scene, UserState
-from uav_dc_ros.nodes.track import POSES_MAX, Track
+from uav_dc_ros.nodes.view import markers
+from uav_dc_ros.nodes.view.markers import Scene, UserState
+from uav_dc_ros.nodes.view.path_history import POSES_MAX, Track
 
 SCENARIO = scenarios.load("five_clusters")
 U = SCENARIO.n_users
@@ -74,7 +74,7 @@ def xyz(point: Any) -> tuple[float, float, float]:
 
 
 def test_every_marker_is_in_the_map_at_the_time_of_the_pose() -> None:
-    shapes = read(drawing.markers(SCENARIO, scene()))
+    shapes = read(markers.markers(SCENARIO, scene()))
     assert set(shapes) == {"clusters", "dock", "users", "footprint", "uav", "status"}
     for marker in (marker for group in shapes.values() for marker in group):
         assert marker.header.frame_id == "map"
@@ -92,14 +92,14 @@ def test_users_are_coloured_by_state() -> None:
         UserState.COLLECTED: users_m[[1, 2]],  # one of them in the step that served it
         UserState.WAITING: users_m[3:],
     }
-    shapes = {marker.id: marker for marker in read(drawing.markers(SCENARIO, scene()))["users"]}
+    shapes = {marker.id: marker for marker in read(markers.markers(SCENARIO, scene()))["users"]}
     assert set(shapes) == set(expected)
     for state, marker in shapes.items():
         assert marker.type == Marker.SPHERE_LIST
         at_m = [xyz(point) for point in marker.points]
         assert at_m == [(x_m, y_m, 0.0) for x_m, y_m in expected[state].tolist()]
         colour = (marker.color.r, marker.color.g, marker.color.b, marker.color.a)
-        assert colour == pytest.approx(drawing.USER_COLOURS[state], abs=1e-6)
+        assert colour == pytest.approx(markers.USER_COLOURS[state], abs=1e-6)
     assert shapes[UserState.SERVED].scale.x > shapes[UserState.WAITING].scale.x
 
 
@@ -110,12 +110,12 @@ def test_the_users_colours_differ_in_lightness_too() -> None:
         linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in rgb[:3]]
         return 116.0 * float(np.dot([0.2126, 0.7152, 0.0722], linear)) ** (1 / 3) - 16.0
 
-    steps = np.diff(sorted(lightness(colour) for colour in drawing.USER_COLOURS.values()))
+    steps = np.diff(sorted(lightness(colour) for colour in markers.USER_COLOURS.values()))
     assert (steps > 15.0).all()
 
 
 def test_the_discs_are_the_clusters() -> None:
-    discs = read(drawing.markers(SCENARIO, scene()))["clusters"]
+    discs = read(markers.markers(SCENARIO, scene()))["clusters"]
     assert [(m.pose.position.x, m.pose.position.y) for m in discs] == list(SCENARIO.users.cluster_centres_m)
     for marker in discs:
         assert marker.type == Marker.CYLINDER
@@ -124,16 +124,16 @@ def test_the_discs_are_the_clusters() -> None:
 
 
 def test_the_footprint_is_where_users_can_be_served() -> None:
-    (marker,) = read(drawing.markers(SCENARIO, scene()))["footprint"]
+    (marker,) = read(markers.markers(SCENARIO, scene()))["footprint"]
     assert (marker.pose.position.x, marker.pose.position.y) == (300.0, 400.0)
     assert marker.scale.x == marker.scale.y == pytest.approx(2 * math.sqrt(250.0**2 - 150.0**2))
     for altitude_m in (250.0, 400.0):
-        (marker,) = read(drawing.markers(SCENARIO, scene(position_m=(300.0, 400.0, altitude_m))))["footprint"]
+        (marker,) = read(markers.markers(SCENARIO, scene(position_m=(300.0, 400.0, altitude_m))))["footprint"]
         assert marker.action == Marker.DELETE
 
 
 def test_the_uav_the_dock_and_the_text() -> None:
-    shapes = read(drawing.markers(SCENARIO, scene()))
+    shapes = read(markers.markers(SCENARIO, scene()))
     body, line = shapes["uav"]
     assert xyz(body.pose.position) == (300.0, 400.0, 150.0)
     assert [xyz(point) for point in line.points] == [(300.0, 400.0, 150.0), (300.0, 400.0, 0.0)]
@@ -142,7 +142,7 @@ def test_the_uav_the_dock_and_the_text() -> None:
     (text,) = shapes["status"]
     assert text.text == "step 12 of 60\n2 of 50 users collected\n1.23 Mbit/s"
     landed = scene(mission=msgspec.structs.replace(MISSION, step=60, phase=Phase.LANDED))
-    (text,) = read(drawing.markers(SCENARIO, landed))["status"]
+    (text,) = read(markers.markers(SCENARIO, landed))["status"]
     assert text.text.startswith("step 60 of 60: landed\n")
 
 
@@ -156,7 +156,7 @@ def test_what_is_not_known_is_not_drawn() -> None:
         mission=None,
         sum_rate_bps=None,
     )
-    shapes = read(drawing.markers(SCENARIO, nothing))
+    shapes = read(markers.markers(SCENARIO, nothing))
     for ns in ("users", "uav", "footprint", "status"):
         assert {marker.action for marker in shapes[ns]} == {Marker.DELETE}
     for ns in ("clusters", "dock"):
@@ -172,7 +172,7 @@ def test_ten_thousand_users_are_drawn_within_milliseconds() -> None:
     durations_s = []
     for _ in range(5):
         began_s = time.thread_time()
-        data = drawing.markers(crowded, many)
+        data = markers.markers(crowded, many)
         durations_s.append(time.thread_time() - began_s)
     waiting = read(data)["users"][0]
     assert len(waiting.points) == 10_000
@@ -356,5 +356,5 @@ def test_a_way_of_any_length_stays_small() -> None:
 def test_the_text_tells_what_a_real_vehicle_does_and_why(phase: Phase, reason: str, expected: str) -> None:
     held = reason.startswith("no ")
     mission = msgspec.structs.replace(MISSION, phase=phase, reason=reason, held=held)
-    text = drawing.status_text(SCENARIO, scene(mission=mission))
+    text = markers.status_text(SCENARIO, scene(mission=mission))
     assert text == f"{expected}\n2 of 50 users collected\n1.23 Mbit/s"

@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import Ros, finish
 from uav_dc_ros.errors import ParameterError
-from uav_dc_ros.nodes import environment, fastdds
+from uav_dc_ros.nodes.ros import environment, fastdds
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from tests.nodes.foxglove_client import FoxgloveClient, is_free
 from uav_dc_ros import cdr
 from uav_dc_ros.errors import NodeError, ParameterError
-from uav_dc_ros.nodes.foxglove_server import FoxgloveServer, check
+from uav_dc_ros.nodes.view.foxglove_server import FoxgloveServer, check
 from uav_dc_ros.topics import TOPICS
 
 ROWS = {f"/{row.name}": row for row in TOPICS.values()}

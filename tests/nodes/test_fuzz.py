@@ -16,7 +16,7 @@ from tests.conftest import Ros
 from tests.nodes import garbage
 from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 PEERS = ("world", "channel_monitor", "policy", "recorder", "observer")
 BY_HAND = ("world", "channel_monitor", "policy")

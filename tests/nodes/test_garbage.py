@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Ros, finish, wait_for
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 TIMES = 5
 

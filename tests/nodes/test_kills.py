@@ -17,7 +17,7 @@ import pytest
 
 from tests.conftest import Ros, but_run, finish, read_bag, until
 from tests.nodes.test_fuzz import Running
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 COMPOSED = ["world", "channel_monitor", "policy"]
 KILLED = [*COMPOSED, "recorder"]

@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import Ros, finish
 from tests.nodes.mavros_flight import node_in, spin
-from uav_dc_ros.nodes.lease import CONFIRMED_S, Confirmed, Lease
+from uav_dc_ros.nodes.ros.liveliness import CONFIRMED_S, Confirmed, Lease
 from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.02

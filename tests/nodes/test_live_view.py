@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from tests.conftest import Ros, finish, wait_for
 from tests.nodes.foxglove_client import FoxgloveClient, Heard, is_free
 from uav_dc_ros import cli, messages
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.topics import TOPICS
 
 SERVED = NODES["live_view"].subscribes

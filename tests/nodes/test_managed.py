@@ -11,8 +11,8 @@ from rclpy.parameter import Parameter
 
 from tests.conftest import Ros, finish
 from tests.nodes.mavros_flight import node_in
-from uav_dc_ros.nodes.parameters import EVERY
-from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.framework.parameters import EVERY
 from uav_dc_ros.nodes.world import World
 
 PROCESSES = [name for name, row in NODES.items() if row.process and name != "live_view"]

@@ -12,7 +12,7 @@ from tests.conftest import Ros
 from tests.nodes.mavros_flight import START, Fake, Flight, fake, mavros_of, node_in, spin
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes.executor import DirectExecutor
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.nodes.vehicles.mavros import Mavros
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import Settings

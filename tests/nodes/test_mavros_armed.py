@@ -21,7 +21,7 @@ from tests.autopilot.autopilot import TICK_S, Autopilot, Copter
 from tests.nodes.mavros_flight import SCENARIO, START, way_home
 from tests.nodes.test_mavros_parts import HEALTHY, PACKAGE, Message, estimator
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import convert
+from uav_dc_ros.nodes.ros import convert
 from uav_dc_ros.nodes.vehicles import mavros
 from uav_dc_ros.nodes.vehicles.mavros import Mavros
 from uav_dc_ros.offboard.frames import Enu, Ned, to_enu, to_ned

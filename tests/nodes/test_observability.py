@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import Ros, finish, read_bag, wait_for
 from tests.nodes.conftest import CLOCKS, Observed, python
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 CLOCK = """
 import time

@@ -13,8 +13,8 @@ from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import rivals
-from uav_dc_ros.nodes.rivals import AnotherMissionError
+from uav_dc_ros.nodes.framework import other_publishers
+from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.runner import monitor
 from uav_dc_ros.runner.monitor import ALONE_S, STARTED_S, TELL_S, MissionSoFar, Observer
 
@@ -65,7 +65,7 @@ class Bench:
         self.publishers: dict[str, list[str]] = {}  # by topic
         self.nodes: list[Observer] = []
         patch.setattr(monitor.time, "monotonic", lambda: self.now_s)
-        patch.setattr(rivals, "publishers", lambda node: self.publishers)
+        patch.setattr(other_publishers, "publishers", lambda node: self.publishers)
 
     def observer(self, run: str = RUN) -> Observer:
         """One of run_all's, with a vehicle of its own if it was given a run."""

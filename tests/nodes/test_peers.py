@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from uav_dc_ros.nodes.mission_node import MissionNode
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 US = "/uav1"
 

@@ -24,8 +24,8 @@ from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes import play as verb
-from uav_dc_ros.nodes import recorded_qos
+from uav_dc_ros.nodes.play import bag_play as verb
+from uav_dc_ros.nodes.ros import recorded_qos
 
 BAG, PLAY = "uav_dc_ros.bag", "play"
 MS = 10**6

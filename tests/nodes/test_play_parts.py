@@ -14,8 +14,9 @@ from std_msgs.msg import String
 from uav_dc_ros.bags.metadata import to_yaml
 from uav_dc_ros.bags.read import RecordedTopic
 from uav_dc_ros.errors import BagError, NodeError
-from uav_dc_ros.nodes import outlet, recorded_qos
-from uav_dc_ros.nodes.play_clock import PlayClock
+from uav_dc_ros.nodes.play import playback_publisher
+from uav_dc_ros.nodes.play.clock import PlayClock
+from uav_dc_ros.nodes.ros import recorded_qos
 
 S = 10**9
 
@@ -155,6 +156,6 @@ def test_nothing_is_imported_that_a_bag_names_but_messages(
     monkeypatch.syspath_prepend(tmp_path)
     for type in ("evil/msg/Thing", "antigravity/msg/Thing", "os/msg/Thing"):
         with pytest.raises(NodeError, match="is not installed; expected a ROS package"):
-            outlet.message_class(RecordedTopic(name="/a", type=type))
+            playback_publisher.message_class(RecordedTopic(name="/a", type=type))
     assert not {"evil", "evil.msg", "antigravity"} & set(sys.modules)
-    assert outlet.message_class(RecordedTopic(name="/a", type="std_msgs/msg/String")) is String
+    assert playback_publisher.message_class(RecordedTopic(name="/a", type="std_msgs/msg/String")) is String

@@ -25,8 +25,8 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import fastdds
-from uav_dc_ros.nodes.executor import DirectExecutor
+from uav_dc_ros.nodes.ros import fastdds
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.nodes.vehicles import px4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned, to_enu
 from uav_dc_ros.offboard.mission.controller import Bridge

@@ -13,7 +13,7 @@ from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import String
 
 from tests.conftest import Ros
-from uav_dc_ros.nodes import rclpy_private
+from uav_dc_ros.nodes.ros import rclpy_private
 
 NODES = Path(rclpy_private.__file__).parent
 PRIVATE = re.compile(

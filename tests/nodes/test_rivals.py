@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from uav_dc_ros.nodes import rivals
-from uav_dc_ros.nodes.audience import Audience
-from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.framework import other_publishers
+from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.play.subscriber_monitor import Audience
 from uav_dc_ros.topics import TOPICS
 
 OURS = {
@@ -28,12 +28,14 @@ def test_the_topics_that_a_mission_trusts_have_one_publisher() -> None:
 
 
 def test_a_mission_alone_has_no_rivals() -> None:
-    assert not rivals.find(OURS, "/uav1", NODES)
-    assert not rivals.find({}, "/", NODES)
+    assert not other_publishers.find(OURS, "/uav1", NODES)
+    assert not other_publishers.find({}, "/", NODES)
 
 
 def test_a_player_is_named_with_what_it_publishes() -> None:
-    found = rivals.find(OURS | {"pose": ["/uav1/world", "/player"], "rates": ["/player"]}, "/uav1", NODES)
+    found = other_publishers.find(
+        OURS | {"pose": ["/uav1/world", "/player"], "rates": ["/player"]}, "/uav1", NODES
+    )
     assert found.foreign == {"/player": ["pose", "rates"]}
     assert found.told("0123456789abcdef") == (
         "/player publishes pose, rates here (run 0123456789abcdef), and is no node of this mission"
@@ -41,33 +43,33 @@ def test_a_player_is_named_with_what_it_publishes() -> None:
 
 
 def test_a_node_of_our_names_in_another_namespace_is_foreign() -> None:
-    assert rivals.find({"mission": ["/world"]}, "/uav1", NODES).foreign == {"/world": ["mission"]}
+    assert other_publishers.find({"mission": ["/world"]}, "/uav1", NODES).foreign == {"/world": ["mission"]}
 
 
 def test_a_node_that_is_there_twice_is_another_mission() -> None:
-    found = rivals.find(OURS | {"mission": ["/uav1/world"] * 2}, "/uav1", NODES)
+    found = other_publishers.find(OURS | {"mission": ["/uav1/world"] * 2}, "/uav1", NODES)
     assert found.told("0123456789abcdef") == (
         "another mission is being flown here by /uav1/world (run 0123456789abcdef)"
     )
 
 
 def test_a_node_that_we_have_not_begun_is_another_mission() -> None:
-    found = rivals.find(OURS, "/uav1", NODES, absent=["world", "policy"])
+    found = other_publishers.find(OURS, "/uav1", NODES, absent=["world", "policy"])
     assert found.told() == "another mission is being flown here by /uav1/world, /uav1/policy"
 
 
 @pytest.mark.parametrize("twice", ["world", "policy"])
 def test_the_graph_may_still_tell_of_a_node_that_was_killed(twice: str) -> None:
     publishers = {topic: names * (1 + names[0].endswith(twice)) for topic, names in OURS.items()}
-    assert rivals.find(publishers, "/uav1", NODES)
-    assert not rivals.find(publishers, "/uav1", NODES, restarted=[twice])
+    assert other_publishers.find(publishers, "/uav1", NODES)
+    assert not other_publishers.find(publishers, "/uav1", NODES, restarted=[twice])
 
 
 def test_nobody_is_a_rival_on_a_topic_that_this_mission_does_not_have() -> None:
     """Beside a real vehicle nobody of ours makes a clock: a simulator may."""
     around = {**NODES, "world": WORLD_AROUND}
-    assert not rivals.find({"clock": ["/gazebo"]}, "/", around)
-    assert rivals.find({"clock": ["/gazebo"]}, "/", NODES)
+    assert not other_publishers.find({"clock": ["/gazebo"]}, "/", around)
+    assert other_publishers.find({"clock": ["/gazebo"]}, "/", NODES)
 
 
 def audience(publishers: dict[str, list[str]], *played: str) -> Audience:

@@ -16,7 +16,7 @@ from tests.nodes.test_fuzz import COMPARED, PEERS, flown, said_by_nodes
 from tests.small_worlds import saved
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
 
 MISSIONS = 120  # so many that the lie is told before they are over
 LATER = 20  # a mission that is yet to come when the lie is told

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes.control import NodeReport, command
+from uav_dc_ros.nodes.framework.process_control import NodeReport, command
 from uav_dc_ros.runner.supervisor import Supervised, Supervisor
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import Ros, each_once, finish, read_bag, wait_for
 from tests.nodes.conftest import Observed
-from uav_dc_ros.nodes.drawing import UserState
+from uav_dc_ros.nodes.view.markers import UserState
 
 STEPS = 30  # of the small world
 ADD = 0

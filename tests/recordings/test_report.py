@@ -15,7 +15,7 @@ from tests.recordings import report_bags
 from tests.small_worlds import saved, tiny
 from uav_dc_ros import bag, resources, scenarios
 from uav_dc_ros.core import world
-from uav_dc_ros.nodes import drawing
+from uav_dc_ros.nodes.view import markers
 from uav_dc_ros.recordings.pages import page as pages
 
 HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>"
@@ -319,10 +319,10 @@ def test_users_have_the_colours_of_the_view_in_rviz():
     def rgb(name):
         return tuple(value / 255 for value in bytes.fromhex(found[name]))
 
-    for state, colour in drawing.USER_COLOURS.items():
+    for state, colour in markers.USER_COLOURS.items():
         assert rgb(state.name.lower()) == colour[:3]
-    assert rgb("dock") == drawing.DOCK_COLOUR[:3]
-    assert rgb("uav") == drawing.UAV_COLOUR[:3]
+    assert rgb("dock") == markers.DOCK_COLOUR[:3]
+    assert rgb("uav") == markers.UAV_COLOUR[:3]
 
 
 @pytest.mark.long

@@ -51,7 +51,7 @@ import sys
 from pathlib import Path
 
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes import environment
+from uav_dc_ros.nodes.ros import environment
 
 MISSING = (
     "ROS 2 is missing: no module rclpy. On a machine without it: pip install 'uav_dc_ros[ros]'. "

@@ -17,10 +17,11 @@ from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError, UavDcError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import runtime, vehicles
-from uav_dc_ros.nodes.journal import Journal
-from uav_dc_ros.nodes.lease import Lease
-from uav_dc_ros.nodes.mission_node import MissionNode
+from uav_dc_ros.nodes import vehicles
+from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.journal import Journal
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.ros.liveliness import Lease
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mission.controller import Bridge
@@ -345,4 +346,4 @@ class AutopilotBridge(MissionNode):
 
 
 if __name__ == "__main__":
-    runtime.main(AutopilotBridge, gives_way=False)  # the vehicle does not wait
+    node_main.main(AutopilotBridge, gives_way=False)  # the vehicle does not wait

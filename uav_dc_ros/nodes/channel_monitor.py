@@ -12,9 +12,9 @@ from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import MessageError, NodeError
-from uav_dc_ros.nodes import runtime
-from uav_dc_ros.nodes.journal import Journal
-from uav_dc_ros.nodes.mission_node import MissionNode
+from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.journal import Journal
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
 
 USER_BYTES = 60  # of `rates`, for each user
 WAITING_MAX = 256  # poses without users, and users without a pose
@@ -164,4 +164,4 @@ class ChannelMonitor(MissionNode):
 
 
 if __name__ == "__main__":
-    runtime.main(ChannelMonitor)
+    node_main.main(ChannelMonitor)

@@ -13,9 +13,9 @@ import sys
 from typing import NoReturn
 
 from uav_dc_ros import cli
-from uav_dc_ros.nodes import runtime, usage
-from uav_dc_ros.nodes.mission_node import MissionNode
-from uav_dc_ros.nodes.table import COMPOSABLE, NODES
+from uav_dc_ros.nodes.framework import node_cli, node_main
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
 
 
 def parser() -> cli.Parser:
@@ -38,10 +38,10 @@ def node_class(name: str) -> type[MissionNode]:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the nodes until they are asked to stop."""
-    own, for_ros = usage.split(sys.argv[1:] if arguments is None else arguments)
+    own, for_ros = node_cli.split(sys.argv[1:] if arguments is None else arguments)
     wanted = parser().parse_args(own).nodes
     in_order = sorted(dict.fromkeys(wanted), key=lambda name: NODES[name].rank)
-    runtime.main(*(node_class(name) for name in in_order), arguments=for_ros)
+    node_main.main(*(node_class(name) for name in in_order), arguments=for_ros)
 
 
 if __name__ == "__main__":

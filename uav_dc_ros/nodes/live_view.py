@@ -9,9 +9,9 @@ stamps, and on `clock`.
 from typing import Any
 
 from uav_dc_ros import resources
-from uav_dc_ros.nodes import runtime
-from uav_dc_ros.nodes.foxglove_server import FoxgloveServer
-from uav_dc_ros.nodes.mission_node import MissionNode
+from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.view.foxglove_server import FoxgloveServer
 from uav_dc_ros.topics import TOPICS, Topic
 
 LAYOUT_FOLDER, LAYOUT = "share/foxglove", "mission.json"
@@ -75,4 +75,4 @@ class LiveView(MissionNode):
 
 
 if __name__ == "__main__":
-    runtime.main(LiveView)
+    node_main.main(LiveView)

@@ -9,9 +9,9 @@ from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.nodes import runtime
-from uav_dc_ros.nodes.mission_node import MissionNode
-from uav_dc_ros.nodes.pairs import StepPairs
+from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.step_synchronizer import StepPairs
 
 
 class Policy(MissionNode):
@@ -71,4 +71,4 @@ class Policy(MissionNode):
 
 
 if __name__ == "__main__":
-    runtime.main(Policy)
+    node_main.main(Policy)

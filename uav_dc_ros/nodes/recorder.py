@@ -13,8 +13,8 @@ from uav_dc_ros import __version__, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core import pace
 from uav_dc_ros.messages import PAYLOADS
-from uav_dc_ros.nodes import runtime
-from uav_dc_ros.nodes.recording import BagNode
+from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.record.recorder_base import BagNode
 from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 
 
@@ -64,4 +64,4 @@ class Recorder(BagNode):
 
 
 if __name__ == "__main__":
-    runtime.main(Recorder)
+    node_main.main(Recorder)

@@ -11,9 +11,10 @@ import numpy as np
 
 from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import drawing, runtime
-from uav_dc_ros.nodes.mission_node import MissionNode
-from uav_dc_ros.nodes.track import Track
+from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.view import markers
+from uav_dc_ros.nodes.view.path_history import Track
 from uav_dc_ros.topics import Topic
 
 P = TypeVar("P", bound=messages.Payload)
@@ -115,16 +116,16 @@ class Visualizer(MissionNode):
             self._drawn, poses = self._track.version, self._track.poses
         if poses:  # it is latched: who comes later has it, too
             self.publish("path", cdr.path(poses))
-        self.publish("markers", drawing.markers(self.scenario, self._scene(self._track.newest)))
+        self.publish("markers", markers.markers(self.scenario, self._scene(self._track.newest)))
 
-    def _scene(self, pose: cdr.Pose | None) -> drawing.Scene:
+    def _scene(self, pose: cdr.Pose | None) -> markers.Scene:
         """What is known now."""
         users = self._payload("users", messages.Users)
         rates = self._payload("rates", messages.Rates)
         if users is None or (rates is not None and rates.mission != users.mission):
             rates = None
         nobody = np.zeros(0 if users is None else self.scenario.n_users, dtype=bool)
-        return drawing.Scene(
+        return markers.Scene(
             time_ns=pose.stamp_ns if pose else users.stamp_ns if users else 0,
             position_m=pose.position_m if pose else None,
             users_m=np.empty((0, 2)) if users is None else payloads.users_m(users, self.scenario),
@@ -136,4 +137,4 @@ class Visualizer(MissionNode):
 
 
 if __name__ == "__main__":
-    runtime.main(Visualizer)
+    node_main.main(Visualizer)

@@ -28,12 +28,13 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.users import Crowd
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes import convert, runtime
-from uav_dc_ros.nodes.journal import Journal
-from uav_dc_ros.nodes.mission_node import MissionNode
-from uav_dc_ros.nodes.parameters import EXTERNAL
-from uav_dc_ros.nodes.surroundings import Surroundings
-from uav_dc_ros.nodes.table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.external_users import Surroundings
+from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.journal import Journal
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.framework.parameters import EXTERNAL
+from uav_dc_ros.nodes.ros import convert
 
 STALL_S = 1.0  # a lockstep that stands still for so long repeats its last messages
 CONFIRM_S = 1.0  # a lockstep waits for who hears of it no longer than so
@@ -339,4 +340,4 @@ class World(MissionNode):
 
 
 if __name__ == "__main__":
-    runtime.main(World)
+    node_main.main(World)

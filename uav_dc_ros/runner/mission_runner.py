@@ -19,10 +19,10 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
 from uav_dc_ros.mission_summary import Summary
-from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.parameters import ADDRESS, EXTERNAL
-from uav_dc_ros.nodes.rivals import AnotherMissionError
-from uav_dc_ros.nodes.table import rows
+from uav_dc_ros.nodes.framework.node_table import rows
+from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
+from uav_dc_ros.nodes.framework.parameters import ADDRESS, EXTERNAL
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.runner import run_options as run_options
 from uav_dc_ros.runner.monitor import MissionSoFar, Observer, summary
@@ -105,7 +105,7 @@ class Flight:
         self._settings = run_options.settings(config, self.nodes)
         run_options.check_vehicle(config, self.nodes, self.scenario)
         if config.live is not None:
-            from uav_dc_ros.nodes import foxglove_server  # brings rosbags, which only few need
+            from uav_dc_ros.nodes.view import foxglove_server  # brings rosbags, which only few need
 
             foxglove_server.check(address=str(ADDRESS.default), port=config.live)
         bag = None if config.bag is None else Path(config.bag)

@@ -14,9 +14,9 @@ from uav_dc_ros.core import world as core
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.mission_summary import Summary
-from uav_dc_ros.nodes import rivals
-from uav_dc_ros.nodes.mission_node import MissionNode
-from uav_dc_ros.nodes.pairs import StepPairs
+from uav_dc_ros.nodes.framework import other_publishers
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.step_synchronizer import StepPairs
 
 ALONE_S = 1.0  # nobody else was found for so long, before any node of this mission may begin,
 STARTED_S = 0.5  # and for so long since all nodes of this run_all have started
@@ -167,11 +167,13 @@ class Observer(MissionNode):
         # The graph still tells of a node that was killed, for a while.
         again = self.rows if begun else [name for name, n in self.restarts_of.items() if n]
         absent = () if self.is_alone and self._other_run is None else self._here
-        found = rivals.find(rivals.publishers(self), self.get_namespace(), self.rows, again, absent)
+        found = other_publishers.find(
+            other_publishers.publishers(self), self.get_namespace(), self.rows, again, absent
+        )
         if not begun and (found or self._other_run is not None):
             self._found_s = self._found_s or now_s
             if (found and self._other_run is not None) or now_s - self._found_s >= TELL_S:
-                raise rivals.AnotherMissionError(found.told(self._other_run or ""))
+                raise other_publishers.AnotherMissionError(found.told(self._other_run or ""))
             return
         if found.foreign.keys() - self._noted:
             self._noted |= found.foreign.keys()

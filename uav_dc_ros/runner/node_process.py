@@ -17,8 +17,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes import control, environment
-from uav_dc_ros.nodes.control import FINALIZED, REPORTS, SUPERVISED, NodeReport
+from uav_dc_ros.nodes.framework import process_control
+from uav_dc_ros.nodes.framework.process_control import FINALIZED, REPORTS, SUPERVISED, NodeReport
+from uav_dc_ros.nodes.ros import environment
 
 READ_MAX = 1 << 16  # bytes; no pipe holds more
 
@@ -105,13 +106,13 @@ class NodeProcess:
         self.silent_s = 0.0 if received else self.silent_s + passed_s
         *lines, self._unread = (self._unread + received).split(b"\n")
         if lines:
-            self.reports = control.decode(lines[-1])
+            self.reports = process_control.decode(lines[-1])
 
     def command(self, transition: str, node: str) -> None:
         """Command a transition of one of its nodes."""
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it has ended, which is seen as any other end
-            os.write(self.process.stdin.fileno(), control.command(transition, node))
+            os.write(self.process.stdin.fileno(), process_control.command(transition, node))
 
     def kill(self, why: str) -> None:
         """End a process that hangs."""

@@ -11,7 +11,7 @@ from uav_dc_ros import files
 from uav_dc_ros.core import pace
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, UavDcError
-from uav_dc_ros.nodes.table import COMPOSABLE, NODES
+from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 

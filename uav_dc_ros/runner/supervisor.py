@@ -8,9 +8,9 @@ from types import TracebackType
 from typing import Self
 
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes.control import ACTIVATE, CONFIGURE
-from uav_dc_ros.nodes.runtime import GAVE_UP, NOT_BEGUN
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_main import GAVE_UP, NOT_BEGUN
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.framework.process_control import ACTIVATE, CONFIGURE
 from uav_dc_ros.runner.node_process import NodeProcess
 
 RESTART_WINDOW_S = 60.0  # deaths longer ago are forgiven

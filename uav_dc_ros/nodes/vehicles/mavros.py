@@ -28,7 +28,7 @@ from sensor_msgs.msg import (  # type: ignore[import-untyped, unused-ignore]
 
 from uav_dc_ros.cdr import FRAME
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes.convert import position_m, stamp_ns
+from uav_dc_ros.nodes.ros.convert import position_m, stamp_ns
 from uav_dc_ros.nodes.vehicles import mavros_messages
 from uav_dc_ros.nodes.vehicles.mavros_commands import Commands
 from uav_dc_ros.nodes.vehicles.other_setpoints import OtherPublishers

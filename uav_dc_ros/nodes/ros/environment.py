@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 
 from uav_dc_ros.errors import ParameterError
-from uav_dc_ros.nodes import fastdds
+from uav_dc_ros.nodes.ros import fastdds
 
 LINES = "RCUTILS_CONSOLE_OUTPUT_FORMAT"
 LINE_OF_NODE = "{severity}: {message}"  # whose line it is says who passes it on

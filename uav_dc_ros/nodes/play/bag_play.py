@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagError, ParameterError
-from uav_dc_ros.nodes import environment
-from uav_dc_ros.nodes.play_clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN
+from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN
+from uav_dc_ros.nodes.ros import environment
 
 if TYPE_CHECKING:
-    from uav_dc_ros.nodes.player import Plan
+    from uav_dc_ros.nodes.play.player import Plan
 
 MAX_GAP_S = 600.0
 CLOCK_HZ = 40.0  # rosbag2's default
@@ -121,7 +121,7 @@ def _plan(reader: BagReader, options: argparse.Namespace) -> "Plan":
         ParameterError: the bag does not hold it.
         BagError: the bag holds nothing.
     """
-    from uav_dc_ros.nodes.player import Plan
+    from uav_dc_ros.nodes.play.player import Plan
 
     if not reader.message_count:
         raise BagError(f"bag {options.bag} holds no message; expected at least one to play")
@@ -204,8 +204,8 @@ def _play(reader: BagReader, plan: "Plan") -> int:
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions
 
-    from uav_dc_ros.nodes.play_display import PlayDisplay, text_of
-    from uav_dc_ros.nodes.player import Player
+    from uav_dc_ros.nodes.play.display import PlayDisplay, text_of
+    from uav_dc_ros.nodes.play.player import Player
 
     length_s = (reader.last_ns - reader.first_ns) * 1e-9
     end_s = length_s if plan.duration_s is None else min(length_s, plan.start_s + plan.duration_s)

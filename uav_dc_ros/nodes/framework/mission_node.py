@@ -17,11 +17,12 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from uav_dc_ros import cdr, messages, topics
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.nodes import diagnostics, qos, rivals
-from uav_dc_ros.nodes.control import SUPERVISED
-from uav_dc_ros.nodes.diagnostics import Meter
-from uav_dc_ros.nodes.managed_node import ManagedNode
-from uav_dc_ros.nodes.table import rows
+from uav_dc_ros.nodes.framework import diagnostics, other_publishers
+from uav_dc_ros.nodes.framework.diagnostics import Meter
+from uav_dc_ros.nodes.framework.lifecycle_node import ManagedNode
+from uav_dc_ros.nodes.framework.node_table import rows
+from uav_dc_ros.nodes.framework.process_control import SUPERVISED
+from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.topics import TOPICS, Topic
 
 CDR_HEAD = 8  # bytes before the text of a serialised std_msgs/String
@@ -273,9 +274,11 @@ class MissionNode(ManagedNode):
             AnotherMissionError: who does.
         """
         others = [name for name in self.rows if name != self.row.name]
-        found = rivals.find(rivals.publishers(self), self.get_namespace(), self.rows, restarted=others)
+        found = other_publishers.find(
+            other_publishers.publishers(self), self.get_namespace(), self.rows, restarted=others
+        )
         if found:
-            raise rivals.AnotherMissionError(found.told())
+            raise other_publishers.AnotherMissionError(found.told())
 
     def check_peer(self, payload: messages.Ready) -> None:
         """Refuse what nobody of the table says.

@@ -10,7 +10,7 @@ from uav_dc_ros.bags.message_definitions import ENCODING
 from uav_dc_ros.bags.read import BagMessage, RecordedTopic
 from uav_dc_ros.bags.records import CDR
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes import message_types, recorded_qos
+from uav_dc_ros.nodes.ros import message_types, recorded_qos
 
 AT_ONCE = Duration()
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from uav_dc_ros import cli
-from uav_dc_ros.nodes.parameters import EVERY, Parameter
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.framework.parameters import EVERY, Parameter
 
 ROS_ARGUMENTS = "--ros-args"
 

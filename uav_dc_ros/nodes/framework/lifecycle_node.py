@@ -17,9 +17,9 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes import rclpy_private
-from uav_dc_ros.nodes.parameters import EVERY, Parameter
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.framework.parameters import EVERY, Parameter
+from uav_dc_ros.nodes.ros import rclpy_private
 
 
 class ManagedNode(LifecycleNode):

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from uav_dc_ros.nodes.rclpy_private import EventCount
+from uav_dc_ros.nodes.ros.rclpy_private import EventCount
 
 Callback = Callable[[bytes, Any], None]
 

@@ -17,7 +17,7 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from uav_dc_ros.bags.read import RecordedTopic
 from uav_dc_ros.errors import BagError
-from uav_dc_ros.nodes.qos import HISTORY_BYTES, HISTORY_LEAST
+from uav_dc_ros.nodes.ros.qos import HISTORY_BYTES, HISTORY_LEAST
 
 # Depth of a publisher whose own one is not known, as most recorders leave it: discovery does not carry it.
 UNKNOWN_DEPTH = 10  # rosbag2's

@@ -18,10 +18,11 @@ from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros import cli
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes import control, environment, fastdds, usage
-from uav_dc_ros.nodes.control import SUPERVISED
-from uav_dc_ros.nodes.executor import DirectExecutor
-from uav_dc_ros.nodes.mission_node import MissionNode
+from uav_dc_ros.nodes.framework import node_cli, process_control
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.process_control import SUPERVISED
+from uav_dc_ros.nodes.ros import environment, fastdds
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.2  # a message that was lost on the way is sent again within a tenth
@@ -103,7 +104,7 @@ def main(
     """
     cli.open_streams()
     if arguments is None:
-        arguments = usage.ros_arguments(makes[0].__doc__ or "")
+        arguments = node_cli.ros_arguments(makes[0].__doc__ or "")
     if gives_way:
         give_way()
     status = _flown(makes, arguments)
@@ -132,11 +133,11 @@ def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> 
             executor.add_node(node)
             node.serve = executor.spin_once
         stopper = Stopper(executor.wake)
-        reporter = control.Reporter(nodes)
+        reporter = process_control.Reporter(nodes)
         reporter.report()
         for node in nodes:
             node.prepare()
-        nodes[0].create_timer(control.PERIOD_S, reporter.report, clock=nodes[0].steady)
+        nodes[0].create_timer(process_control.PERIOD_S, reporter.report, clock=nodes[0].steady)
         if _begin([node for node in nodes if node.values["autostart"]]):
             gc.freeze()  # what is there by now stays: no need to look at it again and again
             if rest_s:
@@ -178,7 +179,10 @@ def _begin(nodes: Sequence[MissionNode]) -> bool:
 
 
 def _run(
-    nodes: Sequence[MissionNode], executor: DirectExecutor, stopper: Stopper, reporter: control.Reporter
+    nodes: Sequence[MissionNode],
+    executor: DirectExecutor,
+    stopper: Stopper,
+    reporter: process_control.Reporter,
 ) -> int:
     """Spin until the nodes are asked to stop, and stop them safely, also when a callback failed."""
     try:

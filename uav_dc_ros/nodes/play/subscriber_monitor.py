@@ -5,9 +5,10 @@ from collections.abc import Collection, Iterator
 
 from rclpy.node import Node
 
-from uav_dc_ros.nodes import qos, rivals
-from uav_dc_ros.nodes.outlet import Outlet
-from uav_dc_ros.nodes.table import NODES
+from uav_dc_ros.nodes.framework import other_publishers
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.play.playback_publisher import Outlet
+from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.topics import TOPICS
 
 
@@ -46,9 +47,9 @@ class Audience:
                 ends = self._node.get_publishers_info_by_topic(name)
                 publishers[namespace][relative] = [qos.full_name(end) for end in ends]
         for namespace, ends_by_topic in publishers.items():
-            found = rivals.find(ends_by_topic, namespace, NODES, absent=NODES)
+            found = other_publishers.find(ends_by_topic, namespace, NODES, absent=NODES)
             if found.doubles:
-                return rivals.Rivals(doubles=found.doubles).told()
+                return other_publishers.Rivals(doubles=found.doubles).told()
         return None
 
     def others(self) -> Iterator[str]:

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
-from uav_dc_ros.nodes import message_types, qos, rclpy_private
-from uav_dc_ros.nodes.hearing import Hearing
-from uav_dc_ros.nodes.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.record.adaptive_subscription import Hearing
+from uav_dc_ros.nodes.ros import message_types, qos, rclpy_private
 from uav_dc_ros.topics import TOPICS, Topic
 
 if TYPE_CHECKING:  # what writes bags is slow to import: see `prepare`
@@ -67,7 +67,7 @@ class BagNode(MissionNode):
     def prepare(self) -> None:
         """Import what writes bags."""
         importlib.import_module("uav_dc_ros.bags.write")
-        importlib.import_module("uav_dc_ros.nodes.recorded_qos")
+        importlib.import_module("uav_dc_ros.nodes.ros.recorded_qos")
 
     def configure(self) -> None:
         """Make the bag."""
@@ -194,7 +194,7 @@ class BagNode(MissionNode):
             BagError: earlier parts of the bag have it with another type; or the disk is full, or gone.
             LookupError: a type inside its type is not installed.
         """
-        from uav_dc_ros.nodes import recorded_qos
+        from uav_dc_ros.nodes.ros import recorded_qos
 
         ends = [end for end in self.get_publishers_info_by_topic(name) if end.topic_type == type]
         profiles = [end.qos_profile for end in ends] or ([] if topic is None else [qos.offered(topic)])

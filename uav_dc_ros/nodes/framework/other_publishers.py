@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from rclpy.node import Node
 
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes import qos
-from uav_dc_ros.nodes.table import NodeRow
+from uav_dc_ros.nodes.framework.node_table import NodeRow
+from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.topics import TOPICS
 
 ADVICE = (

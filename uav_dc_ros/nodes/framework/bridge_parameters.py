@@ -1,6 +1,6 @@
 """The bridge's ROS parameters: the way to the vehicle, and how carefully it is flown. Knows no ROS."""
 
-from uav_dc_ros.nodes.parameters import Parameter, one_of
+from uav_dc_ros.nodes.framework.parameters import Parameter, one_of
 from uav_dc_ros.offboard.mission.fault_detector import Settings
 from uav_dc_ros.offboard.mission.geofence import MARGIN_M
 from uav_dc_ros.topics import SYSTEM_MAX, VEHICLES

@@ -3,8 +3,8 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
-from uav_dc_ros.nodes import bridge_parameters
-from uav_dc_ros.nodes import parameters as p
+from uav_dc_ros.nodes.framework import bridge_parameters
+from uav_dc_ros.nodes.framework import parameters as p
 from uav_dc_ros.topics import TOPICS
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 if TYPE_CHECKING:
-    from uav_dc_ros.nodes.managed_node import ManagedNode
+    from uav_dc_ros.nodes.framework.lifecycle_node import ManagedNode
 
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this process has been restarted
 REPORTS = "UAV_DC_ROS_REPORTS"  # set by run_all: the file descriptor that takes the reports

@@ -16,7 +16,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.utilities import get_default_context
 
-from uav_dc_ros.nodes import rclpy_private
+from uav_dc_ros.nodes.ros import rclpy_private
 
 TURN_MAX, TURN_MAX_S = 100, 0.2  # messages of one topic, and their time, before the others get their turn
 # Quiet is what was so in as many turns: on a busy computer the middleware's thread may have had no time yet.

@@ -18,13 +18,13 @@ from rosgraph_msgs.msg import Clock
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.read_ahead import ReadAhead
 from uav_dc_ros.errors import BagError, NodeError
-from uav_dc_ros.nodes import convert, qos
-from uav_dc_ros.nodes.audience import Audience
-from uav_dc_ros.nodes.keys import HELP, Keys
-from uav_dc_ros.nodes.outlet import Outlet
-from uav_dc_ros.nodes.play_clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN, PlayClock
-from uav_dc_ros.nodes.play_display import PlayDisplay
-from uav_dc_ros.nodes.rivals import AnotherMissionError
+from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
+from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN, PlayClock
+from uav_dc_ros.nodes.play.display import PlayDisplay
+from uav_dc_ros.nodes.play.keyboard import HELP, Keys
+from uav_dc_ros.nodes.play.playback_publisher import Outlet
+from uav_dc_ros.nodes.play.subscriber_monitor import Audience
+from uav_dc_ros.nodes.ros import convert, qos
 from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.05  # keys, the bar and `/clock` are looked at as often, at least

@@ -14,8 +14,8 @@ from rclpy.duration import Duration
 from rclpy.event_handler import QoSSubscriptionEventType, SubscriptionEventCallbacks
 from rclpy.node import Node
 
-from uav_dc_ros.nodes import qos
-from uav_dc_ros.nodes.rclpy_private import EventCount
+from uav_dc_ros.nodes.ros import qos
+from uav_dc_ros.nodes.ros.rclpy_private import EventCount
 from uav_dc_ros.topics import Topic
 
 MISSED_S = 1.25  # without an assertion, after which the middleware reports liveliness as lost
