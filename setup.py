@@ -70,7 +70,7 @@ setup(
     package_dir={f"{NAME}.{folder}": folder for folder in DATA_FOLDERS},
     package_data={
         NAME: ["py.typed", "resource/*", "share/*/*"],
-        f"{NAME}.nodes": ["*.xml"],
+        f"{NAME}.nodes.ros": ["*.xml"],
         f"{NAME}.recordings.pages": ["*.html", "*.css", "*.js"],
         f"{NAME}.scenarios": ["*.toml"],
         f"{NAME}.policies": ["*/*"],

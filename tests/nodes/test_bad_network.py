@@ -72,7 +72,7 @@ def start(
     ros: Ros, link: Link, host: str, nodes: dict[str, dict[str, object]]
 ) -> dict[str, subprocess.Popen[str]]:
     """Start one host's share of the nodes, given with their parameters."""
-    profiles = str(Path(uav_dc_ros.__file__).parent / "nodes" / "fastdds.xml")
+    profiles = str(Path(uav_dc_ros.__file__).parent / "nodes" / "ros" / "fastdds.xml")
     environment = ros.environment | {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
         "FASTRTPS_DEFAULT_PROFILES_FILE": profiles,

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Evaluation: missions flown with a policy, and figures over many of them."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Playback: a bag's messages onto the ROS graph."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Recording: topics into a bag."""

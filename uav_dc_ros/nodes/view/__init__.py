@@ -1,1 +1,1 @@
-"""TODO."""
+"""What RViz and Foxglove show of a mission."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""An autopilot on MAVLink, over TCP, UDP or a serial line."""

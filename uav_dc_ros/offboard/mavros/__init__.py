@@ -1,1 +1,1 @@
-"""TODO."""
+"""What MAVROS reports of its vehicle."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""What PX4 reports on its own topics."""

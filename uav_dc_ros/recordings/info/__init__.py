@@ -1,1 +1,1 @@
-"""TODO."""
+"""The verb `info`: what a bag holds, and whether it is complete."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The verb `verify`: everything that a bag reports of its missions is recomputed and compared."""
