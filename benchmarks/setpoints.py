@@ -13,7 +13,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tests.autopilot.streaming import off_beat_ms
+from tests.support.fake_autopilot.streaming import off_beat_ms
 
 AIM_MS = 10.0
 SENDERS = ("transport", "bare")

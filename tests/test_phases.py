@@ -4,9 +4,9 @@ import itertools
 
 import pytest
 
-from tests.autopilot.simulated import ARMING, Flight, fly_to_step
-from tests.recordings import flown
-from tests.small_worlds import tiny
+from tests.support import flights
+from tests.support.fake_autopilot.simulated import ARMING, Flight, fly_to_step
+from tests.support.worlds import tiny
 from uav_dc_ros.errors import PhaseError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.mission.controller import Bridge
@@ -34,9 +34,9 @@ def test_another_bridge_may_begin_after_any_phase() -> None:
     assert impossible(Phase.READY, Phase.CONNECTING, 0) is not None, "but not the same one"
 
 
-@pytest.mark.parametrize("fault", flown.FAULTS)
+@pytest.mark.parametrize("fault", flights.FAULTS)
 def test_flights_keep_to_the_table(fault: str) -> None:
-    told = flown.phases(flown.Flight(tiny(), beat=flown.FAULTS[fault][0]).fly())
+    told = flights.phases(flights.Flight(tiny(), beat=flights.FAULTS[fault][0]).fly())
     for (step, phase, _), (next_step, next_phase, _) in itertools.pairwise(told):
         if (step, phase) != (next_step, next_phase):
             assert next_phase in following(phase, next_step - step, restarts=fault == "restart")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from tests.small_worlds import changed, config, saved, tiny
+from tests.support.worlds import changed, config, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import network, policy
 from uav_dc_ros.errors import PolicyError

@@ -14,8 +14,8 @@ import zstandard
 from mcap.writer import IndexType, Writer
 from rosbags.rosbag2 import StoragePlugin
 
-from tests.bags.made import QOS, STRING, bare, in_bag, text
 from tests.bags.test_read import by_rosbags, messages
+from tests.support.bags import QOS, STRING, bare, in_bag, text
 from uav_dc_ros import bag as command
 from uav_dc_ros.bags import mcap_storage, message_definitions
 from uav_dc_ros.bags.read import BagReader

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bags.made import STRING, in_bag, in_mcap, information, text
+from tests.support.bags import STRING, in_bag, in_mcap, information, text
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.salvage.recover import recover
 from uav_dc_ros.bags.write import BagWriter

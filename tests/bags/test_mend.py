@@ -20,7 +20,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 from ruamel.yaml import YAML
 
-from tests.bags.made import (
+from tests.support.bags import (
     HASH,
     QOS,
     ROOT,

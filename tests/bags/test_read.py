@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
-from tests.bags.made import STRING, TYPES, bare, in_bag, mcap_file, text
+from tests.support.bags import STRING, TYPES, bare, in_bag, mcap_file, text
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError

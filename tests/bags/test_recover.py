@@ -17,7 +17,7 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from tests.bags.made import (
+from tests.support.bags import (
     HASH,
     QOS,
     ROOT,

@@ -11,17 +11,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-from tests.bags.made import (
-    ROOT,
-    STRING,
-    TYPES,
-    content,
-    in_bag,
-    in_mcap,
-    information,
-    killed_writer,
-    text,
-)
+from tests.support.bags import ROOT, STRING, TYPES, content, in_bag, in_mcap, information, killed_writer, text
 from uav_dc_ros.bags import split_writer
 from uav_dc_ros.bags.part_writer import FolderLock, PartWriter
 from uav_dc_ros.bags.salvage.repair import mend

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
-from tests.bags.made import QOS, ROOT, STRING, in_bag, in_mcap, information, text
+from tests.support.bags import QOS, ROOT, STRING, in_bag, in_mcap, information, text
 from uav_dc_ros.bags.compression import COMPRESSIONS
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.salvage.repair import mend

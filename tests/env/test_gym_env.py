@@ -9,7 +9,7 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from tests.small_worlds import changed, tiny
+from tests.support.worlds import changed, tiny
 from uav_dc_ros.core import world
 from uav_dc_ros.env import registration
 from uav_dc_ros.env.gym_env import DataCollectionEnv

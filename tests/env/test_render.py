@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
-from tests.small_worlds import tiny
+from tests.support.worlds import tiny
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 
 

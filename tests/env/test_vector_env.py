@@ -6,7 +6,7 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.vector import AutoresetMode
 
-from tests.small_worlds import tiny
+from tests.support.worlds import tiny
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.env.registration import ENV_ID
 from uav_dc_ros.env.vector_env import DataCollectionVectorEnv

@@ -10,7 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from tests.small_worlds import population, run, tiny
+from tests.support.worlds import population, run, tiny
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train import checkpoint
 from uav_dc_ros.experiments.train.training import Training

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.small_worlds import changed, saved, tiny
+from tests.support.worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.env.gym_env import DataCollectionEnv

@@ -9,7 +9,7 @@ import torch
 
 from tests.experiments.test_train_cli import TINY as TINY_TOML
 from tests.recordings.made import about, flight, write
-from tests.small_worlds import population, run, tiny
+from tests.support.worlds import population, run, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.env.gym_env import DataCollectionEnv

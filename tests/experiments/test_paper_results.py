@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.experiments.paper_sweeps import SHORT, WORLDS, realistic
-from tests.small_worlds import changed
+from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.rollout import fly

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.small_worlds import population, run, tiny
+from tests.support.worlds import population, run, tiny
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train import checkpoint
 from uav_dc_ros.experiments.train.episode_stats import CURVES

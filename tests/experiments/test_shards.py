@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import uav_dc_ros
-from tests.small_worlds import tiny
+from tests.support.worlds import tiny
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Hyperparameters
 from uav_dc_ros.errors import TrainingError

@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import PATIENCE_S, until
 from tests.experiments.forks import Forks
-from tests.small_worlds import tiny
+from tests.support.worlds import tiny
 from uav_dc_ros.agents import policy
 from uav_dc_ros.experiments.evaluate.evaluation import evaluate, rows
 from uav_dc_ros.experiments.train.cli import main

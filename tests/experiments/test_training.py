@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.small_worlds import population, run, tiny
+from tests.support.worlds import population, run, tiny
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.batch import BatchWorld, observe

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import PATIENCE_S, Ros, ros_in
-from tests.small_worlds import config, saved
+from tests.support.worlds import config, saved
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import network
 from uav_dc_ros.agents import policy as policies

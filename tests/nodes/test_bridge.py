@@ -1,6 +1,6 @@
 """The bridge's node: missions through real nodes over real DDS, beside a fake autopilot on real MAVLink.
 
-The aircraft is what cannot exist here: see tests/autopilot/autopilot.py for what its stand-in imitates.
+The aircraft is what cannot exist here: see tests/support/fake_autopilot/autopilot.py for what its stand-in imitates.
 """
 
 import itertools
@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.autopilot.flight import Fake, fake
 from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.support.fake_autopilot.flight import Fake, fake
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.scenario import Scenario

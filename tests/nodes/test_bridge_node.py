@@ -11,7 +11,7 @@ import pytest
 from std_msgs.msg import String
 
 from tests.conftest import Ros
-from tests.nodes.mavros_flight import node_in
+from tests.support.fake_autopilot.mavros_flight import node_in
 from uav_dc_ros import cdr, messages
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase

@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import Ros, finish, read_bag, wait_for
 from tests.nodes import px4_messages
-from tests.nodes.mavros_flight import fake
+from tests.support.fake_autopilot.mavros_flight import fake
 
 RUN_ALL = "uav_dc_ros.run_all"
 

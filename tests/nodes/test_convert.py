@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from tests.conftest import outcome
 from tests.nodes import poses
-from tests.small_worlds import tiny
+from tests.support.worlds import tiny
 from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.ros import convert

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.autopilot.flight import fake
 from tests.conftest import Ros, finish, read_bag, until, wait_for
+from tests.support.fake_autopilot.flight import fake
 
 NODES = ("world", "channel_monitor", "policy", "recorder", "visualizer")
 AT_A_PACE = ("--pace", 15)  # twenty seconds: longer than the recorder is waited for

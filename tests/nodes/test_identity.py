@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import Ros, but_run, finish, read_bag, wait_for
 from tests.nodes.conftest import SMALL
-from tests.small_worlds import saved
+from tests.support.worlds import saved
 from uav_dc_ros import scenarios
 
 TRIES = [1, pytest.param(20, marks=pytest.mark.long)]

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from tests.conftest import Ros, finish
-from tests.nodes.mavros_flight import node_in, spin
+from tests.support.fake_autopilot.mavros_flight import node_in, spin
 from uav_dc_ros.nodes.ros.liveliness import CONFIRMED_S, Confirmed, Lease
 from uav_dc_ros.topics import TOPICS
 

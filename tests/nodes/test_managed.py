@@ -10,7 +10,7 @@ import pytest
 from rclpy.parameter import Parameter
 
 from tests.conftest import Ros, finish
-from tests.nodes.mavros_flight import node_in
+from tests.support.fake_autopilot.mavros_flight import node_in
 from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
 from uav_dc_ros.nodes.framework.parameters import EVERY
 from uav_dc_ros.nodes.world import World

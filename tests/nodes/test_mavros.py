@@ -9,7 +9,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 
 from tests.conftest import Ros
-from tests.nodes.mavros_flight import START, Fake, Flight, fake, mavros_of, node_in, spin
+from tests.support.fake_autopilot.mavros_flight import START, Fake, Flight, fake, mavros_of, node_in, spin
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros.executor import DirectExecutor

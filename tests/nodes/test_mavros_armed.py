@@ -17,9 +17,9 @@ from geometry_msgs.msg import PoseStamped
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from rclpy.task import Future
 
-from tests.autopilot.autopilot import TICK_S, Autopilot, Copter
-from tests.nodes.mavros_flight import SCENARIO, START, way_home
 from tests.nodes.test_mavros_parts import HEALTHY, PACKAGE, Message, estimator
+from tests.support.fake_autopilot.autopilot import TICK_S, Autopilot, Copter
+from tests.support.fake_autopilot.mavros_flight import SCENARIO, START, way_home
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros import convert
 from uav_dc_ros.nodes.vehicles import mavros

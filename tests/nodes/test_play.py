@@ -17,9 +17,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from tests.bags.made import STRING, TYPES, text
 from tests.conftest import PATIENCE_S, Ros, each_once, finish, read_bag, until
 from tests.nodes.conftest import Alone
+from tests.support.bags import STRING, TYPES, text
 from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.write import BagWriter

@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import Ros, finish, wait_for
 from tests.nodes.conftest import SMALL
 from tests.nodes.test_fuzz import COMPARED, PEERS, flown, said_by_nodes
-from tests.small_worlds import saved
+from tests.support.worlds import saved
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes.framework.node_table import NODES

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.small_worlds import changed
+from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.experiments.evaluate.cli import main

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from tests.bags.made import TYPES
+from tests.support.bags import TYPES
 from uav_dc_ros import __version__, cdr, messages, payloads, topics
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter

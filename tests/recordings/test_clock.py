@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bags.made import bare
 from tests.bags.test_foreign import run
-from tests.recordings import flown
 from tests.recordings.made import BEGUN_NS, about, flight, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, plain, read
-from tests.small_worlds import tiny
+from tests.support import flights
+from tests.support.bags import bare
+from tests.support.worlds import tiny
 from uav_dc_ros.bags import receive_order
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
@@ -168,14 +168,14 @@ def test_beside_an_autopilot(
     """Times of the machine are in all that is published then: of users, of poses, of phases."""
     done = False
 
-    def set_back(the: flown.Flight) -> None:
+    def set_back(the: flights.Flight) -> None:
         nonlocal done
         if not done and the.vehicle.now_s >= at_s:
             the.set_clock(by_s)
             done = True
 
-    told = flown.Flight(SCENARIO, beat=set_back).fly()
-    expected = flown.Flight(SCENARIO).fly()
+    told = flights.Flight(SCENARIO, beat=set_back).fly()
+    expected = flights.Flight(SCENARIO).fly()
     assert done
     bag = write(tmp_path / "bag", told, about(SCENARIO, vehicle="mavlink"))
     (same, stream), found = read(expected), steps_of(bag)

@@ -11,7 +11,7 @@ import pytest
 from pyarrow import parquet
 
 from tests.recordings.made import about, changing, copy, flight, write
-from tests.small_worlds import tiny
+from tests.support.worlds import tiny
 from uav_dc_ros import bag as command
 from uav_dc_ros import messages
 from uav_dc_ros.core.grid import ACTION_LABELS, Action

@@ -10,14 +10,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.autopilot.flight import fake
 from tests.conftest import Ros, finish
 from tests.nodes.conftest import low  # noqa: F401
 from tests.nodes.test_bridge import flies_east, killed, until
-from tests.recordings import flown, report_bags
+from tests.recordings import report_bags
 from tests.recordings.made import changing, copy, flight, said, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, read
-from tests.small_worlds import saved, tiny
+from tests.support import flights
+from tests.support.fake_autopilot.flight import fake
+from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, messages
 from uav_dc_ros.agents import policy as policies
@@ -41,11 +42,11 @@ LAST = TINY.mission.max_steps
 def bags(tmp_path_factory):
     """A bag of a flight with each fault, and one that a policy flew, by name."""
     folder = tmp_path_factory.mktemp("flown")
-    made = {name: flown.bag(folder / name, TINY, name, seed=5) for name in flown.FAULTS}
+    made = {name: flights.bag(folder / name, TINY, name, seed=5) for name in flights.FAULTS}
     own = policies.load(saved(folder / "p", TINY, name="own"))
-    told = flown.Flight(TINY, seed=5, policy=own, settings=Settings(arm=True)).fly()
+    told = flights.Flight(TINY, seed=5, policy=own, settings=Settings(arm=True)).fly()
     made["policy"] = write(
-        folder / "policy", told, flown.flown_about(TINY, 5, policy="own", policy_sha256=own.sha256)
+        folder / "policy", told, flights.flown_about(TINY, 5, policy="own", policy_sha256=own.sha256)
     )
     return made
 
@@ -69,7 +70,7 @@ def steps_of(bag):
 @pytest.fixture(scope="module")
 def not_reached(tmp_path_factory):
     """A bag of a flight of which two steps were not reached; one of them while it lasted."""
-    told = flown.Flight(TINY, seed=5).fly()
+    told = flights.Flight(TINY, seed=5).fly()
     changed = []
     for message in told:
         if message.topic == "/mission":
@@ -79,7 +80,7 @@ def not_reached(tmp_path_factory):
             payload = msgspec.structs.replace(payload, steps_not_reached=n)
             message = message._replace(data=said("mission", payload, 0).data)
         changed.append(message)
-    return write(tmp_path_factory.mktemp("late") / "bag", changed, flown.flown_about(TINY, 5))
+    return write(tmp_path_factory.mktemp("late") / "bag", changed, flights.flown_about(TINY, 5))
 
 
 def test_steps_that_were_not_reached_are_told(not_reached, capsys, tmp_path):
@@ -101,14 +102,14 @@ def test_steps_that_were_not_reached_are_told(not_reached, capsys, tmp_path):
 
 def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
     """One that was told before it, for the same end, is not."""
-    told = flown.Flight(TINY, seed=5).fly()
+    told = flights.Flight(TINY, seed=5).fly()
     last = max(i for i, message in enumerate(told) if message.topic == "/mission")
     payload = messages.decode(cdr.text_in(told[last].data), messages.Mission)
     for i, reason in enumerate(("step 4: there", "the motors were stopped: by hand")):
         ended = msgspec.structs.replace(payload, phase=Phase.ABORTED, reason=reason)
         told.insert(last + i, said("mission", ended, told[last + i - 1].publish_time_ns + 1000))
     del told[last + 2 :]
-    bag = write(tmp_path / "bag", told, flown.flown_about(TINY, 5))
+    bag = write(tmp_path / "bag", told, flights.flown_about(TINY, 5))
     assert "the motors were stopped: by hand" in run(capsys, "info", bag)[1]
     run(capsys, "export", bag, "--out", tmp_path / "tables", "--format", "csv")
     (row,) = csv.DictReader((tmp_path / "tables" / "missions.csv").open())
@@ -121,16 +122,16 @@ def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
 # Steps.
 
 
-@pytest.mark.parametrize("fault", flown.FAULTS)
+@pytest.mark.parametrize("fault", flights.FAULTS)
 def test_a_step_has_all_that_its_vehicle_told(bags, fault):
     """Nothing is lost, repeated or too late, whatever happens on the way."""
     found, stream = steps_of(bags[fault])
     with BagReader(bags[fault]) as reader:
-        words = flown.phases(list(reader.messages()))
+        words = flights.phases(list(reader.messages()))
     assert [(step.step, told.phase, told.reason) for step in found for told in step.told] == words
     assert not stream.orphans + stream.repeated + stream.rejected
     assert not any(step.others or step.untold for step in found)
-    ends = flown.FAULTS[fault][1]
+    ends = flights.FAULTS[fault][1]
     assert (found[-1].status.phase, found[-1].status.reason) == (ends, words[-1][2])
     for step in found[:-1]:
         assert step.status.phase is Phase.READY
@@ -141,7 +142,7 @@ def test_a_step_has_all_that_its_vehicle_told(bags, fault):
 
 
 def test_the_weightiest_word_is_the_status_in_any_order():
-    told = flown.Flight(TINY, beat=flown.FAULTS["battery"][0]).fly()
+    told = flights.Flight(TINY, beat=flights.FAULTS["battery"][0]).fly()
     words = [m for m in told if m.topic == "/mission"]
     expected, _ = read(told)
     times = {m.log_ns: step.step for step in expected for m in step.told}
@@ -156,11 +157,11 @@ def test_the_weightiest_word_is_the_status_in_any_order():
 
 def test_a_vehicle_that_is_ready_again_has_the_same_users_at_another_time():
     """It held while it was ready: the world tells the users again, with the time of a new pose."""
-    frozen = flown.all_of(
-        flown.once(flown.in_phase(Phase.READY, 0, 1.0), flown.setting(frozen=True)),
-        flown.once(flown.in_phase(Phase.READY, 0, 3.0), flown.setting(frozen=False)),
+    frozen = flights.all_of(
+        flights.once(flights.in_phase(Phase.READY, 0, 1.0), flights.setting(frozen=True)),
+        flights.once(flights.in_phase(Phase.READY, 0, 3.0), flights.setting(frozen=False)),
     )
-    flight = flown.Flight(TINY, beat=frozen, patience_s=5.0)
+    flight = flights.Flight(TINY, beat=frozen, patience_s=5.0)
     found, stream = read(flight.fly())
     reasons = [told.reason for told in found[0].told if told.phase is Phase.READY]
     assert reasons[1:] == ["no position for 0.5 s", f"goes on after: {reasons[1]}"]
@@ -173,7 +174,7 @@ def test_a_vehicle_that_is_ready_again_has_the_same_users_at_another_time():
 
 
 def test_what_a_middleware_repeats_is_counted_and_told_once():
-    told = flown.Flight(TINY).fly()
+    told = flights.Flight(TINY).fly()
     words = [
         m._replace(log_time_ns=told[-1].log_time_ns + i) for i, m in enumerate(told) if m.topic == "/mission"
     ]
@@ -184,7 +185,7 @@ def test_what_a_middleware_repeats_is_counted_and_told_once():
 
 
 def test_a_vehicle_that_waits_for_hours_fills_no_memory():
-    told = flown.Flight(TINY, beat=flown.FAULTS["ground"][0]).fly()
+    told = flights.Flight(TINY, beat=flights.FAULTS["ground"][0]).fly()
     i, word = next((i, m) for i, m in enumerate(told) if m.topic == "/mission")
     status = messages.decode(cdr.text_in(word.data), messages.Mission)
     again = [
@@ -194,7 +195,7 @@ def test_a_vehicle_that_waits_for_hours_fills_no_memory():
     told[i:i] = again
     (step,), stream = read(told)
     assert len(step.told) == TOLD_KEPT
-    assert step.untold == len(flown.phases(told)) - TOLD_KEPT
+    assert step.untold == len(flights.phases(told)) - TOLD_KEPT
     assert step.status.phase is step.told[-1].phase is Phase.ABORTED
     assert not stream.repeated
 
@@ -202,7 +203,7 @@ def test_a_vehicle_that_waits_for_hours_fills_no_memory():
 @pytest.fixture(scope="module")
 def long_flight():
     """A flight of a quarter of an hour, since the policy thinks for long."""
-    return flown.Flight(LONG, patience_s=14.0, tick_s=0.05).fly()
+    return flights.Flight(LONG, patience_s=14.0, tick_s=0.05).fly()
 
 
 def test_the_poses_of_a_long_flight_are_few_in_memory(long_flight):
@@ -217,8 +218,8 @@ def test_the_poses_of_a_long_flight_are_few_in_memory(long_flight):
 
 
 def test_a_flight_that_never_left_the_ground_and_one_that_did_are_two(bags):
-    one = flown.Flight(TINY, beat=flown.FAULTS["ground"][0]).fly()
-    two = flown.Flight(TINY, begun_ns=LATER_NS).fly()
+    one = flights.Flight(TINY, beat=flights.FAULTS["ground"][0]).fly()
+    two = flights.Flight(TINY, begun_ns=LATER_NS).fly()
     found, stream = read([*one, *two])
     assert [(s.flight, s.step) for s in found] == [(0, 0), *((1, s) for s in range(LAST + 1))]
     assert (found[0].status.phase, found[-1].status.phase) == (Phase.ABORTED, Phase.LANDED)
@@ -228,7 +229,7 @@ def test_a_flight_that_never_left_the_ground_and_one_that_did_are_two(bags):
 # Verify.
 
 
-@pytest.mark.parametrize("fault", flown.FAULTS)
+@pytest.mark.parametrize("fault", flights.FAULTS)
 def test_a_flight_verifies(bags, capsys, fault):
     status, out = run(capsys, "verify", bags[fault])
     assert status == 0, out
@@ -308,7 +309,7 @@ def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
         for n, m in enumerate((told[ready], told[moving]))
     ]
     told[moving + 1 : moving + 1] = twice
-    bag = write(tmp_path / "bag", told, flown.flown_about(TINY, 5))
+    bag = write(tmp_path / "bag", told, flights.flown_about(TINY, 5))
     status, out = run(capsys, "verify", bag)
     assert status == 1
     assert "phases of 9 of 9 steps looked at, 1 are not as they may be; first:" in out
@@ -339,8 +340,8 @@ def test_whatever_happens_on_the_way_the_bag_verifies(tmp_path, seeds):
     """Faults at random moments: nothing that a bridge tells of them is taken for a difference."""
     ends = set()
     for seed in seeds:
-        told = flown.Flight(TINY, seed=seed, beat=flown.at_random(seed)).fly(cut_s=400.0)
-        bag = write(tmp_path / str(seed), told, flown.flown_about(TINY, seed))
+        told = flights.Flight(TINY, seed=seed, beat=flights.at_random(seed)).fly(cut_s=400.0)
+        bag = write(tmp_path / str(seed), told, flights.flown_about(TINY, seed))
         with BagReader(bag) as reader:
             found = verify(reader, "", TINY)
             assert not found.differs, (seed, found.lines)
@@ -401,9 +402,9 @@ def as_version_0_1(message):
 
 
 def test_a_bag_of_version_0_1_is_read_as_before(bags, capsys, tmp_path):
-    told = flown.Flight(TINY, seed=5, beat=flown.FAULTS["hold"][0]).fly()
+    told = flights.Flight(TINY, seed=5, beat=flights.FAULTS["hold"][0]).fly()
     old = [as_version_0_1(one) if one.topic == "/mission" else one for one in told]
-    bag = write(tmp_path / "old", old, flown.flown_about(TINY, 5))
+    bag = write(tmp_path / "old", old, flights.flown_about(TINY, 5))
     words = [[one for step in steps_of(it)[0] for one in step.told] for it in (bag, bags["hold"])]
     assert [one.held for one in words[0]] == [one.held for one in words[1]]
     prefixes = ["holds: " if one.held else "" for one in words[1]]
@@ -465,7 +466,7 @@ def test_an_export_has_reasons_phases_and_times(bags, capsys, tmp_path):
 
 
 def test_a_simulated_flight_has_none_of_these(capsys, tmp_path):
-    bag = write(tmp_path / "bag", flight(TINY), flown.about(TINY))
+    bag = write(tmp_path / "bag", flight(TINY), flights.about(TINY))
     status, out = run(capsys, "export", bag, "--out", tmp_path / "t", "--tables", "phases")
     assert (status, "--tables phases: of a real vehicle only; expected steps, users" in out) == (2, True)
     assert run(capsys, "export", bag, "--out", tmp_path / "t", "--format", "csv")[0] == 0
@@ -498,7 +499,7 @@ def page_of(capsys, bag, tmp_path):
     return report_bags.unpacked(tmp_path / "page.html")
 
 
-@pytest.mark.parametrize("fault", flown.FAULTS)
+@pytest.mark.parametrize("fault", flights.FAULTS)
 def test_a_report_tells_phases_faults_and_the_way(bags, capsys, tmp_path, fault):
     data = page_of(capsys, bags[fault], tmp_path)
     found, _ = steps_of(bags[fault])
@@ -540,7 +541,7 @@ def test_the_way_of_a_long_flight_stays_small():
 
 
 def test_a_long_flight_has_a_report(long_flight, capsys, tmp_path):
-    data = page_of(capsys, write(tmp_path / "bag", long_flight, flown.flown_about(LONG)), tmp_path)
+    data = page_of(capsys, write(tmp_path / "bag", long_flight, flights.flown_about(LONG)), tmp_path)
     journey = data["mission-0"]["journey"]
     assert len(journey["cells"]["step"]) == LONG.mission.max_steps + 1
     assert (tmp_path / "page.html").stat().st_size < 3_000_000

@@ -10,8 +10,8 @@ import pytest
 from mcap.writer import Writer
 from rosbags.rosbag2.metadata import parse_qos
 
-from tests.bags.made import QOS, STRING, TYPES, content, information, text
 from tests.recordings import made
+from tests.support.bags import QOS, STRING, TYPES, content, information, text
 from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, messages, scenarios, topics
 from uav_dc_ros.bags.salvage.recover import recover

@@ -12,7 +12,7 @@ import pytest
 
 from tests.nodes.conftest import SMALL
 from tests.recordings import report_bags
-from tests.small_worlds import saved, tiny
+from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag, resources, scenarios
 from uav_dc_ros.core import world
 from uav_dc_ros.nodes.view import markers

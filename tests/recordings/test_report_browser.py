@@ -10,9 +10,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from tests.recordings import flown, report_bags
+from tests.recordings import report_bags
 from tests.recordings.test_report import HOSTILE, report
-from tests.small_worlds import tiny
+from tests.support import flights
+from tests.support.worlds import tiny
 from uav_dc_ros import cdr, messages
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -247,11 +248,11 @@ def test_without_webgl_there_is_a_map(chromium, mission_page):
 def test_the_flight_of_a_real_vehicle(chromium, tmp_path):
     """Its reason is told, its phases are listed, and its way is drawn as far as the slider stands."""
     scenario = tiny()
-    flight = flown.Flight(scenario, beat=flown.FAULTS["battery"][0])
+    flight = flights.Flight(scenario, beat=flights.FAULTS["battery"][0])
     said = [cdr.text_in(m.data) for m in flight.fly() if m.topic == "/mission"]
     words = [messages.decode(text, messages.Mission) for text in said]
     told = [said_with(m, words[-1], HOSTILE) for m in flight.told]
-    bag = flown.write(tmp_path / "bag", told, flown.flown_about(scenario))
+    bag = flights.write(tmp_path / "bag", told, flights.flown_about(scenario))
     assert report(bag, "--out", tmp_path / "page.html") == 0
     journey = report_bags.unpacked(tmp_path / "page.html")["mission-0"]["journey"]
     bare = chromium.launch(executable_path=CHROMIUM, args=["--disable-3d-apis", *ROOT])  # draws quickly

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bags.made import text
 from tests.recordings.made import APART_NS, BEGUN_NS, flight, pose, said, write
-from tests.small_worlds import tiny
+from tests.support.bags import text
+from tests.support.worlds import tiny
 from uav_dc_ros import messages
 from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
 from uav_dc_ros.errors import BagError

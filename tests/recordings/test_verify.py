@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import Ros, finish, wait_for
 from tests.recordings.made import about, changing, copy, flight, nudged, pose, said, write
-from tests.small_worlds import saved, tiny
+from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, messages, payloads, resources, scenarios
 from uav_dc_ros.bags.read import BagReader

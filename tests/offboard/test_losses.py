@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
+from tests.support.fake_autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import Standing

@@ -43,7 +43,7 @@ class Fake:
         command = [
             sys.executable,
             "-m",
-            "tests.autopilot.autopilot",
+            "tests.support.fake_autopilot.autopilot",
             "--kind",
             kind,
             f"--{wire}",

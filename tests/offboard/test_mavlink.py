@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from tests.autopilot.flight import ROOT, Fake, fake, free_udp_port
+from tests.support.fake_autopilot.flight import ROOT, Fake, fake, free_udp_port
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic

@@ -10,8 +10,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from tests.autopilot.simulated import Vehicle
 from tests.recordings.made import BEGUN_NS, about, pose, said, write
+from tests.support.fake_autopilot.simulated import Vehicle
 from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.bags.read import BagMessage

@@ -9,7 +9,7 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from tests.autopilot.flight import Fake, fake
+from tests.support.fake_autopilot.flight import Fake, fake
 
 SPEED = 40.0
 POSITION, VELOCITY = 0xDF8, 0xDC7

@@ -1,6 +1,6 @@
 """A fake MAVROS beside a fake autopilot: a process with a real node, and standard messages only.
 
-    python -m tests.nodes.fake_mavros --kind px4 --speed 4 [ROS arguments]
+    python -m tests.support.fake_autopilot.mavros --kind px4 --speed 4 [ROS arguments]
 
 It publishes as MAVROS does (its plugins local_position, sys_status and global_position; names, types, QoS,
 frames, texts): poses at 30 Hz, best effort, in the ENU frame of the EKF's origin, stamped with the
@@ -27,7 +27,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import BatteryState, NavSatFix
 
-from tests.autopilot.autopilot import FOLLOWS, OFFBOARD_GAP_S, OFFBOARD_PROOF_S, TICK_S, Copter, tell
+from tests.support.fake_autopilot.autopilot import (
+    FOLLOWS,
+    OFFBOARD_GAP_S,
+    OFFBOARD_PROOF_S,
+    TICK_S,
+    Copter,
+    tell,
+)
 from uav_dc_ros.nodes.ros import convert
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned, to_enu, to_ned
 

@@ -1,6 +1,6 @@
 """Missions against the fake autopilot, in a process of their own, with a fault on the way or without one.
 
-    python -m tests.autopilot.faulty "px4,udp,jump away" "ardupilot,tcp,freeze,250.0"
+    python -m tests.support.fake_autopilot.faulty "px4,udp,jump away" "ardupilot,tcp,freeze,250.0"
 
 One flight at a time in a process, as on a companion computer: several bridges in one would starve one
 another's streams. It prints one line of JSON when a mission is over: what the bridge decided, and what the
@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from tests.autopilot.flight import ROOT, SCENARIO, Flight, fake
+from tests.support.fake_autopilot.flight import ROOT, SCENARIO, Flight, fake
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.mission.fault_detector import Settings
@@ -171,7 +171,12 @@ def fly(kind: str, wire: str, name: str, at_s: float | None) -> dict[str, Any]:
 def flown(cases: list[tuple[Any, ...]]) -> list[dict[str, Any]]:
     """One after the other, in a process of their own: kind, wire, fault and time, or fewer of them."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.autopilot.faulty", *(",".join(map(str, case)) for case in cases)],
+        [
+            sys.executable,
+            "-m",
+            "tests.support.fake_autopilot.faulty",
+            *(",".join(map(str, case)) for case in cases),
+        ],
         cwd=ROOT,
         capture_output=True,
         text=True,

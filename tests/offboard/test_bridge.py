@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step, way_home
+from tests.support.fake_autopilot.simulated import (
+    ARMING,
+    SCENARIO,
+    START,
+    Flight,
+    Vehicle,
+    fly_to_step,
+    way_home,
+)
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu

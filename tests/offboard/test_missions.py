@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.autopilot.faulty import CAREFUL, FAULTS, PILOT, SPEED, all_flown, check, flown, low
-from tests.autopilot.flight import KINDS, SCENARIO, WIRES, Flight, fake
+from tests.support.fake_autopilot.faulty import CAREFUL, FAULTS, PILOT, SPEED, all_flown, check, flown, low
+from tests.support.fake_autopilot.flight import KINDS, SCENARIO, WIRES, Flight, fake
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 

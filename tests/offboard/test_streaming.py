@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from tests.autopilot.streaming import off_beat_ms
+from tests.support.fake_autopilot.streaming import off_beat_ms
 from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
 from uav_dc_ros.offboard.realtime import run_when_due
 

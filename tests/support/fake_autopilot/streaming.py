@@ -1,7 +1,7 @@
 """The pace of setpoints, as the fake autopilot receives them, while other processes want the processor.
 
-    python -m tests.autopilot.streaming transport ADDRESS
-    python -m tests.autopilot.streaming bare ADDRESS
+    python -m tests.support.fake_autopilot.streaming transport ADDRESS
+    python -m tests.support.fake_autopilot.streaming bare ADDRESS
 
 are the two senders: this project's transport, steered ten times a second as the bridge's node does, and
 beside it a loop that sleeps until the next setpoint is due and sends the same message, as it is run without
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 import numpy as np
 from pymavlink import mavutil
 
-from tests.autopilot.flight import ROOT, Fake, fake
+from tests.support.fake_autopilot.flight import ROOT, Fake, fake
 from uav_dc_ros.offboard.mavlink.session import POSITION_ONLY
 from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
 from uav_dc_ros.offboard.realtime import run_when_due
@@ -64,7 +64,7 @@ def stream(sender: str) -> Iterator[Fake]:
     """A fake autopilot on the ground, and a sender that streams to it by now."""
     with (
         fake("px4", "udp", ready_s=0.5) as autopilot,
-        process("-m", "tests.autopilot.streaming", sender, autopilot.address),
+        process("-m", "tests.support.fake_autopilot.streaming", sender, autopilot.address),
     ):
         end_s = time.monotonic() + 30.0
         while autopilot.report()["setpoints"] == 0:

@@ -1,6 +1,6 @@
 """A fake autopilot: a process that speaks MAVLink 2 over TCP or UDP, like ArduCopter or like PX4.
 
-    python -m tests.autopilot.autopilot --kind ardupilot --tcp 0 --speed 20
+    python -m tests.support.fake_autopilot.autopilot --kind ardupilot --tcp 0 --speed 20
 
 The vehicle itself is in `copter`. It tells in lines of JSON on standard output what happened to it, first
 where it listens, and takes commands on standard input: all of them are listed in `Control`. Simulated time
@@ -39,7 +39,7 @@ from typing import Any
 import pymap3d
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from tests.autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, tell
+from tests.support.fake_autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, tell
 
 ADVICE_S = 30.0
 OFFBOARD_GAP_S, OFFBOARD_PROOF_S = 0.5, 1.0

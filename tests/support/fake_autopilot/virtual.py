@@ -11,9 +11,9 @@ from typing import Any
 
 import msgspec
 
-from tests.autopilot.autopilot import Autopilot, Control
-from tests.autopilot.copter import TICK_S, Copter
-from tests.autopilot.flight import SCENARIO, way_home
+from tests.support.fake_autopilot.autopilot import Autopilot, Control
+from tests.support.fake_autopilot.copter import TICK_S, Copter
+from tests.support.fake_autopilot.flight import SCENARIO, way_home
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase

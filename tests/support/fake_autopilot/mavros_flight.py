@@ -12,7 +12,7 @@ import pytest
 import rclpy
 
 from tests.conftest import Ros
-from tests.small_worlds import changed
+from tests.support.worlds import changed
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
@@ -34,7 +34,7 @@ class Fake:
     """The fake MAVROS; it is told what to do, and tells what happened."""
 
     def __init__(self, ros: Ros, *arguments: object) -> None:
-        self.process = ros.start("tests.nodes.fake_mavros", *arguments, stdin=-1)
+        self.process = ros.start("tests.support.fake_autopilot.mavros", *arguments, stdin=-1)
         self.events: list[dict[str, Any]] = []
         self._new: queue.Queue[dict[str, Any]] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()

@@ -5,7 +5,7 @@ import dataclasses
 import msgspec
 import pytest
 
-from tests.autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
+from tests.support.fake_autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import Standing

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.autopilot.autopilot import Autopilot
-from tests.autopilot.copter import Copter
-from tests.autopilot.flight import KINDS
-from tests.autopilot.virtual import VirtualFlight, short
+from tests.support.fake_autopilot.autopilot import Autopilot
+from tests.support.fake_autopilot.copter import Copter
+from tests.support.fake_autopilot.flight import KINDS
+from tests.support.fake_autopilot.virtual import VirtualFlight, short
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.mission.controller import Bridge
