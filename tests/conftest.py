@@ -19,9 +19,11 @@ import hypothesis
 import pytest
 
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.controller import MissionController
 
-Bridge.is_strict = True  # a phase that cannot follow fails the test; in the air it would end the mission
+MissionController.is_strict = (
+    True  # a phase that cannot follow fails the test; in the air it would end the mission
+)
 MARK = "UAV_DC_TEST"
 ROOT = Path(__file__).parents[1]
 # How long a test waits for what must come, wall time. Only what never comes takes this long: a machine with

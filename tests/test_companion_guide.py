@@ -24,7 +24,7 @@ from uav_dc_ros.offboard import datums, send_timer
 from uav_dc_ros.offboard.mavlink import systems
 from uav_dc_ros.offboard.mavlink.connection import Address
 from uav_dc_ros.offboard.mission import geofence
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.runner import run_options, supervisor
 
 ROOT = Path(__file__).parents[1]
@@ -172,7 +172,7 @@ def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert "end a second after its last decision" in GUIDE
     assert geofence.MARGIN_M == 20.0
     assert "The fence is the grid with 20 m around it and above its top layer" in GUIDE
-    assert Settings().returning_tries == 3
+    assert SafetySettings().returning_tries == 3
     assert "refuses to return three times" in GUIDE.replace("\n", " ")
     assert NODES["policy"].restarts == 3
     assert supervisor.RESTART_WINDOW_S == 60

@@ -9,7 +9,7 @@ from tests.support.fake_autopilot.simulated import ARMING, Flight, fly_to_step
 from tests.support.worlds import tiny
 from uav_dc_ros.errors import PhaseError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.offboard.mission.controller import Bridge
+from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.phases import RESTART, STEERED, TRANSITIONS, Transition, following, impossible
 
 OVER = {phase for phase in Phase if phase.is_over}
@@ -53,7 +53,7 @@ def test_what_cannot_follow_is_an_error_in_tests() -> None:
 def test_in_the_air_it_is_the_end_of_the_mission(
     monkeypatch: pytest.MonkeyPatch, wrong: Phase, more_steps: int
 ) -> None:
-    monkeypatch.setattr(Bridge, "is_strict", False)
+    monkeypatch.setattr(MissionController, "is_strict", False)
     flight = fly_to_step(3)
     flight.bridge.course.step += more_steps
     flight._step += more_steps
@@ -70,7 +70,7 @@ def test_in_the_air_it_is_the_end_of_the_mission(
 
 
 def test_on_the_ground_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Bridge, "is_strict", False)
+    monkeypatch.setattr(MissionController, "is_strict", False)
     bridge = Flight(ARMING).bridge
     bridge._enter(Phase.READY, "wrong")
     assert (bridge.phase, bridge.setpoint) == (Phase.ABORTED, None)

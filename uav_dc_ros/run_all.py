@@ -158,10 +158,10 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
 
         environment.prepare(alone=config.nodes is None)  # before ROS is imported
         from uav_dc_ros.nodes.framework import node_main
-        from uav_dc_ros.runner.mission_runner import Flight
+        from uav_dc_ros.runner.mission_runner import MissionRunner
 
         try:
-            flight = Flight(config)
+            flight = MissionRunner(config)
             signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the terminal is gone: the mission goes on
             cli.on_stop(flight.interrupt)
             node_main.give_way()
@@ -206,9 +206,9 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
 
         environment.prepare(alone=config.nodes is None)  # before ROS is imported
         from uav_dc_ros.messages import Phase
-        from uav_dc_ros.runner.mission_runner import Flight
+        from uav_dc_ros.runner.mission_runner import MissionRunner
 
-        flight = Flight(config, show=show)
+        flight = MissionRunner(config, show=show)
         handler = signal.signal(signal.SIGINT, flight.interrupt) if in_main else None
         try:
             status = flight.run()

@@ -117,7 +117,7 @@ def node_graph(nodes: tuple[str, ...], title: str) -> str:
 def layers() -> list[str]:
     """The layers of the import contract, the highest first."""
     pyproject = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))
-    (contract,) = (c for c in pyproject["tool"]["importlinter"]["contracts"] if c["type"] == "layers")
+    contract = pyproject["tool"]["importlinter"]["contracts"][0]
     return list(contract["layers"])
 
 

@@ -18,15 +18,15 @@ from uav_dc_ros.experiments.evaluate import cli
 from uav_dc_ros.experiments.evaluate.cli import main
 from uav_dc_ros.experiments.evaluate.evaluation import (
     Evaluation,
+    EvaluationReport,
     Figure,
-    Report,
     compare,
     evaluate,
     judge,
     rows,
     steer,
 )
-from uav_dc_ros.experiments.evaluate.rollout import flight, fly
+from uav_dc_ros.experiments.evaluate.rollout import flight, roll_out
 from uav_dc_ros.stats import interval
 
 
@@ -58,7 +58,7 @@ def test_seed_s_is_the_mission_of_the_environment_with_seed_s(tmp_path, end):
     scenario = changed("five_clusters", mission={"episode_end": end, "max_steps": 30})
     made = policy.load(saved(tmp_path / "made", scenario))
     seeds = [3, 0, 11, 12, 13, 14, 15]
-    missions = fly(scenario, steer(made, scenario), seeds)
+    missions = roll_out(scenario, steer(made, scenario), seeds)
     states = [state for state, _ in flight(scenario, steer(made, scenario), seeds)]
     for i, seed in enumerate(seeds):
         course, rewards = by_hand(DataCollectionEnv(scenario), made.act, seed)
@@ -78,10 +78,10 @@ def test_a_planned_flight_lands_when_it_should():
     """To the dock, away and back: the arrival that counts is the last one."""
     scenario = tiny(mission={"max_steps": 8})
     plan = [1, 1, 2, 2, 0, 1, 6, 6]  # over the dock after steps 4 and 6
-    missions = fly(scenario, lambda state: np.full(state.step.shape, plan[state.step[0]]), [0, 1])
+    missions = roll_out(scenario, lambda state: np.full(state.step.shape, plan[state.step[0]]), [0, 1])
     assert missions.landed.tolist() == [True, True]
     assert missions.arrival_step.tolist() == [6, 6]
-    away = fly(scenario, lambda state: np.full(state.step.shape, 6), [0])
+    away = roll_out(scenario, lambda state: np.full(state.step.shape, 6), [0])
     assert not away.landed[0]
     assert np.isnan(away.arrival_step[0])
 
@@ -89,7 +89,7 @@ def test_a_planned_flight_lands_when_it_should():
 def test_on_arrival_a_mission_ends_there():
     scenario = tiny(mission={"episode_end": "on_arrival"})
     plan = [[1, 1, 2, 2, 6, 6, 6, 6], [6] * 8]
-    missions = fly(scenario, lambda state: np.array([one[state.step[0]] for one in plan]), [5, 5])
+    missions = roll_out(scenario, lambda state: np.array([one[state.step[0]] for one in plan]), [5, 5])
     assert missions.steps.tolist() == [4, 8]
     assert missions.landed.tolist() == [True, False]
 
@@ -102,7 +102,7 @@ def plan(*actions):
 def test_a_figure_is_over_the_missions_that_have_it():
     scenario = tiny()
     flown = judge("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, range(20))
-    figures, missions = flown.evaluation, fly(scenario, plan(1, 1, 2, 2, 6, 6, 6, 6), range(20))
+    figures, missions = flown.evaluation, roll_out(scenario, plan(1, 1, 2, 2, 6, 6, 6, 6), range(20))
     assert figures.landing_rate == Figure(n=20, mean=1.0, low=1.0, high=1.0, min=1.0, max=1.0)
     assert figures.arrival_step.mean == 4.0
     mean, low, high = interval(missions.data_bits)
@@ -145,7 +145,7 @@ def test_every_policy_flies_in_every_scenario_and_is_compared_with_the_first(tmp
     with pytest.raises(SystemExit) as exit:
         main([*map(str, arguments), "--json", str(tmp_path / "x.json")])
     assert exit.value.code == 0
-    report = msgspec.json.decode((tmp_path / "x.json").read_bytes(), type=Report)
+    report = msgspec.json.decode((tmp_path / "x.json").read_bytes(), type=EvaluationReport)
     flown = [(one.policy, one.scenario) for one in report.evaluations]
     fields = ("five_clusters", "three_clusters")
     assert flown == [(who, where) for where in fields for who in ("tour", "test")]

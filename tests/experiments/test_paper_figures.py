@@ -9,7 +9,7 @@ import pytest
 
 from tests.experiments.paper_sweeps import realistic
 from uav_dc_ros import scenarios
-from uav_dc_ros.env.trajectory import Track
+from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.rollout import flight
 from uav_dc_ros.experiments.paper.figures import draw, drawable
@@ -32,7 +32,7 @@ def tracks():
 
     made = []
     for seed in range(2):
-        track = Track(scenario)
+        track = Trajectory(scenario)
         for state, outcome in flight(scenario, PLANNERS["tour"](scenario), [seed]):
             track.add(first(state), first(outcome.link) if outcome else None)
         made.append(track)

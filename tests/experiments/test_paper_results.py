@@ -11,7 +11,7 @@ from tests.experiments.paper_sweeps import SHORT, WORLDS, realistic
 from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.rollout import fly
+from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.experiments.paper.results import CURVES_FILE, GREEDY, METRICS, RUNS_FILE, Results, World
 from uav_dc_ros.experiments.paper.setting import SMOKE, Setting
 from uav_dc_ros.planners import PLANNERS
@@ -135,7 +135,7 @@ def test_the_throughput_gives_the_data_term(name):
     """Of flown missions: r^t with the binary R_plus is beta c throughput + zeta landed."""
     scenario = changed(name, reward={"beta": 3.0, "zeta": 2.0, "r_plus": "binary"})
     for planner in ("tour", "random"):
-        missions = fly(scenario, PLANNERS[planner](scenario), range(5))
+        missions = roll_out(scenario, PLANNERS[planner](scenario), range(5))
         data = World.of(scenario).data_per_bps * missions.sum_rate_bps
         np.testing.assert_allclose(missions.reward, 3 * data + 2 * missions.landed, rtol=1e-9)
 

@@ -11,7 +11,7 @@ from tests.support.worlds import population, run, tiny
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train import checkpoint
 from uav_dc_ros.experiments.train.episode_stats import CURVES
-from uav_dc_ros.experiments.train.tensorboard import Scalars
+from uav_dc_ros.experiments.train.tensorboard import TensorBoardLog
 from uav_dc_ros.experiments.train.training import Training
 
 CPU = torch.device("cpu")
@@ -36,7 +36,7 @@ def curve(training, name, one):
 
 def test_they_are_the_curves_of_each_run(tmp_path, made):
     training = Training(made, CPU)
-    with Scalars(tmp_path, "name", training) as written:
+    with TensorBoardLog(tmp_path, "name", training) as written:
         for _ in range(3):
             training.fly_episode()
             written.add_episode()
@@ -50,7 +50,7 @@ def test_they_are_the_curves_of_each_run(tmp_path, made):
 
 def test_what_was_written_after_the_checkpoint_is_taken_back(tmp_path, made):
     training = Training(made, CPU)
-    lost = Scalars(tmp_path, "name", training)  # never closed, like that of a killed process
+    lost = TensorBoardLog(tmp_path, "name", training)  # never closed, like that of a killed process
     for n in range(1, 4):
         training.fly_episode()
         lost.add_episode()
@@ -60,7 +60,7 @@ def test_what_was_written_after_the_checkpoint_is_taken_back(tmp_path, made):
     lost.add_scores(np.array([9.0, 9.0]))  # puts the third episode on the disk too
     resumed = Training(made, CPU)
     checkpoint.restore(tmp_path / "state", resumed)
-    with Scalars(tmp_path, "name", resumed) as written:
+    with TensorBoardLog(tmp_path, "name", resumed) as written:
         for _ in range(2):
             resumed.fly_episode()
             written.add_episode()
@@ -73,7 +73,7 @@ def test_what_was_written_after_the_checkpoint_is_taken_back(tmp_path, made):
 def test_a_validation_puts_everything_until_then_on_the_disk(tmp_path, made):
     """So that what a checkpoint follows cannot be lost."""
     training = Training(made, CPU)
-    written = Scalars(tmp_path, "name", training)
+    written = TensorBoardLog(tmp_path, "name", training)
     training.fly_episode()
     written.add_episode()
     written.add_scores(np.array([1.0, 1.0]))
@@ -84,7 +84,7 @@ def test_a_validation_puts_everything_until_then_on_the_disk(tmp_path, made):
 def test_without_a_folder_nothing_is_written(tmp_path, made, monkeypatch):
     monkeypatch.chdir(tmp_path)
     training = Training(made, CPU)
-    with Scalars(None, "name", training) as written:
+    with TensorBoardLog(None, "name", training) as written:
         training.fly_episode()
         written.add_episode()
         written.add_scores(np.array([1.0, 1.0]))
@@ -94,10 +94,10 @@ def test_without_a_folder_nothing_is_written(tmp_path, made, monkeypatch):
 def test_a_folder_that_cannot_be_written_is_named(tmp_path, made):
     (tmp_path / "file").touch()
     with pytest.raises(TrainingError, match=r"--tensorboard .*file cannot be written: "):
-        Scalars(tmp_path / "file", "name", Training(made, CPU))
+        TensorBoardLog(tmp_path / "file", "name", Training(made, CPU))
 
 
 def test_without_tensorboard_there_is_one_line_that_helps(tmp_path, made, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(TrainingError, match=r'expected it from: pip install "uav_dc_ros\[train\]"'):
-        Scalars(tmp_path, "name", Training(made, CPU))
+        TensorBoardLog(tmp_path, "name", Training(made, CPU))

@@ -16,13 +16,13 @@ from uav_dc_ros.core.batch import BatchWorld, observe
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS
-from uav_dc_ros.experiments.evaluate.rollout import Missions, fly
+from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.experiments.train import validation
-from uav_dc_ros.experiments.train.episode_stats import CURVES, Books
+from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
 from uav_dc_ros.experiments.train.population import architecture
-from uav_dc_ros.experiments.train.progress import Report
+from uav_dc_ros.experiments.train.progress import ProgressReport
 from uav_dc_ros.experiments.train.training import Training
-from uav_dc_ros.experiments.train.validation import VALIDATION_SEEDS, fly_greedily, validate
+from uav_dc_ros.experiments.train.validation import VALIDATION_SEEDS, roll_out_greedily, validate
 
 CPU = torch.device("cpu")
 ENDS = ["at_time_limit", "on_arrival"]
@@ -340,7 +340,7 @@ def test_the_loss_is_the_mean_over_the_iterations(monkeypatch):
 def test_an_episode_in_which_no_mission_ended_has_no_figures(library):
     scenario = tiny()
     worlds = BatchWorld(scenario, library.zeros((2, scenario.n_users, 2)))
-    books = Books(scenario, worlds.state.total_reward)
+    books = EpisodeStats(scenario, worlds.state.total_reward)
     outcome = worlds.step(library.zeros((2,), dtype=library.int64), library.zeros((2, scenario.n_users, 2)))
     books.add(worlds.state, outcome)
     second = library.asarray([False, True])
@@ -371,7 +371,7 @@ def test_validation_flies_what_is_exported():
     scenario = tiny()
     training = trained(population(scenario, *mixed(scenario)))
     seeds = range(1_000_000, 1_000_008)
-    missions = fly_greedily(training, seeds)
+    missions = roll_out_greedily(training, seeds)
     made = training.population
     shapes = [architecture(made, one) for one in made.runs]
     for i, one in enumerate(made.runs):
@@ -386,7 +386,7 @@ def test_validation_flies_what_is_exported():
         if one.environment is not None:
             drawn = np.random.default_rng(one.environment).random((scenario.n_users, 2))
             layouts = [drawn.astype(np.float32)]
-        alone = fly(own, act, seeds, layouts=layouts)
+        alone = roll_out(own, act, seeds, layouts=layouts)
         np.testing.assert_array_equal(missions.users_collected[i], alone.users_collected[0])
         np.testing.assert_array_equal(missions.landed[i], alone.landed[0])
         np.testing.assert_allclose(missions.reward[i], alone.reward[0], rtol=1e-6)
@@ -396,7 +396,7 @@ def test_validation_flies_what_is_exported():
 def test_the_score_counts_users_brought_home():
     scenario = tiny()
     training = trained(population(scenario, *mixed(scenario)))
-    missions = fly_greedily(training, VALIDATION_SEEDS)
+    missions = roll_out_greedily(training, VALIDATION_SEEDS)
     brought = [
         np.mean([n if landed else 0 for n, landed in zip(*both, strict=True)])
         for both in zip(missions.users_collected, missions.landed, strict=True)
@@ -437,7 +437,7 @@ def test_nothing_is_chosen_on_the_missions_that_judge():
 def test_a_report_looks_back_on_the_latest_episodes():
     scenario = tiny()
     training = trained(population(scenario, run(scenario, 0, episodes=23), run(scenario, 1, episodes=23)))
-    report = Report.of(training, 1.5)
+    report = ProgressReport.of(training, 1.5)
     assert (report.episode, report.score) == (23, 1.5)
     for name, value in {
         "episode_return": report.mean_return,

@@ -25,7 +25,7 @@ from tests.support.fake_autopilot.flight import Fake, fake
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import Crowd
+from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.env.registration import ENV_ID
 
 STEPS = 7  # of the low world's missions
@@ -130,7 +130,7 @@ def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) 
     assert phases[5:-2] == ["moving", "ready"] * (steps - 1) + ["moving"]
     assert phases[-2:] == ["landing", "landed"]
     assert all(p["reason"] for t, p in bag if t == "/mission")
-    crowd = Crowd(scenario, 3)
+    crowd = WalkingUsers(scenario, 3)
     users = {p["step"]: p for t, p in bag if t == "/users"}
     assert users.keys() == set(range(steps + 1))
     for step in range(steps + 1):

@@ -21,7 +21,7 @@ from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address
-from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Wish
 
 DATUM = Geodetic(latitude_deg=47.4, longitude_deg=8.5, altitude_m=400.0)
@@ -296,7 +296,7 @@ def test_a_transport_is_closed_whatever_became_of_it(monkeypatch: pytest.MonkeyP
     """Before it was opened, after the link could not be opened at all, and a second time."""
     before = open_files()
     for opened in (False, True):
-        vehicle = Mavlink("tcp:127.0.0.1:1")
+        vehicle = MavlinkVehicle("tcp:127.0.0.1:1")
         with monkeypatch.context() as patch:
             if opened:
                 patch.setattr(Address, "open", refuse_link)

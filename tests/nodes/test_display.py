@@ -9,7 +9,7 @@ from rich.console import Console
 from tests.nodes.test_drawing import MISSION, SCENARIO
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.output import Output
-from uav_dc_ros.runner.console import Display
+from uav_dc_ros.runner.console import MissionConsole
 
 FLIGHT = (
     (Phase.TAKEOFF, "takes off", None),
@@ -27,7 +27,7 @@ FLIGHT = (
 def test_it_prints_what_is_no_daily_work(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(Output, "console", lambda self, file: Console(file=out, width=80))
-    display = Display(SCENARIO, 1)
+    display = MissionConsole(SCENARIO, 1)
     for phase, reason, fault in FLIGHT:
         held = fault is not None
         display.vehicle(msgspec.structs.replace(MISSION, phase=phase, reason=reason, held=held, fault=fault))

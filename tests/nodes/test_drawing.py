@@ -19,7 +19,7 @@ from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
 from uav_dc_ros.nodes.view import markers
 from uav_dc_ros.nodes.view.markers import Scene, UserState
-from uav_dc_ros.nodes.view.path_history import POSES_MAX, Track
+from uav_dc_ros.nodes.view.path_history import POSES_MAX, PathHistory
 
 SCENARIO = scenarios.load("five_clusters")
 U = SCENARIO.n_users
@@ -218,7 +218,7 @@ def test_a_pose_that_is_nowhere_is_refused(bad: float) -> None:
 class Flight:
     """Tells a Track of steps, in the order in which the world publishes them."""
 
-    def __init__(self, track: Track) -> None:
+    def __init__(self, track: PathHistory) -> None:
         self.track, self.clock_ns = track, 0
 
     def published_ns(self) -> int:
@@ -246,7 +246,7 @@ class Flight:
 
 def test_a_new_mission_starts_a_new_path_whatever_the_order_of_topics() -> None:
     """All poses of a turn come before all users of it."""
-    flight = Flight(Track(SCENARIO))
+    flight = Flight(PathHistory(SCENARIO))
     turns = [(0, step) for step in range(61)] + [(1, step) for step in range(5)]
     calls = [flight.step(*turn, heard=("pose", "users")) for turn in turns]
     for pose, _ in calls:
@@ -258,7 +258,7 @@ def test_a_new_mission_starts_a_new_path_whatever_the_order_of_topics() -> None:
 
 def test_what_is_flown_between_two_missions_belongs_to_none() -> None:
     """An aircraft tells its pose all the time."""
-    flight = Flight(Track(SCENARIO))
+    flight = Flight(PathHistory(SCENARIO))
     for call in flight.step(0, 60):
         call()
     between = cdr.Pose(serialize_message(pose_message(np.array([9.0, 9.0, 100.0]), 61 * STEP_NS - 1)))
@@ -269,7 +269,7 @@ def test_what_is_flown_between_two_missions_belongs_to_none() -> None:
 
 
 def test_a_step_that_is_repeated_is_one_pose() -> None:
-    flight = Flight(Track(SCENARIO))
+    flight = Flight(PathHistory(SCENARIO))
     for step in (0, 1, 1, 1, 2):
         for call in flight.step(0, step):
             call()
@@ -277,7 +277,7 @@ def test_a_step_that_is_repeated_is_one_pose() -> None:
 
 
 def test_another_run_of_the_same_mission_starts_a_new_path() -> None:
-    flight = Flight(Track(SCENARIO))
+    flight = Flight(PathHistory(SCENARIO))
     for run in range(2):
         for step in range(8 - run):
             for call in flight.step(0, step):
@@ -288,7 +288,7 @@ def test_another_run_of_the_same_mission_starts_a_new_path() -> None:
 @pytest.mark.parametrize("pose_first", [False, True])
 def test_who_joins_late_knows_the_way_by_the_targets(pose_first: bool) -> None:
     """What is latched comes from where it is kept, and may be overtaken by what is said now."""
-    flight = Flight(Track(SCENARIO))
+    flight = Flight(PathHistory(SCENARIO))
     missed = [(0, 59), (0, 60), (1, 0), (1, 1), (1, 2)]
     latched = [call for step in missed for call in flight.step(*step, heard=("target",))]
     now = [call for step in [(1, 3), (1, 4)] for call in flight.step(*step)]
@@ -298,7 +298,7 @@ def test_who_joins_late_knows_the_way_by_the_targets(pose_first: bool) -> None:
 
 
 def test_who_joins_after_the_end_sees_where_it_ended() -> None:
-    flight = Flight(Track(SCENARIO))
+    flight = Flight(PathHistory(SCENARIO))
     for step in (0, 1, 2):
         for call in flight.step(0, step, heard=("target", "users")):
             call()
@@ -314,7 +314,7 @@ def real_poses(seconds: float, mps: float, *, from_s: float = 0.0) -> Any:
 
 def test_the_way_of_a_real_vehicle_is_thinned() -> None:
     """A pose each five metres, or two seconds; and the newest one is known to the last."""
-    track = Track(SCENARIO)
+    track = PathHistory(SCENARIO)
     poses = list(real_poses(60.0, 10.0))
     for i, pose in enumerate(poses):
         track.pose(pose, i)
@@ -330,7 +330,7 @@ def test_the_way_of_a_real_vehicle_is_thinned() -> None:
 
 def test_a_way_of_any_length_stays_small() -> None:
     """Ten hours of poses: from its beginning to its end, at most so many."""
-    track = Track(SCENARIO)
+    track = PathHistory(SCENARIO)
     most = 0
     for i in range(36_000 * 2):
         place_m = np.array([i * 5.0, 0.0, 100.0])

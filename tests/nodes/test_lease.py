@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import Ros, finish
 from tests.support.fake_autopilot.mavros_flight import node_in, spin
-from uav_dc_ros.nodes.ros.liveliness import CONFIRMED_S, Confirmed, Lease
+from uav_dc_ros.nodes.ros.liveliness import CONFIRMED_S, Confirmed, LivelinessMonitor
 from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.02
@@ -39,7 +39,10 @@ def test_liveliness_that_comes_back_at_once_was_not_lost() -> None:
 
 
 def test_a_policy_that_was_killed_is_missed_and_one_that_was_held_up_is_not(ros: Ros) -> None:
-    with node_in(ros) as (node, executor), contextlib.closing(Lease(node, TOPICS["move"])) as lease:
+    with (
+        node_in(ros) as (node, executor),
+        contextlib.closing(LivelinessMonitor(node, TOPICS["move"])) as lease,
+    ):
         policy = ros.start("uav_dc_ros.nodes.policy")
         try:
             end_s = time.monotonic() + 60.0
@@ -75,7 +78,10 @@ def test_a_busy_computer_is_no_dead_policy(ros: Ros) -> None:
         subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(8 * (os.cpu_count() or 1))
     ]
     try:
-        with node_in(ros) as (node, executor), contextlib.closing(Lease(node, TOPICS["move"])) as lease:
+        with (
+            node_in(ros) as (node, executor),
+            contextlib.closing(LivelinessMonitor(node, TOPICS["move"])) as lease,
+        ):
             policy = ros.start("uav_dc_ros.nodes.policy")
             times = []
             try:

@@ -13,10 +13,10 @@ from tests.support.fake_autopilot.mavros_flight import START, Fake, Flight, fake
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
-from uav_dc_ros.nodes.vehicles.mavros import Mavros
+from uav_dc_ros.nodes.vehicles.mavros import MavrosVehicle
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.fault_detector import Settings
-from uav_dc_ros.offboard.mission.geofence import Fence
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
+from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.setpoint_stream import LIFE_S
 from uav_dc_ros.offboard.vehicle import Telemetry
 
@@ -25,7 +25,10 @@ ORIGIN = Enu(27.0, -11.0, -3.0)  # of that frame, in the grid's
 
 
 def until(
-    executor: DirectExecutor, vehicle: Mavros, right: Callable[[Telemetry], bool], seconds: float = 90.0
+    executor: DirectExecutor,
+    vehicle: MavrosVehicle,
+    right: Callable[[Telemetry], bool],
+    seconds: float = 90.0,
 ) -> Telemetry:
     """Hear until something is so."""
     end = time.monotonic() + seconds
@@ -35,7 +38,7 @@ def until(
     return known
 
 
-def check_setpoints(mavros: Fake, fence: Fence, yaw_deg: float) -> None:
+def check_setpoints(mavros: Fake, fence: Geofence, yaw_deg: float) -> None:
     """All that was heard lay in the fence, in the frame `map`, and turned nobody round."""
     heard = mavros.all("setpoint")
     assert heard
@@ -52,7 +55,7 @@ def test_px4_flies_a_mission_that_a_pilot_starts_and_lands(ros: Ros) -> None:
         node_in(ros) as (node, executor),
         mavros_of(node) as vehicle,
     ):
-        flight = Flight(executor, vehicle, mavros, Settings())
+        flight = Flight(executor, vehicle, mavros, SafetySettings())
         bridge = flight.bridge
         flight.until(lambda: bridge.phase is Phase.PREFLIGHT)
         assert vehicle.kind == "PX4"
@@ -81,7 +84,7 @@ def test_ardupilot_is_taken_off_by_a_pilot_resumed_after_a_restart_and_taken_ove
         node_in(ros) as (node, executor),
         mavros_of(node) as vehicle,
     ):
-        flight = Flight(executor, vehicle, mavros, Settings())
+        flight = Flight(executor, vehicle, mavros, SafetySettings())
         flight.until(lambda: flight.bridge.phase is Phase.PREFLIGHT)
         mavros.do("arm")
         for _ in range(5):
@@ -95,7 +98,7 @@ def test_ardupilot_is_taken_off_by_a_pilot_resumed_after_a_restart_and_taken_ove
         vehicle.close()
 
         with mavros_of(node, anchor=anchor) as after:
-            resumed = Flight(executor, after, mavros, Settings(), standing=standing)
+            resumed = Flight(executor, after, mavros, SafetySettings(), standing=standing)
             resumed.until(lambda: resumed.bridge.phase is Phase.MOVING)
             assert after.anchor == anchor
             assert Phase.PREFLIGHT not in [phase for phase, _, _ in resumed.log]
@@ -222,4 +225,4 @@ def test_to_arm_it_needs_mavros_msgs(ros: Ros) -> None:
         node_in(ros) as (node, _),
         pytest.raises(VehicleError, match="arming through MAVROS needs the package"),
     ):
-        Mavros(node, place=START, arms=True)
+        MavrosVehicle(node, place=START, arms=True)

@@ -23,10 +23,10 @@ from tests.support.fake_autopilot.mavros_flight import SCENARIO, START, way_home
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros import convert
 from uav_dc_ros.nodes.vehicles import mavros
-from uav_dc_ros.nodes.vehicles.mavros import Mavros
+from uav_dc_ros.nodes.vehicles.mavros import MavrosVehicle
 from uav_dc_ros.offboard.frames import Enu, Ned, to_enu, to_ned
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 
 STANDS = Enu(-7.0, 11.0, 3.0)
 READY_S = 5.0
@@ -167,10 +167,12 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(mavros, "time", clock)
     monkeypatch.setattr(mavros, "Stream", Direct)
     monkeypatch.setattr(mavros.mavros_messages, "load", lambda needed_for: PACKAGE)
-    vehicle = Mavros(node, place=START, arms=True)  # type: ignore[arg-type]
+    vehicle = MavrosVehicle(node, place=START, arms=True)  # type: ignore[arg-type]
     vehicle.open()
     log: list[tuple[Phase, str]] = []
-    bridge = Bridge(SCENARIO, Settings(arm=True), lambda: log.append((bridge.phase, bridge.reason)))
+    bridge = MissionController(
+        SCENARIO, SafetySettings(arm=True), lambda: log.append((bridge.phase, bridge.reason))
+    )
     cells, refusals = [], set()
     while not bridge.is_over:
         assert clock.now_s < 1400.0, log[-5:]

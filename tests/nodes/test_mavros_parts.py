@@ -23,10 +23,10 @@ from uav_dc_ros.nodes.vehicles.mavros_commands import ASK_AGAIN_S, Commands
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.offboard.mavros.diagnostics import OTHERS_S
-from uav_dc_ros.offboard.mavros.telemetry import Hearing
+from uav_dc_ros.offboard.mavros.telemetry import MavrosTelemetry
 from uav_dc_ros.offboard.mavros.vehicle_time import PATIENCE_S, VehicleTime
-from uav_dc_ros.offboard.mission.fault_detector import Settings, Watch
-from uav_dc_ros.offboard.setpoint_stream import LIFE_S, Stream
+from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
+from uav_dc_ros.offboard.setpoint_stream import LIFE_S, SetpointStream
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
 
 PLACE = Enu(20.0, 0.0, 0.0)
@@ -35,7 +35,7 @@ HEALTHY = (1 << 21) | (1 << 25) | (1 << 28)  # estimate, battery, would arm
 
 
 def heartbeat(
-    hearing: Hearing,
+    hearing: MavrosTelemetry,
     beats: int,
     mode: str = "POSCTL",
     state: str = "Standby",
@@ -60,9 +60,9 @@ def heartbeat(
     hearing.diagnostics.on_status(f"{node}: System", LINK, system, now_s)
 
 
-def met(kind: str = "PX4 Autopilot", **how: Any) -> Hearing:
+def met(kind: str = "PX4 Autopilot", **how: Any) -> MavrosTelemetry:
     """A vehicle that stands on the ground at 5, 6, 7 of MAVROS's frame, is well, and was listened to."""
-    hearing = Hearing(PLACE, **how)
+    hearing = MavrosTelemetry(PLACE, **how)
     for beats in (1, 2, 3):
         heartbeat(hearing, beats, kind=kind)
     hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 100.0, 1.0)
@@ -84,7 +84,7 @@ def test_the_first_pose_on_the_ground_is_the_place_and_both_ways_agree() -> None
 
 def test_in_the_air_or_without_an_estimate_nothing_is_the_place() -> None:
     for state, health in [("Active", HEALTHY), ("Critical", HEALTHY), ("Standby", 1 << 28)]:
-        hearing = Hearing(PLACE)
+        hearing = MavrosTelemetry(PLACE)
         for beats in (1, 2, 3):
             heartbeat(hearing, beats, "OFFBOARD", state, health=health)
         hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 100.0, 1.0)
@@ -96,7 +96,7 @@ def test_in_the_air_or_without_an_estimate_nothing_is_the_place() -> None:
 
 def test_an_anchor_needs_no_ground() -> None:
     anchor = "15.1,-6.0,-7.000000000000001"
-    hearing = Hearing(PLACE, anchor=anchor)
+    hearing = MavrosTelemetry(PLACE, anchor=anchor)
     assert ",".join(map(repr, hearing.origin or ())) == anchor
     for beats in (1, 2, 3):
         heartbeat(hearing, beats, "OFFBOARD", "Active")
@@ -107,7 +107,7 @@ def test_an_anchor_needs_no_ground() -> None:
     assert (known.armed, known.on_ground, hearing.may_steer) == (True, False, True)
     for wrong in ("1,2", "1,2,nan", "1,2,3,4", "here"):
         with pytest.raises(VehicleError, match=r"^anchor of MAVROS: .*; expected EAST,NORTH,UP"):
-            Hearing(PLACE, anchor=wrong)
+            MavrosTelemetry(PLACE, anchor=wrong)
 
 
 def test_with_a_datum_the_fix_says_where_it_stands_across_and_the_ground_how_high() -> None:
@@ -194,7 +194,7 @@ def test_two_vehicles_on_one_topic_are_told_and_the_first_is_listened_to() -> No
     assert (known.missing, known.mode_name) == (expected, "POSCTL")
     heartbeat(hearing, 4, now_s=3.0 + OTHERS_S)
     assert hearing.telemetry(3.0 + OTHERS_S).missing is None
-    twins = Hearing(PLACE)
+    twins = MavrosTelemetry(PLACE)
     for beats in range(1, 9):
         heartbeat(twins, beats)
         heartbeat(twins, beats + 1000)
@@ -328,7 +328,7 @@ def estimator(**wrong: bool) -> Message:
     return Message(**{f"{name}_status_flag": flag for name, flag in (flags | wrong).items()})
 
 
-def full(kind: str) -> Hearing:
+def full(kind: str) -> MavrosTelemetry:
     """A vehicle on the ground, with all that mavros_msgs tells."""
     hearing = met(kind, full=True)
     hearing.on_state(Message(connected=True, armed=False, mode="STABILIZE", system_status=3), 1.0)
@@ -405,7 +405,7 @@ def test_with_mavros_msgs_the_estimators_flags_count(wrong: dict[str, bool]) -> 
 @pytest.mark.parametrize("kind", ["PX4 Autopilot", "ArduPilot"])
 def test_with_mavros_msgs_an_estimate_that_a_cut_link_leaves_old_is_not_lost(kind: str) -> None:
     """The link is back: heartbeats come first. What ended while heartbeats came was lost."""
-    watch = Watch(Settings())
+    watch = FaultDetector(SafetySettings())
     hearing = full(kind)
     sys_status = Message(sensors_enabled=1 << 21, sensors_health=0)
 
@@ -571,7 +571,9 @@ def test_the_package_is_found_and_one_of_another_kind_is_refused(monkeypatch: py
 
 def test_the_stream_keeps_its_pace_sends_news_at_once_and_ends_with_those_who_decide() -> None:
     sent: list[tuple[float, str]] = []
-    stream: Stream[str] = Stream(lambda target: sent.append((time.monotonic(), target)), "test")
+    stream: SetpointStream[str] = SetpointStream(
+        lambda target: sent.append((time.monotonic(), target)), "test"
+    )
     stream.start()
     time.sleep(0.2)
     assert not sent
@@ -601,7 +603,7 @@ def test_a_stream_that_broke_is_not_believed_to_live() -> None:
     def send(target: str) -> None:
         raise RuntimeError("no such publisher")
 
-    stream: Stream[str] = Stream(send, "test")
+    stream: SetpointStream[str] = SetpointStream(send, "test")
     stream.start()
     stream.steer("a")
     time.sleep(0.1)

@@ -16,7 +16,7 @@ from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.runner import monitor
-from uav_dc_ros.runner.monitor import ALONE_S, STARTED_S, TELL_S, MissionSoFar, Observer
+from uav_dc_ros.runner.monitor import ALONE_S, STARTED_S, TELL_S, MissionMonitor, MissionProgress
 
 STEPS = 3
 MBIT = 1e6
@@ -60,16 +60,16 @@ class Bench:
     def __init__(self, scenario: Scenario, patch: pytest.MonkeyPatch) -> None:
         self.scenario = scenario
         self.now_s = 1000.0
-        self.ends: list[tuple[MissionSoFar, Phase]] = []
+        self.ends: list[tuple[MissionProgress, Phase]] = []
         self.notes: list[str] = []
         self.publishers: dict[str, list[str]] = {}  # by topic
-        self.nodes: list[Observer] = []
+        self.nodes: list[MissionMonitor] = []
         patch.setattr(monitor.time, "monotonic", lambda: self.now_s)
         patch.setattr(other_publishers, "publishers", lambda node: self.publishers)
 
-    def observer(self, run: str = RUN) -> Observer:
+    def observer(self, run: str = RUN) -> MissionMonitor:
         """One of run_all's, with a vehicle of its own if it was given a run."""
-        node = Observer(
+        node = MissionMonitor(
             *(self.scenario, 0 if run else None, run, ["world", "policy"]),
             ["world", "policy"] if run else ["policy"],
             *(lambda _: None, lambda _: None, lambda now, phase: self.ends.append((now, phase))),
@@ -80,7 +80,7 @@ class Bench:
         node.trigger_activate()
         return node
 
-    def looks(self, node: Observer, seconds: float, *, have_started: bool = True) -> None:
+    def looks(self, node: MissionMonitor, seconds: float, *, have_started: bool = True) -> None:
         """Look for others as often as run_all does."""
         until_s = self.now_s + seconds
         while self.now_s < until_s:

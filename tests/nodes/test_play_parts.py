@@ -15,7 +15,7 @@ from uav_dc_ros.bags.metadata import to_yaml
 from uav_dc_ros.bags.read import RecordedTopic
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.nodes.play import playback_publisher
-from uav_dc_ros.nodes.play.clock import PlayClock
+from uav_dc_ros.nodes.play.clock import PlaybackClock
 from uav_dc_ros.nodes.ros import recorded_qos
 
 S = 10**9
@@ -33,7 +33,7 @@ class Steady:
 
 def test_time_runs_by_the_rate_and_stands_still_in_a_pause() -> None:
     now = Steady()
-    clock = PlayClock(2.0, now=now)
+    clock = PlaybackClock(2.0, now=now)
     clock.jump(10 * S)
     clock.limit_ns = 100 * S
     assert clock.due_s(14 * S) == 102.0
@@ -52,7 +52,7 @@ def test_time_runs_by_the_rate_and_stands_still_in_a_pause() -> None:
 def test_time_does_not_run_ahead_of_what_is_played() -> None:
     """A player that cannot keep up is as slow as it is: a lower rate holds from where it is."""
     now = Steady()
-    clock = PlayClock(1000.0, now=now)
+    clock = PlaybackClock(1000.0, now=now)
     clock.limit_ns = 5 * S
     now.s += 1.0
     assert clock.position_ns() == 5 * S
@@ -61,7 +61,7 @@ def test_time_does_not_run_ahead_of_what_is_played() -> None:
 
 
 def test_a_step_and_a_bag_without_schedule_carry_the_time_along() -> None:
-    for clock in (PlayClock(1.0, paused=True), PlayClock(math.inf)):
+    for clock in (PlaybackClock(1.0, paused=True), PlaybackClock(math.inf)):
         clock.jump(1 * S)
         clock.limit_ns = 7 * S
         clock.played(7 * S)
@@ -70,7 +70,7 @@ def test_a_step_and_a_bag_without_schedule_carry_the_time_along() -> None:
 
 def test_what_had_to_be_waited_for_delays_the_rest() -> None:
     now = Steady()
-    clock = PlayClock(1.0, now=now)
+    clock = PlaybackClock(1.0, now=now)
     clock.hold(4.0)
     assert clock.due_s(1 * S) == 105.0
 

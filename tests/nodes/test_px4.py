@@ -29,10 +29,10 @@ from uav_dc_ros.nodes.ros import fastdds
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.nodes.vehicles import px4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned, to_enu
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.px4 import telemetry
-from uav_dc_ros.offboard.px4.telemetry import Px4Hearing
+from uav_dc_ros.offboard.px4.telemetry import Px4Telemetry
 from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
 
@@ -121,9 +121,9 @@ def spun(domain: Ros) -> Iterator[Spun]:
 
 
 @pytest.fixture
-def vehicle(spun: Spun) -> Iterator[px4.Px4]:
+def vehicle(spun: Spun) -> Iterator[px4.Px4Vehicle]:
     """The transport, on a node of its own, open."""
-    made = px4.Px4(spun.node("bridge"), place=PLACE)
+    made = px4.Px4Vehicle(spun.node("bridge"), place=PLACE)
     made.open()
     yield made
     made.close()
@@ -202,9 +202,9 @@ def position(msg: Any, ned: Ned, reference: Geodetic | None = None, **more: Any)
     return message
 
 
-def standing(msg: Any, ned: Ned = START, **more: Any) -> Px4Hearing:
+def standing(msg: Any, ned: Ned = START, **more: Any) -> Px4Telemetry:
     """What is known of a vehicle that stands on the ground and told where."""
-    hearing = Px4Hearing(place=more.pop("place", PLACE), **more)
+    hearing = Px4Telemetry(place=more.pop("place", PLACE), **more)
     hearing.on_vehicle_status(status(msg), 0.0)
     hearing.on_vehicle_land_detected(msg.VehicleLandDetected(landed=True), 0.0)
     hearing.on_vehicle_local_position(position(msg, ned), 0.0)
@@ -219,7 +219,7 @@ def test_without_px4_msgs_one_line_says_what_to_install(monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "px4_msgs", None)
     node: Any = None
     with pytest.raises(VehicleError, match="needs the ROS package px4_msgs") as told:
-        px4.Px4(node, place=PLACE)
+        px4.Px4Vehicle(node, place=PLACE)
     assert str(told.value).endswith("its workspace sourced: https://github.com/PX4/px4_msgs")
     assert "\n" not in str(told.value)
 
@@ -236,7 +236,7 @@ def test_a_topic_has_the_version_of_its_messages(version: int | None, name: str)
     assert px4.versioned("t", kind) == name
 
 
-def test_topics_and_their_qos(vehicle: px4.Px4, spun: Spun) -> None:
+def test_topics_and_their_qos(vehicle: px4.Px4Vehicle, spun: Spun) -> None:
     node, space = spun.nodes[0], spun.namespace
     own = f"{space}/fmu/"
     names = {name.removeprefix(own) for name, _ in node.get_topic_names_and_types() if name.startswith(own)}
@@ -293,7 +293,7 @@ def test_where_it_is_comes_from_ned(msg: Any) -> None:
     assert hearing.telemetry().position == Enu(120.0, 210.0, 30.0)
 
 
-def test_a_setpoint_goes_out_in_ned(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+def test_a_setpoint_goes_out_in_ned(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     goal = Enu(20.0, 10.0, 30.0)
     spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(goal)))
     setpoint, heartbeat = hand.setpoints[-1][1], hand.heartbeats[-1][1]
@@ -326,7 +326,7 @@ def test_the_grid_has_a_datum_once_px4_knows_the_earth(msg: Any) -> None:
 def test_a_bridge_that_comes_back_in_the_air_has_the_same_grid(msg: Any, reference: Geodetic | None) -> None:
     hearing = standing(msg, place=Enu(100.0, 0.0, 0.0))
     hearing.on_vehicle_local_position(position(msg, START, reference), 1.0)
-    again = Px4Hearing(place=Enu(100.0, 0.0, 0.0), anchor=hearing.anchor)
+    again = Px4Telemetry(place=Enu(100.0, 0.0, 0.0), anchor=hearing.anchor)
     for each in (hearing, again):
         each.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 2.0)
         each.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
@@ -339,7 +339,7 @@ def test_a_bridge_that_comes_back_in_the_air_has_the_same_grid(msg: Any, referen
 @pytest.mark.parametrize("anchor", ["local:", "local:1,2", "local:1,2,nan", "local:a,b,c", "47,8"])
 def test_an_anchor_that_is_none(anchor: str) -> None:
     with pytest.raises(VehicleError, match="expected"):
-        Px4Hearing(place=PLACE, anchor=anchor)
+        Px4Telemetry(place=PLACE, anchor=anchor)
 
 
 def test_a_grid_with_a_datum_needs_a_px4_that_knows_the_earth(msg: Any) -> None:
@@ -359,7 +359,7 @@ def gaps_s(messages: list[tuple[int, Any]]) -> Any:
     return np.diff([time_ns for time_ns, _ in messages]) / 1e9
 
 
-def test_the_stream_keeps_its_pace(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+def test_the_stream_keeps_its_pace(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     """While positions come at 50 Hz, and the node's own thread is held up now and then."""
     goal = Enu(0.0, 0.0, 50.0)
 
@@ -382,7 +382,9 @@ def test_the_stream_keeps_its_pace(vehicle: px4.Px4, spun: Spun, hand: Hand) -> 
     assert max(gaps) < 0.5, "PX4 wants more than 2 Hz"
 
 
-def test_the_stream_ends_a_second_after_those_who_decide(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+def test_the_stream_ends_a_second_after_those_who_decide(
+    vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand
+) -> None:
     goal = Enu(0.0, 0.0, 50.0)
     spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(goal)))
     vehicle.steer(goal)
@@ -396,7 +398,7 @@ def test_the_stream_ends_a_second_after_those_who_decide(vehicle: px4.Px4, spun:
 
 @pytest.mark.parametrize("gone", ["silence", "xy_valid"])
 def test_the_stream_ends_half_a_second_after_the_last_good_position(
-    vehicle: px4.Px4, spun: Spun, hand: Hand, gone: str
+    vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand, gone: str
 ) -> None:
     goal = Enu(0.0, 0.0, 50.0)
 
@@ -429,13 +431,13 @@ def test_a_position_that_px4_does_not_trust_is_none(msg: Any, bad: dict[str, Any
     hearing.on_vehicle_local_position(position(msg, Ned(9.0, 9.0, 9.0), **bad), 1.0)
     known = hearing.telemetry()
     assert (known.estimate_ok, known.position, known.position_s) == (False, PLACE, 0.0)
-    never = Px4Hearing(place=PLACE)
+    never = Px4Telemetry(place=PLACE)
     never.on_vehicle_status(status(msg), 0.0)
     never.on_vehicle_local_position(position(msg, START, **bad), 1.0)
     assert never.telemetry().missing == "PX4 has no estimate of its position yet"
 
 
-def test_no_setpoint_no_stream(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+def test_no_setpoint_no_stream(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(Enu(0.0, 0.0, 50.0))))
     vehicle.steer(None)
     spun.pass_time(0.1, hand.say)
@@ -446,7 +448,7 @@ def test_no_setpoint_no_stream(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None
     vehicle.close()
 
 
-def test_another_bridge_is_seen(vehicle: px4.Px4, spun: Spun, hand: Hand, msg: Any) -> None:
+def test_another_bridge_is_seen(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand, msg: Any) -> None:
     spun.until(lambda: vehicle.kind == "PX4", hand.say)
     assert vehicle.telemetry().other_controller is None
     topic = f"{spun.namespace}/fmu/in/trajectory_setpoint"
@@ -456,7 +458,7 @@ def test_another_bridge_is_seen(vehicle: px4.Px4, spun: Spun, hand: Hand, msg: A
     assert other is not None
 
 
-def test_a_stream_that_broke_is_not_believed_to_live(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+def test_a_stream_that_broke_is_not_believed_to_live(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     def broken(message: Any) -> None:
         raise RuntimeError("no such publisher")
 
@@ -467,7 +469,9 @@ def test_a_stream_that_broke_is_not_believed_to_live(vehicle: px4.Px4, spun: Spu
             spun.pass_time(20.0, lambda: (hand.say(), vehicle.steer(Enu(0.0, 0.0, 50.0))))
 
 
-def test_a_vehicle_whose_time_is_faster_gets_more_of_it(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+def test_a_vehicle_whose_time_is_faster_gets_more_of_it(
+    vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand
+) -> None:
     stamps = iter(range(1, 10**9, 200_000))  # 0.2 s each, every 20 ms: a simulation that is ten times faster
 
     def say() -> None:
@@ -489,7 +493,7 @@ def test_a_vehicle_whose_time_is_faster_gets_more_of_it(vehicle: px4.Px4, spun: 
 # Commands and answers.
 
 
-def test_wishes_as_commands(vehicle: px4.Px4, spun: Spun, hand: Hand) -> None:
+def test_wishes_as_commands(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     for wish in (Arm(), SetMode(Mode.LAND)):
         vehicle.ask(wish)  # nobody is there yet: to be forgotten, not kept
     spun.until(lambda: vehicle.kind == "PX4", hand.say)
@@ -538,7 +542,7 @@ def test_a_refusal_is_told_until_it_is_granted(msg: Any) -> None:
 
 
 def test_modes_and_failsafe(msg: Any) -> None:
-    hearing = Px4Hearing(place=PLACE)
+    hearing = Px4Telemetry(place=PLACE)
     assert hearing.telemetry() == Telemetry(missing="PX4 has no estimate of its position yet")
     for state, failsafe, mode, name in (
         (14, False, Mode.COMMANDED, "OFFBOARD"),
@@ -554,7 +558,7 @@ def test_modes_and_failsafe(msg: Any) -> None:
 
 
 def test_the_emptiest_battery_counts(msg: Any) -> None:
-    hearing = Px4Hearing(place=PLACE)
+    hearing = Px4Telemetry(place=PLACE)
     for number, connected, remaining, told in (
         (1, True, 0.75, 0.75),
         (2, True, 0.5, 0.5),
@@ -567,7 +571,7 @@ def test_the_emptiest_battery_counts(msg: Any) -> None:
 
 
 def test_a_battery_tells_its_voltage_and_what_px4_thinks_of_it(msg: Any) -> None:
-    hearing = Px4Hearing(place=PLACE)
+    hearing = Px4Telemetry(place=PLACE)
     assert (hearing.telemetry().battery_v, hearing.telemetry().battery_fails) == (None, False)
     for warning, fails in ((0, False), (1, True), (3, True)):
         message = msg.BatteryStatus(id=1, connected=True, remaining=0.75, voltage_v=9.0, warning=warning)
@@ -628,7 +632,7 @@ def test_what_is_late_repeated_unstamped_or_of_another_vehicle_is_counted_and_ig
 
 
 def test_time_goes_on_whatever_clock_the_stamps_are_of(msg: Any) -> None:
-    hearing = Px4Hearing(place=PLACE)
+    hearing = Px4Telemetry(place=PLACE)
     agent_us = 1_700_000_000_000_000
     passed = []
     for stamp_us in (
@@ -644,19 +648,19 @@ def test_time_goes_on_whatever_clock_the_stamps_are_of(msg: Any) -> None:
 
 def test_in_the_air_without_a_datum_nobody_knows_where_the_grid_is(msg: Any) -> None:
     for landed in (None, False):  # PX4 1.15 may not tell: then it stands as long as it is disarmed
-        hearing = Px4Hearing(place=PLACE)
+        hearing = Px4Telemetry(place=PLACE)
         hearing.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 0.0)
         if landed is not None:
             hearing.on_vehicle_land_detected(msg.VehicleLandDetected(landed=landed), 0.0)
         hearing.on_vehicle_local_position(position(msg, START), 0.0)
         assert "expected a datum" in str(hearing.telemetry().missing)
-    hearing = Px4Hearing(place=PLACE)
+    hearing = Px4Telemetry(place=PLACE)
     hearing.on_vehicle_status(status(msg), 0.0)
     hearing.on_vehicle_local_position(position(msg, START), 0.0)
     assert (hearing.telemetry().missing, hearing.telemetry().position) == (None, PLACE)
 
 
-def test_px4_msgs_of_another_release_are_named(vehicle: px4.Px4, spun: Spun, msg: Any) -> None:
+def test_px4_msgs_of_another_release_are_named(vehicle: px4.Px4Vehicle, spun: Spun, msg: Any) -> None:
     assert vehicle.telemetry().missing == (
         "nothing came on fmu/out/vehicle_status_v1, fmu/out/vehicle_local_position yet"
     )
@@ -711,8 +715,8 @@ class Flight:
         self.cells: list[tuple[int, int, int]] = []
         scenario = scenarios.load(path)
         self.place = Enu(*scenario.mission.start_m[:2], 0.0)
-        self.bridge = Bridge(scenario, Settings(arm=True), self.note)
-        self.vehicle = px4.Px4(spun.node("bridge"), place=self.place)
+        self.bridge = MissionController(scenario, SafetySettings(arm=True), self.note)
+        self.vehicle = px4.Px4Vehicle(spun.node("bridge"), place=self.place)
         self.vehicle.open()
 
     def note(self) -> None:
@@ -847,8 +851,8 @@ def test_a_bridge_that_is_started_again_in_the_air_goes_on(flight: Flight) -> No
     flight.do("speed 0.2")  # PX4 waits a second of its time, and no more
     standing, anchor, place = flight.bridge.standing, flight.vehicle.anchor, Enu(7.0, 7.0, 7.0)
     flight.vehicle.close()
-    flight.bridge = Bridge(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
-    flight.vehicle = px4.Px4(flight.spun.nodes[0], place=place, anchor=anchor)
+    flight.bridge = MissionController(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
+    flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], place=place, anchor=anchor)
     flight.vehicle.open()
     flight.until(lambda: flight.log[-1][2].startswith("it flies already"))
     flight.spun.pass_time(1.0, flight.tick)  # until PX4 has found the new publishers

@@ -7,7 +7,7 @@ import pytest
 
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
-from uav_dc_ros.nodes.play.subscriber_monitor import Audience
+from uav_dc_ros.nodes.play.subscriber_monitor import SubscriberMonitor
 from uav_dc_ros.topics import TOPICS
 
 OURS = {
@@ -72,7 +72,7 @@ def test_nobody_is_a_rival_on_a_topic_that_this_mission_does_not_have() -> None:
     assert other_publishers.find({"clock": ["/gazebo"]}, "/", NODES)
 
 
-def audience(publishers: dict[str, list[str]], *played: str) -> Audience:
+def audience(publishers: dict[str, list[str]], *played: str) -> SubscriberMonitor:
     """Who is there while topics are played, by what the graph tells: full names of nodes, by topic."""
 
     def ends(topic: str) -> list[Any]:
@@ -81,7 +81,7 @@ def audience(publishers: dict[str, list[str]], *played: str) -> Audience:
 
     node: Any = SimpleNamespace(get_publishers_info_by_topic=ends)
     outlets: Any = [SimpleNamespace(name=topic) for topic in played]
-    return Audience(node, outlets)
+    return SubscriberMonitor(node, outlets)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes.framework.process_control import NodeReport, command
-from uav_dc_ros.runner.supervisor import Supervised, Supervisor
+from uav_dc_ros.runner.supervisor import SupervisedNode, Supervisor
 
 
 class Process:
@@ -31,7 +31,7 @@ def process() -> Process:
 @pytest.fixture
 def turn(process: Process) -> Callable[..., str | None]:
     """A turn of run_all, after the node has reported this."""
-    node = Supervised("policy", {})
+    node = SupervisedNode("policy", {})
     node.begin(process)  # type: ignore[arg-type]
 
     def turn(*report: str, may_activate: bool = True) -> str | None:

@@ -21,7 +21,7 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import Standing
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff
 
 
@@ -41,7 +41,7 @@ def test_a_whole_mission_from_the_ground_to_the_dock() -> None:
 
 
 def test_without_arm_it_waits_for_a_pilot_and_asks_for_nothing() -> None:
-    flight = Flight(Settings())
+    flight = Flight(SafetySettings())
     flight.run(100.0)
     assert flight.vehicle.asked == []
     assert flight.bridge.phase is Phase.PREFLIGHT
@@ -103,7 +103,7 @@ def test_a_pilot_may_take_over_a_vehicle_that_comes_down(mode: Mode) -> None:
 
 
 def test_a_pilot_may_choose_another_way_down() -> None:
-    flight = fly_to_step(5, Settings(arm=True, then=Mode.LAND))
+    flight = fly_to_step(5, SafetySettings(arm=True, then=Mode.LAND))
     flight.vehicle.battery = 0.1
     flight.run(1.0)
     flight.vehicle.asked.clear()
@@ -148,7 +148,7 @@ def test_a_policy_has_its_time_on_the_clock_that_it_lives_by() -> None:
 )
 @pytest.mark.parametrize("then", [Mode.RETURN, Mode.LAND])
 def test_a_fault_that_stays_brings_it_down(fault: dict[str, object], why: str, then: Mode) -> None:
-    flight = fly_to_step(5, Settings(arm=True, then=then))
+    flight = fly_to_step(5, SafetySettings(arm=True, then=then))
     for name, value in fault.items():
         setattr(flight.vehicle, name, value)
     flight.until(Phase.ABORTED, 600.0)
@@ -222,7 +222,7 @@ def test_nobody_takes_off_with_a_low_battery() -> None:
 
 
 def test_a_vehicle_that_was_not_seen_for_a_while_has_not_jumped() -> None:
-    flight = fly_to_step(5, Settings(arm=True, jump_m=1.0, position_age_s=2.0))
+    flight = fly_to_step(5, SafetySettings(arm=True, jump_m=1.0, position_age_s=2.0))
     flight.run(4.0)
     flight.vehicle.frozen = True
     before = flight.vehicle.position
@@ -256,7 +256,7 @@ def test_a_silent_policy_ends_the_mission_after_two_steps() -> None:
 
 def test_a_vehicle_that_flies_already_goes_on_where_it_was() -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
-    flight = Flight(Settings(), vehicle, standing=Standing(step=7, cell=(3, 3, 1), flies=True))
+    flight = Flight(SafetySettings(), vehicle, standing=Standing(step=7, cell=(3, 3, 1), flies=True))
     flight.until(Phase.LANDED)
     assert flight.executed == list(range(7, SCENARIO.mission.max_steps))
 
@@ -317,7 +317,7 @@ def test_a_bridge_that_comes_back_knows_its_battery() -> None:
 
 def test_a_vehicle_that_flies_already_lands_where_that_is_wanted() -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
-    flight = Flight(Settings(flying_at_start="land"), vehicle)
+    flight = Flight(SafetySettings(flying_at_start="land"), vehicle)
     flight.until(Phase.ABORTED)
     assert flight.executed == []
     assert not vehicle.armed

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
 from uav_dc_ros.offboard.limits import ASKED
-from uav_dc_ros.offboard.mavlink.telemetry import Hearing
+from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.vehicle import Limits, Telemetry
 
 HOME = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
@@ -24,7 +24,7 @@ NORTH_MPS = 5.0
 class Radio:
     """Messages of one sender, with their numbers; `hearing` takes them in, at `now_s`."""
 
-    def __init__(self, hearing: Hearing, system: int = 1, component: int = 1) -> None:
+    def __init__(self, hearing: MavlinkTelemetry, system: int = 1, component: int = 1) -> None:
         self.hearing, self.now_s = hearing, 0.0
         self.codec = mav.MAVLink(None, system, component)
 
@@ -50,7 +50,7 @@ class Radio:
 
 def met(autopilot: int = ARDUPILOT, datum: Geodetic | None = HOME) -> Radio:
     """A vehicle that was met, and has told where it counts from."""
-    radio = Radio(Hearing(datum, Enu(0.0, 0.0, 0.0)))
+    radio = Radio(MavlinkTelemetry(datum, Enu(0.0, 0.0, 0.0)))
     radio.heartbeat(autopilot)
     radio.send("gps_global_origin", *HERE)
     return radio
@@ -60,7 +60,7 @@ def met(autopilot: int = ARDUPILOT, datum: Geodetic | None = HOME) -> Radio:
 
 
 def test_only_an_autopilot_is_listened_to() -> None:
-    hearing = Hearing(None, Enu(0.0, 0.0, 0.0))
+    hearing = MavlinkTelemetry(None, Enu(0.0, 0.0, 0.0))
     Radio(hearing, 255, 190).heartbeat(8, 6)  # a ground station
     Radio(hearing, 1, 154).heartbeat(8, 26)  # a gimbal
     assert hearing.system is None
@@ -74,7 +74,7 @@ def test_only_an_autopilot_is_listened_to() -> None:
 
 
 def test_of_two_autopilots_on_a_link_none_is_taken_unless_one_is_named() -> None:
-    hearing = Hearing(None, Enu(0.0, 0.0, 0.0))
+    hearing = MavlinkTelemetry(None, Enu(0.0, 0.0, 0.0))
     other, ours = Radio(hearing, 2), Radio(hearing, 1)
     assert "waiting for its heartbeats, and for those of others" in str(other.heartbeat(PX4_STACK).missing)
     two = "2 autopilots on this link: system 2, PX4; system 1, ArduCopter; expected --system N, one of them"
@@ -93,7 +93,7 @@ def test_of_two_autopilots_on_a_link_none_is_taken_unless_one_is_named() -> None
 
 @pytest.mark.parametrize("first", [1, 2])
 def test_the_vehicle_that_is_named_is_taken_whoever_speaks_first(first: int) -> None:
-    hearing = Hearing(HOME, Enu(0.0, 0.0, 0.0), system=2)
+    hearing = MavlinkTelemetry(HOME, Enu(0.0, 0.0, 0.0), system=2)
     radios = {1: Radio(hearing, 1), 2: Radio(hearing, 2)}
     known = radios[first].heartbeat()
     if first == 1:

@@ -11,8 +11,8 @@ from tests.support.fake_autopilot.simulated import ARMING, SCENARIO, START, Flig
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import Standing
-from uav_dc_ros.offboard.mission.fault_detector import Settings
-from uav_dc_ros.offboard.mission.geofence import Fence
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
+from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.vehicle import Limits, Mode, SetMode, TakeOff, Telemetry
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
@@ -93,9 +93,9 @@ def test_a_bridge_that_was_killed_while_it_landed_judges_where_the_vehicle_stand
         (Limits(fence_floor_m=120.0), ("begins 120 m above home", "100 m", "FENCE_ALT_MIN")),
     ],
 )
-@pytest.mark.parametrize("how", [ARMING, Settings()])
+@pytest.mark.parametrize("how", [ARMING, SafetySettings()])
 def test_a_field_that_the_autopilot_s_fence_does_not_hold_is_refused(
-    limits: Limits, words: tuple[str, ...], how: Settings
+    limits: Limits, words: tuple[str, ...], how: SafetySettings
 ) -> None:
     flight = Flight(how, Vehicle(position=GROUND, limits=limits))
     flight.run(5.0)
@@ -108,7 +108,7 @@ def test_home_counts_where_the_vehicle_stands_now_and_where_it_was_armed() -> No
     limits = Limits(fence_radius_m=1420.0, fence_ceiling_m=205.0)
     flight = Flight(vehicle=Vehicle(position=GROUND, limits=limits, home=Enu(5000.0, 0.0, 0.0)))
     flight.until(Phase.MOVING)
-    flight = Flight(Settings(), Vehicle(position=GROUND, limits=limits))
+    flight = Flight(SafetySettings(), Vehicle(position=GROUND, limits=limits))
     flight.run(2.0)
     flight.vehicle.mode, flight.vehicle.armed = Mode.COMMANDED, True
     flight.vehicle.home = Enu(5000.0, 0.0, 0.0)
@@ -138,7 +138,7 @@ def test_steps_that_the_vehicle_s_speeds_do_not_allow_are_told_before_take_off()
 
 
 def slowly(speed_mps: float, **more: float) -> Flight:
-    flight = Flight(Settings(arm=True, takeoff_s=3000.0, **more))  # type: ignore[arg-type]
+    flight = Flight(SafetySettings(arm=True, takeoff_s=3000.0, **more))  # type: ignore[arg-type]
     flight.vehicle.speeds_mps["across"] = speed_mps
     return flight
 
@@ -167,7 +167,7 @@ def test_a_step_that_ends_at_the_dock_is_flown_to_its_end() -> None:
     scenario = msgspec.structs.replace(
         SCENARIO, mission=msgspec.structs.replace(SCENARIO.mission, episode_end="on_arrival")
     )
-    flight = Flight(Settings(arm=True), scenario=scenario)
+    flight = Flight(SafetySettings(arm=True), scenario=scenario)
     flight.vehicle.speeds_mps["across"] = 4.0
     flight.until(Phase.LANDED)
     assert flight.bridge.step == 20
@@ -231,7 +231,7 @@ def test_a_vehicle_that_does_not_fly_any_more_ends_the_mission_at_once(
 
 
 def test_a_vehicle_that_stands_where_it_should_fly_ends_the_mission_at_once() -> None:
-    flight = fly_to_step(3, Settings(arm=True, sink_limit_m=1000.0))
+    flight = fly_to_step(3, SafetySettings(arm=True, sink_limit_m=1000.0))
     flight.vehicle.stuck = True
     while flight.vehicle.position.up_m > 0.0:
         up_m = max(0.0, flight.vehicle.position.up_m - 1.8)
@@ -242,7 +242,7 @@ def test_a_vehicle_that_stands_where_it_should_fly_ends_the_mission_at_once() ->
 
 
 def test_who_has_come_down_again_after_take_off_is_not_told_to_take_off_anew() -> None:
-    flight = Flight(Settings(arm=True, sink_limit_m=1000.0))
+    flight = Flight(SafetySettings(arm=True, sink_limit_m=1000.0))
     flight.until(Phase.TAKEOFF)
     flight.run(10.0)
     flight.vehicle.asked.clear()
@@ -300,7 +300,7 @@ def test_a_return_that_does_not_come_home_lands(wind_mps: float, reports_home: b
             tell(),
             setattr(vehicle, "told", dataclasses.replace(vehicle.told, home=None)),
         )  # type: ignore[method-assign,assignment,func-returns-value]
-    flight = Flight(Settings(arm=True, fastest_mps=30.0), vehicle)
+    flight = Flight(SafetySettings(arm=True, fastest_mps=30.0), vehicle)
     flight.until(Phase.LANDING)
     begun_s = vehicle.now_s
     flight.until(Phase.ABORTED)
@@ -325,7 +325,7 @@ def test_a_return_that_somebody_else_chose_is_only_watched_and_has_an_end_all_th
 
 @pytest.mark.parametrize("obeys", [True, False])
 def test_a_landing_that_comes_no_lower_has_an_end(obeys: bool) -> None:
-    flight = fly_to_step(5, Settings(arm=True, then=Mode.LAND))
+    flight = fly_to_step(5, SafetySettings(arm=True, then=Mode.LAND))
     flight.vehicle.battery, flight.vehicle.stuck, flight.vehicle.deaf = 0.1, True, not obeys
     flight.until(Phase.ABORTED, 200.0)
     what = "it lands" if obeys else "mode COMMANDED"
@@ -368,7 +368,7 @@ def cut(flight: Flight, seconds: float) -> None:
 @pytest.mark.parametrize("hold_s", [1.0, 1.5, 3.1, 5.0, 8.0])
 @pytest.mark.parametrize("seconds", [9.0, 30.0])
 def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(hold_s: float, seconds: float) -> None:
-    flight = fly_to_step(5, Settings(arm=True, hold_s=hold_s))
+    flight = fly_to_step(5, SafetySettings(arm=True, hold_s=hold_s))
     flight.vehicle.asked.clear()
     cut(flight, seconds)
     flight.until(Phase.ABORTED)
@@ -378,7 +378,7 @@ def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(hold_s: flo
 
 
 def test_a_link_that_comes_back_in_time_is_held_through() -> None:
-    flight = fly_to_step(5, Settings(arm=True, hold_s=20.0))
+    flight = fly_to_step(5, SafetySettings(arm=True, hold_s=20.0))
     cut(flight, 10.0)
     assert (flight.bridge.fault_kind, flight.bridge.reason) == (
         FaultKind.LINK, "link lost: no heartbeat for 3 s",
@@ -419,5 +419,5 @@ def test_telemetry_without_a_position_ends_nothing_by_an_exception() -> None:
 
 @pytest.mark.parametrize("margin_m", [1.0, 20.0, 300.0])
 def test_the_fence_lies_as_far_above_the_grid_as_around_it(margin_m: float) -> None:
-    fence = Fence.around(SCENARIO, margin_m)
+    fence = Geofence.around(SCENARIO, margin_m)
     assert fence.most == Enu(1000.0 + margin_m, 1000.0 + margin_m, 200.0 + margin_m)

@@ -18,8 +18,8 @@ from tests.support.fake_autopilot.flight import ROOT, Fake, fake, free_udp_port
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic
-from uav_dc_ros.offboard.mavlink.connection import Address, LinkDown
-from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.mavlink.connection import Address, ConnectionLost
+from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
 from uav_dc_ros.offboard.send_timer import LIFE_S, Heartbeat
 from uav_dc_ros.offboard.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry
 
@@ -56,7 +56,7 @@ def test_addresses(text: str, expected: Address | None) -> None:
 
 @pytest.mark.parametrize("text", ["tcp:..:5760", f"tcp:{'a' * 300}:5760", "serial:a\0b:57600"])
 def test_a_name_that_nothing_can_have_is_refused_and_not_tried_again(text: str) -> None:
-    with Mavlink(text) as vehicle, pytest.raises(VehicleError, match=r"^connect: .*; expected "):
+    with MavlinkVehicle(text) as vehicle, pytest.raises(VehicleError, match=r"^connect: .*; expected "):
         until(vehicle, lambda known: False)
 
 
@@ -64,13 +64,13 @@ def test_what_cannot_be_opened_now_is_told_and_tried_again(tmp_path: Path) -> No
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
-        with Mavlink(f"udpin:127.0.0.1:{port}") as vehicle:
+        with MavlinkVehicle(f"udpin:127.0.0.1:{port}") as vehicle:
             taken = f"udpin:127.0.0.1:{port} cannot be opened: Address already in use"
             until(vehicle, lambda known: known.missing == taken)
             other.close()
             until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot")
     device = tmp_path / "ttyUSB0"
-    with Mavlink(f"serial:{device}:57600") as vehicle:
+    with MavlinkVehicle(f"serial:{device}:57600") as vehicle:
         until(vehicle, lambda known: "cannot be opened: " in str(known.missing))
         assert "No such file or directory" in str(vehicle.telemetry().missing)
         master, slave = os.openpty()
@@ -118,7 +118,9 @@ def test_a_mode_that_is_asked_for_is_the_one_that_is_understood(dialect: Any) ->
             assert names[number] == f"COPTER_MODE_{name}"
 
 
-def until(vehicle: Mavlink, right: Callable[[Telemetry], bool], setpoint: Enu | None = None) -> Telemetry:
+def until(
+    vehicle: MavlinkVehicle, right: Callable[[Telemetry], bool], setpoint: Enu | None = None
+) -> Telemetry:
     end = time.monotonic() + 90.0
     while not right(known := vehicle.telemetry()):
         assert time.monotonic() < end, known
@@ -127,7 +129,7 @@ def until(vehicle: Mavlink, right: Callable[[Telemetry], bool], setpoint: Enu | 
     return known
 
 
-def hover(autopilot: Fake, vehicle: Mavlink, up_m: float = 10.0) -> Enu:
+def hover(autopilot: Fake, vehicle: MavlinkVehicle, up_m: float = 10.0) -> Enu:
     """Take off; where it is sent to."""
     known = until(vehicle, lambda known: known.missing is None and known.estimate_ok)
     assert known.position is not None
@@ -146,7 +148,7 @@ def hover(autopilot: Fake, vehicle: Mavlink, up_m: float = 10.0) -> Enu:
 def test_where_the_grid_lies_is_what_the_datum_says() -> None:
     with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot:
         corner = HOME.at(Enu(-300.0, -400.0, -8.0))  # the vehicle stands 300 m east and 400 m north of it
-        with Mavlink(autopilot.address, datum=corner) as vehicle:
+        with MavlinkVehicle(autopilot.address, datum=corner) as vehicle:
             known = until(vehicle, lambda known: known.missing is None)
             assert known.position == pytest.approx((300.0, 400.0, 8.0), abs=0.05)
             target = hover(autopilot, vehicle, up_m=30.0)
@@ -161,7 +163,7 @@ def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told
     place = Enu(300.0, 400.0, 0.0)
     with (
         fake("px4", speed=20.0, ready_s=1.0) as autopilot,
-        Mavlink(autopilot.address, place=place) as vehicle,
+        MavlinkVehicle(autopilot.address, place=place) as vehicle,
     ):
         known = until(vehicle, lambda known: known.missing is None)
         # Not exactly: the plane at the grid's corner is no longer level half a kilometre away (0.02 m).
@@ -172,7 +174,10 @@ def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told
 
 
 def test_the_stream_ends_with_those_who_decide() -> None:
-    with fake("px4", ready_s=0.5) as autopilot, Mavlink(autopilot.address) as vehicle:  # it may stand still
+    with (
+        fake("px4", ready_s=0.5) as autopilot,
+        MavlinkVehicle(autopilot.address) as vehicle,
+    ):  # it may stand still
         known = until(vehicle, lambda known: known.missing is None and known.estimate_ok)
         assert known.position is not None
         before = autopilot.report()["setpoints"]
@@ -194,7 +199,7 @@ def test_the_first_heartbeat_goes_out_as_soon_as_somebody_can_hear_it(kind: str)
         autopilot.settimeout(15.0)
         autopilot.bind(("127.0.0.1", 0))
         port = autopilot.getsockname()[1] if kind == "udpout" else free_udp_port()
-        with Mavlink(f"{kind}:127.0.0.1:{port}") as vehicle:
+        with MavlinkVehicle(f"{kind}:127.0.0.1:{port}") as vehicle:
             if kind == "udpin":
                 until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot")
                 autopilot.sendto(b"anything", ("127.0.0.1", port))
@@ -221,7 +226,10 @@ def test_heartbeats_keep_up_with_the_clock_and_with_the_vehicle(speed: float) ->
 
 
 def test_a_simulated_vehicle_that_is_faster_than_the_clock_misses_no_heartbeat() -> None:
-    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+    with (
+        fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot,
+        MavlinkVehicle(autopilot.address) as vehicle,
+    ):
         autopilot.do("param FS_GCS_ENABLE 1")
         target = hover(autopilot, vehicle)
         begun_s = vehicle.telemetry().vehicle_s
@@ -236,7 +244,7 @@ def test_the_autopilot_s_limits_home_and_target_are_read(kind: str) -> None:
     with fake(kind, speed=20.0, ready_s=1.0) as autopilot:
         autopilot.do("param FENCE_ENABLE 1")
         autopilot.do(f"param {fence} 250.0")
-        with Mavlink(autopilot.address, place=place) as vehicle:
+        with MavlinkVehicle(autopilot.address, place=place) as vehicle:
             known = until(vehicle, lambda known: known.missing is None and known.home is not None)
             assert known.system == f"system 1, {'ArduCopter' if kind == 'ardupilot' else 'PX4'}"
             assert known.limits is not None
@@ -259,7 +267,7 @@ def test_parameters_that_a_vehicle_does_not_know_hold_nobody_up() -> None:
         for name, value in (("WP_SPD", 8.5), ("WP_SPD_UP", 2.0), ("WP_SPD_DN", 1.0)):
             autopilot.do(f"param {name} {value}")
         autopilot.wait_for("control")
-        with Mavlink(autopilot.address) as vehicle:
+        with MavlinkVehicle(autopilot.address) as vehicle:
             known = until(vehicle, lambda known: known.missing is None)
             assert known.limits == Limits(speed_mps=8.5, climb_mps=2.0, descent_mps=1.0)
 
@@ -267,14 +275,14 @@ def test_parameters_that_a_vehicle_does_not_know_hold_nobody_up() -> None:
 def test_of_two_vehicles_on_a_link_the_one_that_is_named_is_commanded() -> None:
     with fake("ardupilot", "udp", speed=20.0, ready_s=1.0) as autopilot:
         autopilot.do("second_vehicle 7 px4")
-        with Mavlink(autopilot.address) as vehicle:
+        with MavlinkVehicle(autopilot.address) as vehicle:
             known = until(vehicle, lambda known: "2 autopilots on this link" in str(known.missing))
             assert "system 7, PX4" in str(known.missing)
             assert "expected --system N" in str(known.missing)
-        with Mavlink(autopilot.address, system=1) as vehicle:
+        with MavlinkVehicle(autopilot.address, system=1) as vehicle:
             hover(autopilot, vehicle)
             assert vehicle.telemetry().system == "system 1, ArduCopter"
-        with Mavlink(autopilot.address, system=7) as vehicle:
+        with MavlinkVehicle(autopilot.address, system=7) as vehicle:
             known = until(vehicle, lambda known: known.missing is None)
             assert (known.system, known.armed) == ("system 7, PX4", False)
     assert not [event for event in autopilot.events if event["event"].startswith("second ")]
@@ -285,7 +293,7 @@ def test_on_a_port_that_several_vehicles_send_to_the_right_one_is_answered() -> 
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
         codecs = {system: mav.MAVLink(None, system, 1) for system in (7, 1)}
-        vehicle = stack.enter_context(Mavlink(f"udpin:127.0.0.1:{port}", system=1))
+        vehicle = stack.enter_context(MavlinkVehicle(f"udpin:127.0.0.1:{port}", system=1))
         until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot of system 1")
         heard: list[Any] = []
         ends_s = time.monotonic() + 15.0
@@ -304,7 +312,10 @@ def test_on_a_port_that_several_vehicles_send_to_the_right_one_is_answered() -> 
 
 
 def test_a_second_bridge_is_noticed_and_a_router_s_echo_is_none() -> None:
-    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+    with (
+        fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot,
+        MavlinkVehicle(autopilot.address) as vehicle,
+    ):
         autopilot.do("echo 1")
         target = hover(autopilot, vehicle)
         begun_s = vehicle.telemetry().vehicle_s
@@ -321,7 +332,10 @@ def test_a_second_bridge_is_noticed_and_a_router_s_echo_is_none() -> None:
 
 
 def test_a_take_off_command_that_was_lost_twice_is_followed_when_it_comes() -> None:
-    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+    with (
+        fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot,
+        MavlinkVehicle(autopilot.address) as vehicle,
+    ):
         autopilot.do(f"ignore {mav.MAV_CMD_NAV_TAKEOFF} 2")
         until(vehicle, lambda known: known.missing is None and known.estimate_ok)
         for wish, right in [
@@ -340,15 +354,18 @@ def test_a_take_off_command_that_was_lost_twice_is_followed_when_it_comes() -> N
 def test_a_flying_vehicle_without_a_datum_says_what_to_give() -> None:
     with fake("px4", speed=20.0, ready_s=1.0) as autopilot:
         autopilot.do("fly 10 10 20")
-        with Mavlink(autopilot.address) as vehicle:
+        with MavlinkVehicle(autopilot.address) as vehicle:
             until(vehicle, lambda known: "expected a datum" in str(known.missing))
-        with Mavlink(autopilot.address, datum=HOME) as vehicle:
+        with MavlinkVehicle(autopilot.address, datum=HOME) as vehicle:
             known = until(vehicle, lambda known: known.missing is None)
             assert known.position is not None
 
 
 def test_it_comes_back_to_a_vehicle_that_flies_and_repeats_no_wish() -> None:
-    with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+    with (
+        fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot,
+        MavlinkVehicle(autopilot.address) as vehicle,
+    ):
         target = hover(autopilot, vehicle)
         autopilot.do("drop 0.3")
         until(vehicle, lambda known: (known.heartbeat_s or 0.0) < time.monotonic() - 0.2, target)
@@ -361,7 +378,10 @@ def test_it_comes_back_to_a_vehicle_that_flies_and_repeats_no_wish() -> None:
 
 
 def test_a_vehicle_that_starts_anew_is_asked_again() -> None:
-    with fake("px4", "udp", speed=20.0, ready_s=1.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+    with (
+        fake("px4", "udp", speed=20.0, ready_s=1.0) as autopilot,
+        MavlinkVehicle(autopilot.address) as vehicle,
+    ):
         until(vehicle, lambda known: known.missing is None)
         autopilot.do("reboot")
         autopilot.wait_for("control")
@@ -372,13 +392,16 @@ def test_a_vehicle_that_starts_anew_is_asked_again() -> None:
 def test_px4_tells_its_origin_again_to_a_bridge_that_comes_back() -> None:
     with fake("px4", "udp", speed=20.0, ready_s=0.5) as autopilot:
         for _ in range(2):  # its streams go on meanwhile, and the origin does not change
-            with Mavlink(autopilot.address) as vehicle:
+            with MavlinkVehicle(autopilot.address) as vehicle:
                 until(vehicle, lambda known: known.missing is None and known.estimate_ok)
         assert autopilot.all("armed") == []
 
 
 def test_what_keeps_a_vehicle_on_the_ground_is_told_in_its_own_words() -> None:
-    with fake("ardupilot", speed=20.0, ready_s=30.0) as autopilot, Mavlink(autopilot.address) as vehicle:
+    with (
+        fake("ardupilot", speed=20.0, ready_s=30.0) as autopilot,
+        MavlinkVehicle(autopilot.address) as vehicle,
+    ):
         until(vehicle, lambda known: "has not sent" in str(known.missing))
         waiting = "the autopilot is not ready to arm: PreArm: AHRS: waiting for home"
         autopilot.do("lose", 1)  # the position comes, but nobody trusts it
@@ -388,11 +411,11 @@ def test_what_keeps_a_vehicle_on_the_ground_is_told_in_its_own_words() -> None:
 
 
 def test_a_link_that_cannot_be_opened_says_why() -> None:
-    with pytest.raises(LinkDown, match="does not answer: Connection refused"):
+    with pytest.raises(ConnectionLost, match="does not answer: Connection refused"):
         Address("tcp", "127.0.0.1", free_udp_port()).open()
-    with pytest.raises(LinkDown, match="does not answer: "):
+    with pytest.raises(ConnectionLost, match="does not answer: "):
         Address("tcp", "no-such-host.invalid", 5760).open()
-    with Mavlink(f"tcp:127.0.0.1:{free_udp_port()}") as vehicle:
+    with MavlinkVehicle(f"tcp:127.0.0.1:{free_udp_port()}") as vehicle:
         known = until(vehicle, lambda known: "refused" in str(known.missing))
     assert known.heartbeat_s is None
 
@@ -409,6 +432,6 @@ def test_a_serial_line() -> None:
     assert os.read(master, 10) == b"\x00\xfd\n", "raw: nothing is changed on the way"
     os.close(slave)
     os.close(master)
-    with pytest.raises(LinkDown, match="broke"):
+    with pytest.raises(ConnectionLost, match="broke"):
         link.read()
     link.close()

@@ -17,8 +17,8 @@ from tests.support.fake_autopilot.flight import KINDS
 from tests.support.fake_autopilot.virtual import VirtualFlight, short
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 
 STEPS = list(range(6))
 
@@ -121,7 +121,7 @@ def test_a_short_sag_of_the_voltage_does_nothing(kind: str) -> None:
 
 @pytest.mark.parametrize("speed", [1.0, 8.0, 30.0])
 def test_the_failsafe_for_the_ground_station_stays_calm_at_any_speed_of_the_simulator(speed: float) -> None:
-    flight = VirtualFlight("ardupilot", Settings(arm=True, link_age_s=3.0), speed=speed)
+    flight = VirtualFlight("ardupilot", SafetySettings(arm=True, link_age_s=3.0), speed=speed)
     flight.do("param FS_GCS_ENABLE 1")
     flight.until_over()
     check_landed(flight)
@@ -305,7 +305,7 @@ def test_a_vehicle_in_the_air_without_a_datum_is_refused_at_once(kind: str) -> N
     assert flight.all("command") == []
 
 
-def down_and_up(bridge: Bridge) -> Action:
+def down_and_up(bridge: MissionController) -> Action:
     """Between two layers."""
     return Action.UPWARD if bridge.cell[2] == 0 else Action.DOWNWARD
 

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from tests.support.fake_autopilot.streaming import off_beat_ms
-from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
 from uav_dc_ros.offboard.realtime import run_when_due
 
 AIM_MS = 10.0
@@ -37,7 +37,7 @@ def test_setpoints_keep_their_pace_whoever_wants_the_processor() -> None:
 def test_the_thread_that_streams_runs_when_it_is_due() -> None:
     if not _may():
         pytest.skip("this process may not ask for it")
-    with Mavlink("tcp:127.0.0.1:1") as vehicle:
+    with MavlinkVehicle("tcp:127.0.0.1:1") as vehicle:
         end_s = time.monotonic() + 5.0
         while "refused" not in str(vehicle.telemetry().missing):  # by then it runs
             assert time.monotonic() < end_s

@@ -9,7 +9,7 @@ from tests.support.fake_autopilot.simulated import ARMING, START, Flight, Vehicl
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import Standing
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, Telemetry
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
@@ -108,7 +108,7 @@ def test_before_anything_is_requested_a_pilot_may_choose_any_mode() -> None:
 
 def test_without_arm_modes_on_the_ground_are_the_pilot_s_business() -> None:
     vehicle = Vehicle(position=GROUND, mode=Mode.COMMANDED)
-    flight = Flight(Settings(), vehicle)
+    flight = Flight(SafetySettings(), vehicle)
     for mode in (Mode.OTHER, Mode.COMMANDED, Mode.HOLD, Mode.COMMANDED):
         flight.run(3.0)
         vehicle.mode = mode
@@ -132,8 +132,10 @@ def test_what_a_pilot_took_over_stays_the_pilot_s_after_a_restart_and_a_stop() -
     assert flight.vehicle.asked == []
 
 
-@pytest.mark.parametrize("how", [ARMING, Settings()])
-def test_a_vehicle_that_another_system_commands_is_refused_before_anything_is_sent(how: Settings) -> None:
+@pytest.mark.parametrize("how", [ARMING, SafetySettings()])
+def test_a_vehicle_that_another_system_commands_is_refused_before_anything_is_sent(
+    how: SafetySettings,
+) -> None:
     evidence = "component 191 of system 254 sends heartbeats"
     for vehicle in (
         Vehicle(position=GROUND, other_controller=evidence),
@@ -220,7 +222,7 @@ def test_a_bridge_that_is_stopped_brings_a_vehicle_down_in_every_phase(
 ) -> None:
     vehicle = Vehicle(position=ALOFT, mode=Mode.COMMANDED, armed=True, unplaced=unplaced)
     vehicle.pass_time(0.1, None)
-    flight = Flight(Settings(then=then), vehicle)
+    flight = Flight(SafetySettings(then=then), vehicle)
     for _ in range(ticks):
         flight.tick()
     flight.bridge.stop("the bridge was stopped", vehicle.told)

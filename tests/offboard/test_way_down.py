@@ -9,7 +9,7 @@ from tests.support.fake_autopilot.simulated import ARMING, SCENARIO, START, Flig
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import Standing
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Mode, SetMode
 
 GROUND = Enu(START.east_m, START.north_m, 0.0)
@@ -156,7 +156,7 @@ def test_a_vehicle_without_an_estimate_is_not_told_to_return_when_the_bridge_is_
         flight = fly_to_step(3)
     else:
         vehicle = Vehicle(position=START, mode=Mode.COMMANDED, armed=True)
-        flight = Flight(Settings(), vehicle)
+        flight = Flight(SafetySettings(), vehicle)
     flight.vehicle.estimate_ok = False
     flight.vehicle.refused = (Mode.RETURN,)
     flight.run(1.0)
@@ -190,7 +190,7 @@ def test_a_vehicle_whose_clock_stands_is_asked_again(lost_s: float, mode: Mode) 
 def test_a_vehicle_that_flies_goes_straight_up_or_down_then_across(up_m: float, again: bool) -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, up_m), mode=Mode.COMMANDED, armed=True)
     standing = Standing(step=0, cell=SCENARIO.start_cell, flies=True) if again else None
-    flight = Flight(Settings(), vehicle, standing=standing)
+    flight = Flight(SafetySettings(), vehicle, standing=standing)
     while abs(vehicle.position.up_m - START.up_m) > 3.0:
         assert vehicle.position[:2] == (300.0, 300.0)
         flight.tick()

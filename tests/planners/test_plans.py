@@ -9,7 +9,7 @@ from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.experiments.evaluate.cli import main
-from uav_dc_ros.experiments.evaluate.rollout import flight, fly
+from uav_dc_ros.experiments.evaluate.rollout import flight, roll_out
 from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.planners.plans import ENOUGH, EXACT_TOUR_MAX
 
@@ -20,7 +20,7 @@ SEEDS = range(20)
 @pytest.mark.parametrize("planner", ["nearest", "tour"])
 def test_a_plan_collects_nearly_everyone_and_lands(name, planner):
     scenario = scenarios.load(name)
-    missions = fly(scenario, PLANNERS[planner](scenario), SEEDS)
+    missions = roll_out(scenario, PLANNERS[planner](scenario), SEEDS)
     assert missions.landed.all()
     assert missions.users_collected.mean() > ENOUGH * scenario.n_users
 
@@ -29,7 +29,7 @@ def test_a_plan_collects_nearly_everyone_and_lands(name, planner):
 @pytest.mark.parametrize("max_steps", [20, 21, 27, 40])
 def test_a_plan_is_home_in_time_however_short_that_is(planner, max_steps):
     scenario = changed("five_clusters", mission={"max_steps": max_steps})
-    assert fly(scenario, PLANNERS[planner](scenario), SEEDS).landed.all()
+    assert roll_out(scenario, PLANNERS[planner](scenario), SEEDS).landed.all()
 
 
 def test_the_tour_is_flown_in_the_shortest_order():
@@ -48,12 +48,12 @@ def test_the_tour_is_flown_in_the_shortest_order():
 def test_many_clusters_need_no_search_of_all_orders():
     centres = [[100.0 * i, 100.0 * (i % 3)] for i in range(EXACT_TOUR_MAX + 2)]
     scenario = changed("five_clusters", users={"cluster_centres_m": centres})
-    assert fly(scenario, PLANNERS["tour"](scenario), [0]).landed.all()
+    assert roll_out(scenario, PLANNERS["tour"](scenario), [0]).landed.all()
 
 
 def test_a_cluster_off_the_grid_is_approached_from_its_edge():
     scenario = changed("five_clusters", users={"cluster_centres_m": [[-150.0, 1100.0]]})
-    assert fly(scenario, PLANNERS["nearest"](scenario), [0]).landed.all()
+    assert roll_out(scenario, PLANNERS["nearest"](scenario), [0]).landed.all()
 
 
 def test_random_takes_every_action_and_repeats_itself():

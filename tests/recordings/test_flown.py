@@ -24,7 +24,7 @@ from uav_dc_ros import cdr, messages
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.messages import FaultKind, Phase
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.recordings.info.missions import look_through
 from uav_dc_ros.recordings.pages import missions as pages
 from uav_dc_ros.recordings.pages.vehicle import WAY_MAX, Way
@@ -44,7 +44,7 @@ def bags(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flown")
     made = {name: flights.bag(folder / name, TINY, name, seed=5) for name in flights.FAULTS}
     own = policies.load(saved(folder / "p", TINY, name="own"))
-    told = flights.Flight(TINY, seed=5, policy=own, settings=Settings(arm=True)).fly()
+    told = flights.Flight(TINY, seed=5, policy=own, settings=SafetySettings(arm=True)).fly()
     made["policy"] = write(
         folder / "policy", told, flights.flown_about(TINY, 5, policy="own", policy_sha256=own.sha256)
     )

@@ -18,11 +18,11 @@ from uav_dc_ros.bags.read import BagMessage
 from uav_dc_ros.core import world
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import Crowd
+from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Mode
 
 TICK_S = 0.1  # from one position to the next: ten a second
@@ -60,7 +60,7 @@ class Flight:
         *,
         seed: int = 0,
         beat: Callable[["Flight"], None] = lambda _: None,
-        settings: Settings | None = None,
+        settings: SafetySettings | None = None,
         policy: Policy | None = None,
         patience_s: float = 0.0,
         speed: float = 1.0,
@@ -68,12 +68,12 @@ class Flight:
         begun_ns: int = BEGUN_NS,
     ) -> None:
         self.scenario, self.seed, self.speed, self.tick_s = scenario, seed, speed, tick_s
-        self.settings = settings or Settings(arm=True)
+        self.settings = settings or SafetySettings(arm=True)
         self.told: list[BagMessage] = []
         self.executed: list[int] = []
         x_m, y_m, _ = scenario.mission.start_m
         self.vehicle = Vehicle(position=Enu(x_m, y_m, 0.0))
-        self.bridge: Bridge | None = self._bridge()
+        self.bridge: MissionController | None = self._bridge()
         self._beat, self._policy, self._begun_ns = beat, policy, begun_ns
         self._sent_ns = 0
         self._dead_until_s = 0.0
@@ -82,7 +82,7 @@ class Flight:
         self._last: messages.Mission | None = None
         self._users_due = False
         self._users_of = -1  # step
-        self._crowd = Crowd(scenario, seed)
+        self._crowd = WalkingUsers(scenario, seed)
         self._rates: messages.Rates | None = None
         self._data_bits = np.zeros(scenario.n_users)
         self._collected = np.zeros(scenario.n_users, dtype=bool)
@@ -113,8 +113,8 @@ class Flight:
         """The time of the machine."""
         return self._begun_ns + round(self.vehicle.now_s / self.speed * 1e9)
 
-    def _bridge(self, **standing: object) -> Bridge:
-        return Bridge(self.scenario, self.settings, self._tell, **standing)  # type: ignore[arg-type]
+    def _bridge(self, **standing: object) -> MissionController:
+        return MissionController(self.scenario, self.settings, self._tell, **standing)  # type: ignore[arg-type]
 
     def _tick(self) -> None:
         self._beat(self)
@@ -185,7 +185,7 @@ class Flight:
             self._rates = payloads.rates(link, self._data_bits, self._collected, **at)
         self._say("rates", self._rates)
 
-    def _decide(self, bridge: Bridge) -> None:
+    def _decide(self, bridge: MissionController) -> None:
         """The policy's answer to rates and a vehicle that is ready."""
         rates, status = self._rates, self._last
         if rates is None or status is None or rates.step != bridge.step:
@@ -215,7 +215,7 @@ class Flight:
         return Action(int(self._policy.act(observation)))
 
 
-def way_home(bridge: Bridge) -> Action:
+def way_home(bridge: MissionController) -> Action:
     """A policy: straight to the dock, then hover."""
     (x, y, _), (dock_x, dock_y) = bridge.cell, bridge.scenario.dock_cell
     if x != dock_x:

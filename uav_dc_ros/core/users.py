@@ -7,7 +7,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 
 
-class Crowd:
+class WalkingUsers:
     """Users who walk step by step, drawn in the order of the environment: once to start, once a step.
 
     Args:

@@ -15,7 +15,7 @@ from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env.trajectory import Track
+from uav_dc_ros.env.trajectory import Trajectory
 
 RENDER_MODES = ("rgb_array",)
 ACTIONS_TEXT = ", ".join(f"{action.value} {action.label}" for action in Action)
@@ -75,7 +75,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         self.scenario, self.observation, self.render_mode = checked(scenario, observation, render_mode)
         self.observation_space, self.action_space = spaces_of(self.scenario, self.observation)
         self._state: world.State | None = None
-        self._track = Track(self.scenario)
+        self._track = Trajectory(self.scenario)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -83,7 +83,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         """Starts a mission; `options` are not used."""
         super().reset(seed=seed)
         self._state = world.initial(self.scenario, self._draws())
-        self._track = Track(self.scenario)
+        self._track = Trajectory(self.scenario)
         self._track.add(self._state)
         return observe(self.observation, self.scenario, self._state), info(self.scenario, self._state)
 

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 from uav_dc_ros import files
 from uav_dc_ros.core import mission, radio
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.env.trajectory import Track
+from uav_dc_ros.env.trajectory import Trajectory
 
 INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
 WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
@@ -21,21 +21,21 @@ WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
 PATH_COLOURS = LinearSegmentedColormap.from_list("path", ["#2b3f7e", "#8c5aa6", "#f0a83a"])
 
 
-def picture(track: Track) -> Array:
+def picture(track: Trajectory) -> Array:
     """The mission so far, `[H, W, 3]` uint8."""
     canvas = FigureCanvasAgg(_figure(track, dpi=100))
     canvas.draw()  # type: ignore[no-untyped-call]
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
-def save_picture(track: Track, path: Path) -> None:
+def save_picture(track: Trajectory, path: Path) -> None:
     """Writes the mission so far as an image; the path's ending names the kind, PNG without one."""
     with files.replacing(path) as partial:
         kind = path.suffix.removeprefix(".") or "png"
         FigureCanvasAgg(_figure(track, dpi=150)).figure.savefig(partial, format=kind)
 
 
-def _figure(track: Track, dpi: int) -> Figure:
+def _figure(track: Trajectory, dpi: int) -> Figure:
     figure = Figure(figsize=(7.2, 8.7), dpi=dpi, facecolor=PAPER)
     field, course = figure.add_axes((0.1, 0.235, 0.81, 0.67)), figure.add_axes((0.1, 0.06, 0.81, 0.115))
     _draw_field(field, track)
@@ -50,7 +50,7 @@ def _figure(track: Track, dpi: int) -> Figure:
     return figure
 
 
-def _draw_field(axes: Axes, track: Track) -> None:
+def _draw_field(axes: Axes, track: Trajectory) -> None:
     """The field from above; the path is coloured by step, and a dot grows with the time spent at it."""
     scenario, state = track.scenario, track.state
     assert state is not None, "a picture is made of a mission that has started"
@@ -104,7 +104,7 @@ def _draw_field(axes: Axes, track: Track) -> None:
     _dress(axes)
 
 
-def _draw_course(axes: Axes, track: Track) -> None:
+def _draw_course(axes: Axes, track: Trajectory) -> None:
     """Altitude and users collected over the steps."""
     scenario = track.scenario
     steps = np.arange(len(track.cells))

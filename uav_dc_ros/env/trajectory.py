@@ -7,7 +7,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 
 
-class Track:
+class Trajectory:
     """What a picture needs of one mission, step by step.
 
     Attributes:

@@ -21,14 +21,14 @@ from uav_dc_ros.nodes import vehicles
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
-from uav_dc_ros.nodes.ros.liveliness import Lease
+from uav_dc_ros.nodes.ros.liveliness import LivelinessMonitor
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
-from uav_dc_ros.offboard.mission.geofence import Fence
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
+from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.plausibility import Plausibility
-from uav_dc_ros.offboard.mission.progress import Standing
+from uav_dc_ros.offboard.mission.progress import Checkpoint
 from uav_dc_ros.offboard.realtime import run_when_due
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.topics import TOPICS
@@ -49,7 +49,7 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     fingerprint: str
     seed: int
     run: str
-    standing: Standing
+    standing: Checkpoint
     anchor: str
     system: int | None
 
@@ -66,11 +66,11 @@ class AutopilotBridge(MissionNode):
         """Load the world, and what is left of a mission whose bridge was killed."""
         values = self.values
         self.scenario = scenarios.load(values["scenario"])
-        names = [field.name for field in dataclasses.fields(Settings)]
+        names = [field.name for field in dataclasses.fields(SafetySettings)]
         settings = {name: values[name] for name in names}
-        self.settings = Settings(**settings | {"then": Mode(values["then"])})
+        self.settings = SafetySettings(**settings | {"then": Mode(values["then"])})
         self.journal = Journal(values["journal"])
-        self.fence = Fence.around(self.scenario, values["fence_margin_m"])
+        self.fence = Geofence.around(self.scenario, values["fence_margin_m"])
         vehicles.check(*(values[name] for name in ("vehicle", "connect", "system", "arm")))
         self._restore()
         self._datum()
@@ -83,7 +83,7 @@ class AutopilotBridge(MissionNode):
         system = kept.system if kept is not None and kept.standing.flies else None
         datum = self._datum()
         self.run = self.values["run"] or (self.run if kept is None else kept.run)
-        self.bridge = Bridge(self.scenario, self.settings, self._on_change, standing, self.fence)
+        self.bridge = MissionController(self.scenario, self.settings, self._on_change, standing, self.fence)
         way = self.scenario, datum, anchor, system, kept is not None
         self.vehicle: Vehicle = vehicles.make(self, self.values, *way)
         self._ready_peers: set[str] = set()
@@ -101,7 +101,7 @@ class AutopilotBridge(MissionNode):
         self._grid = ""  # where it lies, as logged last
         self._grid_is_kept, self._is_restarted = False, bool(anchor)
         self._pace_since: tuple[float, float] | None = None  # steady and vehicle time
-        self._policy = Lease(self, TOPICS["move"])
+        self._policy = LivelinessMonitor(self, TOPICS["move"])
         for close in (self._policy.close, self.journal.close, self.vehicle.close):
             self._open.callback(close)
         run_when_due()  # this thread; those of the middleware stay as they are

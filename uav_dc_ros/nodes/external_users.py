@@ -6,14 +6,14 @@ the next pose, so that the monitor measures them from where the vehicle was then
 
 from uav_dc_ros import messages, payloads
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import Crowd
+from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 
 ARRIVED = (Phase.READY, Phase.LANDING, Phase.LANDED, Phase.TIMEOUT, Phase.ABORTED)
 
 
-class Surroundings:
+class ExternalUsers:
     """Says which users are to be published, and when. It needs no journal: seed and step tell all.
 
     Args:
@@ -27,7 +27,7 @@ class Surroundings:
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._scenario, self._seed = scenario, seed
         self.status: messages.Mission | None = None
-        self._crowd: Crowd | None = None
+        self._crowd: WalkingUsers | None = None
         self._crowd_of = -1  # mission
         self._is_due = False
 
@@ -58,7 +58,7 @@ class Surroundings:
         self._is_due = False
         mission, step = self.status.mission, self.status.step
         if self._crowd is None or self._crowd_of != mission or self._crowd.step > step:
-            self._crowd, self._crowd_of = Crowd(self._scenario, self._seed + mission), mission
+            self._crowd, self._crowd_of = WalkingUsers(self._scenario, self._seed + mission), mission
         self._crowd.walk(step - self._crowd.step)
         return payloads.users(
             self._scenario, self._crowd.positions_m, mission=mission, step=step, time_ns=stamp_ns, run=run

@@ -11,7 +11,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
-from uav_dc_ros.nodes.framework.step_synchronizer import StepPairs
+from uav_dc_ros.nodes.framework.step_synchronizer import StepSynchronizer
 
 
 class Policy(MissionNode):
@@ -31,7 +31,7 @@ class Policy(MissionNode):
 
     def activate(self) -> None:
         """Wait for a step that the vehicle is ready for."""
-        self._steps = StepPairs()
+        self._steps = StepSynchronizer()
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Note a step that the vehicle is ready for."""

@@ -14,11 +14,11 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core import pace
 from uav_dc_ros.messages import PAYLOADS
 from uav_dc_ros.nodes.framework import node_main
-from uav_dc_ros.nodes.record.recorder_base import BagNode
+from uav_dc_ros.nodes.record.recorder_base import RecorderBase
 from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 
 
-class Recorder(BagNode):
+class Recorder(RecorderBase):
     """Writes a mission's bag; what it is about (scenario, policy and its hash, seed) goes inside."""
 
     looks_twice = True  # only then is it known whether another mission lives there

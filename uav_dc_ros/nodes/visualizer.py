@@ -14,7 +14,7 @@ from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.view import markers
-from uav_dc_ros.nodes.view.path_history import Track
+from uav_dc_ros.nodes.view.path_history import PathHistory
 from uav_dc_ros.topics import Topic
 
 P = TypeVar("P", bound=messages.Payload)
@@ -43,7 +43,7 @@ class Visualizer(MissionNode):
 
     def activate(self) -> None:
         """Draw from here on."""
-        self._track = Track(self.scenario)
+        self._track = PathHistory(self.scenario)
         self._newest: dict[str, tuple[int, bytes]] = {}  # by topic: time of publication, and the message
         self._changed = False
         self._drawn = -1  # version of the track

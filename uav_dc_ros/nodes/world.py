@@ -25,10 +25,10 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.core.users import Crowd
+from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes.external_users import Surroundings
+from uav_dc_ros.nodes.external_users import ExternalUsers
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
@@ -64,11 +64,11 @@ class World(MissionNode):
         """Load the world, and see whether it can be flown at this pace."""
         self.scenario = scenarios.load(self.values["scenario"])
         self.pace: float | None = self.values["pace"]
-        self.surroundings: Surroundings | None = None
+        self.surroundings: ExternalUsers | None = None
         is_around = self.values["vehicle"] == EXTERNAL
         self.row = WORLD_AROUND if is_around else NODES["world"]
         if is_around:
-            self.surroundings = Surroundings(self.scenario, self.values["seed"])
+            self.surroundings = ExternalUsers(self.scenario, self.values["seed"])
         else:
             pace.check(self.scenario, self.pace, self.values["missions"])
         self.message_bytes = {"users": USER_BYTES * self.scenario.n_users}
@@ -154,7 +154,7 @@ class World(MissionNode):
     def _place(self, mission: int) -> None:
         """Put the vehicle and the users where a mission starts."""
         self._mission, self._step = mission, 0
-        self._crowd = Crowd(self.scenario, self.values["seed"] + mission)
+        self._crowd = WalkingUsers(self.scenario, self.values["seed"] + mission)
         self._cell = np.asarray(self.scenario.start_cell)
         self._phase = Phase.READY
         self._action = None

@@ -24,7 +24,7 @@ MOVED_M = 5.0  # two fixes of one place differ by less
 NO_ALTITUDE = "mavros"  # the vehicle's ground level takes the place of the datum's altitude
 
 
-class Kept(msgspec.Struct, frozen=True, kw_only=True):
+class SavedDatum(msgspec.Struct, frozen=True, kw_only=True):
     """The grid of the last flight in one world.
 
     Attributes:
@@ -61,7 +61,7 @@ def folder() -> Path:
     return Path(given) / "uav_dc_ros" / "datums"
 
 
-def last(scenario: Scenario) -> Kept | None:
+def last(scenario: Scenario) -> SavedDatum | None:
     """The last flight in a scenario's world; None: there was none.
 
     Raises:
@@ -69,7 +69,7 @@ def last(scenario: Scenario) -> Kept | None:
     """
     path = folder() / f"{scenario.fingerprint}.json"
     try:
-        kept = msgspec.json.decode(path.read_bytes(), type=Kept)
+        kept = msgspec.json.decode(path.read_bytes(), type=SavedDatum)
         Geodetic.parse(kept.datum)
     except FileNotFoundError:
         return None
@@ -87,7 +87,7 @@ def keep(scenario: Scenario, datum: Geodetic, vehicle: str) -> None:
         UavDcError: it cannot be written.
     """
     time = datetime.now(UTC).isoformat(timespec="seconds")
-    kept = Kept(scenario=scenario.name, datum=str(datum), vehicle=vehicle, time=time)
+    kept = SavedDatum(scenario=scenario.name, datum=str(datum), vehicle=vehicle, time=time)
     path = folder() / f"{scenario.fingerprint}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

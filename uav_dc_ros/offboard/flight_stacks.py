@@ -22,7 +22,7 @@ ARMABLE = FLYABLE | ACROSS_RELATIVE | PREDICTED_RELATIVE | PREDICTED  # 0x33f
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dialect:
+class FlightStack:
     """One kind of autopilot.
 
     Attributes:
@@ -95,7 +95,7 @@ def px4_mode(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
-ARDUCOPTER = Dialect(
+ARDUCOPTER = FlightStack(
     name="ArduCopter",
     modes={4: Mode.COMMANDED, 5: Mode.HOLD, 17: Mode.HOLD, 6: Mode.RETURN, 21: Mode.RETURN, 9: Mode.LAND},
     names={
@@ -137,7 +137,7 @@ ARDUCOPTER = Dialect(
     earth_radius_m=6_378_100.0,
 )
 
-PX4 = Dialect(
+PX4 = FlightStack(
     name="PX4",
     modes={
         px4_mode(6): Mode.COMMANDED,

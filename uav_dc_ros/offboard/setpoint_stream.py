@@ -11,7 +11,7 @@ from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S, following
 Target = TypeVar("Target")
 
 
-class Stream(Generic[Target]):
+class SetpointStream(Generic[Target]):
     """Calls `send` every `STREAM_S` in a thread of its own, and at once when there is another target.
 
     Args:

@@ -7,7 +7,7 @@ FASTEST = 100.0  # a simulated vehicle's time, times as fast as the clock
 RESYNC_S = 1.0  # without news, after which another order is believed: clocks are set, and vehicles boot
 
 
-class Order:
+class StampOrder:
     """The order of one stream: a message that is late, repeated or of an impossible time is to be ignored.
 
     A sender that never stamps is taken as it comes.

@@ -122,7 +122,7 @@ Wish = SetMode | Arm | TakeOff
 
 
 class Vehicle(Protocol):
-    """A transport: a way to one vehicle. It hears, passes wishes on, streams setpoints, and decides nothing.
+    """A way to one vehicle. It receives, sends commands and streams setpoints. It decides nothing.
 
     It works from `open` to `close`. Its stream is a sign of life of those who decide: it ends a second
     after the last call of `steer`, and then the autopilot's own failsafes take over.

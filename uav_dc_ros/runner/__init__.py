@@ -1,1 +1,1 @@
-"""What run_all consists of: it starts the nodes, follows the missions, stops the nodes and writes the summary."""
+"""What run_all consists of: nodes are started, followed and stopped; a summary is written."""

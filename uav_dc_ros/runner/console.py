@@ -15,13 +15,13 @@ from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.output import Output
 from uav_dc_ros.phases import DECIDED
-from uav_dc_ros.runner.monitor import MissionSoFar
+from uav_dc_ros.runner.monitor import MissionProgress
 
 REFRESH_S = 0.05
 PLAIN_LINES = 6  # of progress a mission, where there is no terminal
 
 
-class Display:
+class MissionConsole:
     """Shows missions while they are flown; a context manager.
 
     Args:
@@ -52,7 +52,7 @@ class Display:
         self._told: Mission | None = None  # what the vehicle did last
         self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, told="")
 
-    def step(self, now: MissionSoFar) -> None:
+    def step(self, now: MissionProgress) -> None:
         """Show a step: on a terminal a few times a second, elsewhere a few lines a mission."""
         shown = now.step % self._every == 0 if self._bar.disable else time.monotonic() >= self._next_s
         if not (shown or now.over or now.step == self.scenario.mission.max_steps):

@@ -25,12 +25,12 @@ from uav_dc_ros.nodes.framework.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.runner import run_options as run_options
-from uav_dc_ros.runner.monitor import MissionSoFar, Observer, summary
+from uav_dc_ros.runner.monitor import MissionMonitor, MissionProgress, summary
 from uav_dc_ros.runner.supervisor import Supervisor
 from uav_dc_ros.topics import SIMULATED
 
 if TYPE_CHECKING:
-    from uav_dc_ros.runner.console import Display
+    from uav_dc_ros.runner.console import MissionConsole
 
 SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
@@ -48,7 +48,7 @@ class Network:
         make: makes the node in a context.
     """
 
-    def __init__(self, namespace: str, make: Callable[[Context], Observer]) -> None:
+    def __init__(self, namespace: str, make: Callable[[Context], MissionMonitor]) -> None:
         self._context = Context()
         self._context.init(["--ros-args", "-r", f"__ns:={namespace}", "-r", "/clock:=clock"])
         self.node = make(self._context)
@@ -73,7 +73,7 @@ class Network:
         self._context.destroy()
 
 
-class Flight:
+class MissionRunner:
     """A run of missions.
 
     Args:
@@ -112,7 +112,7 @@ class Flight:
         self.bag = run_options.new_bag(bag) if "recorder" in self.nodes else None
         if config.summary is not None:
             run_options.check_writable(Path(config.summary), self.bag)
-        self._show, self._display, self._making = show, cast("Display | None", None), threading.Lock()
+        self._show, self._display, self._making = show, cast("MissionConsole | None", None), threading.Lock()
         self.summaries: list[Summary] = []
         self.errors: list[str] = []
         self.interrupted = self._aborted = False
@@ -121,13 +121,13 @@ class Flight:
         self._status: Mission | None = None  # of the vehicle, its last word
 
     @property
-    def display(self) -> "Display":
+    def display(self) -> "MissionConsole":
         """What the user sees; made when it is first needed, since the nodes can start meanwhile."""
         with self._making:
             if self._display is None:
-                from uav_dc_ros.runner.console import Display
+                from uav_dc_ros.runner.console import MissionConsole
 
-                self._display = Display(self.scenario, self.config.missions, show=self._show)
+                self._display = MissionConsole(self.scenario, self.config.missions, show=self._show)
             return self._display
 
     def run(self) -> int:
@@ -169,10 +169,10 @@ class Flight:
         self.display.drain()
         return cli.INTERRUPTED if self.interrupted else status
 
-    def _observer(self, context: Context) -> Observer:
+    def _observer(self, context: Context) -> MissionMonitor:
         """The node that follows the missions."""
         seed = self.config.seed if "world" in self.nodes else None
-        return Observer(
+        return MissionMonitor(
             *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
             *(self._on_status, self._on_step, self._on_end, self._note, context),
         )
@@ -186,7 +186,7 @@ class Flight:
                 f"than it flies in ({flown.name} {flown.fingerprint})"
             )
 
-    def _follow(self, supervisor: Supervisor, node: Observer, executor: DirectExecutor) -> None:
+    def _follow(self, supervisor: Supervisor, node: MissionMonitor, executor: DirectExecutor) -> None:
         """Spin until all missions are over, or Ctrl-C.
 
         Raises:
@@ -210,7 +210,7 @@ class Flight:
                 self._check_patience(node, now_s)
             time.sleep(min(node.rest_s, tick_s))
 
-    def _check_patience(self, node: Observer, now_s: float) -> None:
+    def _check_patience(self, node: MissionMonitor, now_s: float) -> None:
         """Wait for steps that are due, and for nodes that are started here; others may take their time."""
         if not self.is_simulated and self._status is not None:
             return  # the bridge itself sees to it that the mission ends; a pilot may take his time
@@ -241,12 +241,12 @@ class Flight:
             except NodeError as error:
                 self._error(str(error))
 
-    def _account_for_all(self, node: Observer) -> None:
+    def _account_for_all(self, node: MissionMonitor) -> None:
         """Every mission that was to be flown has its end: those without one were aborted."""
         node.close()
         flown = len(self.summaries)
         if flown < self.config.missions:
-            not_begun = MissionSoFar(scenario=self.scenario, mission=flown, seed=self.config.seed + flown)
+            not_begun = MissionProgress(scenario=self.scenario, mission=flown, seed=self.config.seed + flown)
             now = node.mission or not_begun
             now = now if now.mission == flown else not_begun
             status = self._status
@@ -332,11 +332,11 @@ class Flight:
         self._status = status
         self.display.vehicle(status)
 
-    def _on_step(self, mission: MissionSoFar) -> None:
+    def _on_step(self, mission: MissionProgress) -> None:
         self._step_s = time.monotonic()
         self.display.step(mission)
 
-    def _on_end(self, mission: MissionSoFar, outcome: Phase) -> None:
+    def _on_end(self, mission: MissionProgress, outcome: Phase) -> None:
         bag = None if self.bag is None else str(self.bag)
         self._aborted |= outcome is Phase.ABORTED
         if outcome is Phase.ABORTED and not (self._why or self.interrupted):

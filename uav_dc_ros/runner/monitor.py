@@ -16,7 +16,7 @@ from uav_dc_ros.errors import MessageError
 from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
-from uav_dc_ros.nodes.framework.step_synchronizer import StepPairs
+from uav_dc_ros.nodes.framework.step_synchronizer import StepSynchronizer
 
 ALONE_S = 1.0  # nobody else was found for so long, before any node of this mission may begin,
 STARTED_S = 0.5  # and for so long since all nodes of this run_all have started
@@ -26,7 +26,7 @@ TELL_S = 3.0  # both who publishes and for which run are told, if they are known
 
 
 @dataclass(kw_only=True)
-class MissionSoFar:
+class MissionProgress:
     """A mission so far. What few ask for is worked out when it is asked for.
 
     Attributes:
@@ -88,7 +88,7 @@ class MissionSoFar:
         return float(core.total_reward(self.scenario, np.asarray(self.cell), data_bits))
 
 
-class Observer(MissionNode):
+class MissionMonitor(MissionNode):
     """Follows `mission` and `rates`.
 
     Args:
@@ -118,8 +118,8 @@ class Observer(MissionNode):
         peers: list[str],
         here: list[str],
         on_status: Callable[[messages.Mission], None],
-        on_step: Callable[[MissionSoFar], None],
-        on_end: Callable[[MissionSoFar, messages.Phase], None],
+        on_step: Callable[[MissionProgress], None],
+        on_end: Callable[[MissionProgress, messages.Phase], None],
         on_note: Callable[[str], None],
         context: Context | None = None,
     ) -> None:
@@ -128,7 +128,7 @@ class Observer(MissionNode):
         super().__init__("observer", overrides, context)
         self.scenario = scenario
         self.seed = seed
-        self.mission: MissionSoFar | None = None
+        self.mission: MissionProgress | None = None
         self.restarts_of: dict[str, int] = {}
         self.is_alone = False
         self._on_status, self._on_step, self._on_end = on_status, on_step, on_end
@@ -143,7 +143,7 @@ class Observer(MissionNode):
         self._started_s = math.inf  # when all nodes of this run_all had started
         self._found_s: float | None = None  # when another mission was noticed
         self._noted: set[str] = set()  # nodes that publish for nobody of this mission
-        self._steps = StepPairs()
+        self._steps = StepSynchronizer()
         self._position_m: list[float] = []  # before the first step
         self._ended: dict[int, messages.Mission] = {}  # missions that are over, and how, until it is told
         self._ended_s = 0.0  # when the last one was
@@ -240,7 +240,7 @@ class Observer(MissionNode):
         position_m = self.scenario.grid.centre_m(np.asarray(mission.cell), like=np.zeros(1)).tolist()
         if now is None or mission.mission > now.mission:
             self.close(before=mission.mission)
-            now = MissionSoFar(scenario=self.scenario, mission=mission.mission, seed=mission.seed)
+            now = MissionProgress(scenario=self.scenario, mission=mission.mission, seed=mission.seed)
             now.unheard_steps = mission.step
         else:
             now.sum_of_sum_rates_bps += rates.sum_rate_bps
@@ -267,11 +267,11 @@ class Observer(MissionNode):
                 return
             end = self._ended[mission]
             if self.mission is None or self.mission.mission < mission:  # it was over before its first rates
-                self.mission = MissionSoFar(scenario=self.scenario, mission=mission, seed=end.seed)
+                self.mission = MissionProgress(scenario=self.scenario, mission=mission, seed=end.seed)
             self.mission.over = True
             self._tell_end(self.mission, end)
 
-    def _tell_end(self, now: MissionSoFar, end: messages.Mission) -> None:
+    def _tell_end(self, now: MissionProgress, end: messages.Mission) -> None:
         now.hear(end)
         self._told = now.mission
         self._ended.pop(now.mission, None)
@@ -283,7 +283,7 @@ class Observer(MissionNode):
 
 
 def summary(
-    now: MissionSoFar, outcome: messages.Phase, scenario: Scenario, policy: str, bag: str | None
+    now: MissionProgress, outcome: messages.Phase, scenario: Scenario, policy: str, bag: str | None
 ) -> Summary:
     """The mission in numbers."""
     return Summary(

@@ -23,7 +23,7 @@ UP = ("unconfigured", "inactive", "active")  # the way up; each transition leads
 TRANSITIONS = {"unconfigured": CONFIGURE, "inactive": ACTIVATE}
 
 
-class Supervised:
+class SupervisedNode:
     """One node: its process, which others may share, and how far it has come.
 
     Attributes:
@@ -97,7 +97,7 @@ class Supervisor:
         self._namespace = namespace
         self._together, self._folder = together, folder
         self._on_line, self._on_note = on_line, on_note
-        self.nodes = [Supervised(name, values) for name, values in parameters.items()]
+        self.nodes = [SupervisedNode(name, values) for name, values in parameters.items()]
         self.brought_up = False
         self._ticked_s = time.monotonic()
 
@@ -125,7 +125,7 @@ class Supervisor:
         """Has every node started so far that it reports."""
         return all(node.process is not None and bool(node.process.reports) for node in self.nodes)
 
-    def _start(self, nodes: Sequence[Supervised]) -> None:
+    def _start(self, nodes: Sequence[SupervisedNode]) -> None:
         """Start a process of these nodes."""
         parameters = {
             node.row.name: {
@@ -174,7 +174,7 @@ class Supervisor:
             if process.silent_s > patience_s and not process.ended:
                 process.kill(f"gave no sign of life for {patience_s:.0f} s")
 
-    def _lower_ranks_are_active(self, node: Supervised) -> bool:
+    def _lower_ranks_are_active(self, node: SupervisedNode) -> bool:
         return all(
             other.state == "active"
             for other in self.nodes
@@ -197,7 +197,7 @@ class Supervisor:
         for node in nodes:
             self._start_again_later(node, told if len(nodes) == 1 else f"node {node.row.name} ended with it")
 
-    def _start_again_later(self, node: Supervised, told: str) -> None:
+    def _start_again_later(self, node: SupervisedNode, told: str) -> None:
         """Let a node that died rest for a while, or, if it has died too often, give up."""
         now_s, most = time.monotonic(), node.row.restarts
         node.deaths_s.append(now_s)
@@ -211,7 +211,7 @@ class Supervisor:
         node.start_s = now_s + BACK_OFF_S * 2 ** (deaths - 1)
         self._on_note(f"{told}; it is started again ({deaths} of {most} within {RESTART_WINDOW_S:.0f} s)")
 
-    def _lose(self, node: Supervised, why: str) -> None:
+    def _lose(self, node: SupervisedNode, why: str) -> None:
         """Do without a node from now on.
 
         Raises:

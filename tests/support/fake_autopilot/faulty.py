@@ -19,14 +19,14 @@ import msgspec
 from tests.support.fake_autopilot.flight import ROOT, SCENARIO, Flight, fake
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.realtime import run_when_due
 
 SPEED = 100.0
 AT_ONCE = 4
 LIMIT_S = 120.0
 # The clock runs a hundredth as fast as the vehicle's: what is a blink of it is half a minute of a flight.
-CAREFUL = Settings(
+CAREFUL = SafetySettings(
     arm=True,
     position_age_s=0.5,
     link_age_s=0.8,

@@ -17,9 +17,9 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu, Ned, to_enu
-from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Telemetry
 
 ROOT = Path(__file__).parents[2]
@@ -115,7 +115,7 @@ def fake(kind: str, wire: str = "tcp", **options: Any) -> Iterator[Fake]:
         autopilot.close()
 
 
-def way_home(bridge: Bridge) -> Action:
+def way_home(bridge: MissionController) -> Action:
     """A policy: straight to the dock, then hover."""
     (x, y, _), (dock_x, dock_y) = bridge.cell, bridge.scenario.dock_cell
     if x != dock_x:
@@ -136,7 +136,9 @@ class Flight:
         unflown: steps that counted, though the position that was reported was that of another cell.
     """
 
-    def __init__(self, autopilot: Fake, how: Settings, scenario: Scenario = SCENARIO, **bridge: Any) -> None:
+    def __init__(
+        self, autopilot: Fake, how: SafetySettings, scenario: Scenario = SCENARIO, **bridge: Any
+    ) -> None:
         self.fake = autopilot
         self.log: list[tuple[Phase, int, str]] = []
         self.executed: list[int] = []
@@ -144,11 +146,11 @@ class Flight:
         self.known = Telemetry()
         self.unflown: list[int] = []
         self._step = 0
-        self.bridge = Bridge(scenario, how, self._note, **bridge)
+        self.bridge = MissionController(scenario, how, self._note, **bridge)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
-        self.vehicle = Mavlink(autopilot.address, place=self.place)
-        self.policy: Callable[[Bridge], Action] | None = way_home
+        self.vehicle = MavlinkVehicle(autopilot.address, place=self.place)
+        self.policy: Callable[[MissionController], Action] | None = way_home
 
     def _note(self) -> None:
         bridge = self.bridge

@@ -16,10 +16,10 @@ from tests.support.worlds import changed
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
-from uav_dc_ros.nodes.vehicles.mavros import Mavros
+from uav_dc_ros.nodes.vehicles.mavros import MavrosVehicle
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 
 START = Enu(20.0, 0.0, 0.0)  # on the ground below it
 SCENARIO = changed(
@@ -115,15 +115,15 @@ def node_in(ros: Ros, *arguments: str) -> Iterator[tuple[rclpy.node.Node, Direct
 
 
 @contextlib.contextmanager
-def mavros_of(node: rclpy.node.Node, **how: Any) -> Iterator[Mavros]:
+def mavros_of(node: rclpy.node.Node, **how: Any) -> Iterator[MavrosVehicle]:
     """The transport, open, for the time of a block."""
-    vehicle = Mavros(node, place=START, **how)
+    vehicle = MavrosVehicle(node, place=START, **how)
     vehicle.open()
     with contextlib.closing(vehicle):
         yield vehicle
 
 
-def way_home(bridge: Bridge) -> Action:
+def way_home(bridge: MissionController) -> Action:
     """A policy: straight to the dock, then hover."""
     (x, y, _), (dock_x, dock_y) = bridge.cell, bridge.scenario.dock_cell
     if x != dock_x:
@@ -140,13 +140,18 @@ class Flight:
     """
 
     def __init__(
-        self, executor: DirectExecutor, vehicle: Mavros, mavros: Fake, how: Settings, **bridge: Any
+        self,
+        executor: DirectExecutor,
+        vehicle: MavrosVehicle,
+        mavros: Fake,
+        how: SafetySettings,
+        **bridge: Any,
     ) -> None:
         self.executor, self.vehicle, self.mavros = executor, vehicle, mavros
         self.log: list[tuple[Phase, int, str]] = []
         self.executed: list[int] = []
         self.cells: list[tuple[int, int, int]] = []
-        self.bridge = Bridge(SCENARIO, how, self._note, **bridge)
+        self.bridge = MissionController(SCENARIO, how, self._note, **bridge)
 
     def _note(self) -> None:
         bridge = self.bridge

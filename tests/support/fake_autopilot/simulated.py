@@ -10,8 +10,8 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry, Wish
 
 SPEED_MPS = {"across": 10.0, "up": 2.5, "down": 1.5}
@@ -21,7 +21,7 @@ STALE_S = 3.0  # age after which a transport takes the last report on the estima
 SCENARIO = scenarios.load("five_clusters")
 TICK_S = 0.1
 START = Enu(*SCENARIO.mission.start_m)
-ARMING = Settings(arm=True)
+ARMING = SafetySettings(arm=True)
 
 
 @dataclass
@@ -159,7 +159,7 @@ def towards(position: Enu, target: Enu, seconds: float, speeds_mps: dict[str, fl
     )
 
 
-def way_home(bridge: Bridge) -> Action:
+def way_home(bridge: MissionController) -> Action:
     """A policy: straight to the dock, then hover."""
     (x, y, _), (dock_x, dock_y) = bridge.course.goal, bridge.scenario.dock_cell
     if x != dock_x:
@@ -180,7 +180,7 @@ class Flight:
 
     def __init__(
         self,
-        how: Settings = ARMING,
+        how: SafetySettings = ARMING,
         vehicle: Vehicle | None = None,
         scenario: Scenario = SCENARIO,
         **bridge: object,
@@ -190,8 +190,8 @@ class Flight:
         self.log: list[tuple[Phase, int, str]] = []
         self.executed: list[int] = []
         self.ended_m: list[float] = []
-        self.bridge = Bridge(scenario, how, self._note, **bridge)  # type: ignore[arg-type]
-        self.policy: Callable[[Bridge], Action] | None = way_home
+        self.bridge = MissionController(scenario, how, self._note, **bridge)  # type: ignore[arg-type]
+        self.policy: Callable[[MissionController], Action] | None = way_home
         self._step = self.bridge.step
 
     def _note(self) -> None:
@@ -227,7 +227,7 @@ class Flight:
             self.tick()
 
 
-def fly_to_step(step: int, how: Settings = ARMING, scenario: Scenario = SCENARIO) -> Flight:
+def fly_to_step(step: int, how: SafetySettings = ARMING, scenario: Scenario = SCENARIO) -> Flight:
     """A flight that moves at a step."""
     flight = Flight(how, scenario=scenario)
     while flight.bridge.step < step or flight.bridge.phase is not Phase.MOVING:

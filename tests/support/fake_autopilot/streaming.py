@@ -20,7 +20,7 @@ from pymavlink import mavutil
 
 from tests.support.fake_autopilot.flight import ROOT, Fake, fake
 from uav_dc_ros.offboard.mavlink.session import POSITION_ONLY
-from uav_dc_ros.offboard.mavlink.vehicle import Mavlink
+from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
 from uav_dc_ros.offboard.realtime import run_when_due
 from uav_dc_ros.offboard.send_timer import STREAM_S
 
@@ -31,7 +31,7 @@ LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_dueling
 def transport(address: str) -> None:
     """Stream with the transport."""
     run_when_due()
-    with Mavlink(address) as vehicle:
+    with MavlinkVehicle(address) as vehicle:
         while True:
             vehicle.steer(vehicle.telemetry().position)
             time.sleep(0.1)

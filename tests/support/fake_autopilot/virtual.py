@@ -19,10 +19,10 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.session import Session
-from uav_dc_ros.offboard.mavlink.telemetry import Hearing
+from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.mavlink.vehicle import load_codec
-from uav_dc_ros.offboard.mission.controller import Bridge
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 
 LOOKS = 2  # after so many ticks of the vehicle the bridge looks: half as often as its node does
 
@@ -69,7 +69,7 @@ class VirtualFlight:
     def __init__(
         self,
         kind: str,
-        how: Settings | None = None,
+        how: SafetySettings | None = None,
         scenario: Scenario | None = None,
         channel: Channel | None = None,
         datum: Geodetic | None = None,
@@ -86,12 +86,12 @@ class VirtualFlight:
         self.channel = channel or (lambda sent, now_s: sent)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
-        self.hearing = Hearing(datum, self.place, system)
+        self.hearing = MavlinkTelemetry(datum, self.place, system)
         self.session = Session(load_codec(), self.hearing, self._write)
         self.link_is_up, self.now_s, self.speed, self.looks = True, 1000.0, speed, looks
         self._control = Control(self.autopilot)
-        self.bridge = Bridge(scenario, how or Settings(arm=True), self._note, **bridge)
-        self.policy: Callable[[Bridge], Action] | None = way_home
+        self.bridge = MissionController(scenario, how or SafetySettings(arm=True), self._note, **bridge)
+        self.policy: Callable[[MissionController], Action] | None = way_home
         self.log: list[tuple[Phase, int, str]] = []
         self.executed: list[int] = []
         self.session.live(self.now_s)
@@ -122,9 +122,9 @@ class VirtualFlight:
             system: the vehicle that the journal names.
         """
         standing, old = self.bridge.standing, self.bridge
-        self.hearing = Hearing(self.hearing.datum, self.place, system, again=True)
+        self.hearing = MavlinkTelemetry(self.hearing.datum, self.place, system, again=True)
         self.session = Session(load_codec(), self.hearing, self._write)
-        self.bridge = Bridge(old.scenario, old.settings, self._note, standing)
+        self.bridge = MissionController(old.scenario, old.settings, self._note, standing)
         self.session.live(self.now_s)
         self.session.begin(self.now_s)
 

@@ -19,10 +19,10 @@ from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.evaluate.evaluation import (
     COLUMNS,
     TITLES,
+    EvaluatedMissions,
     Evaluation,
+    EvaluationReport,
     Figure,
-    Flown,
-    Report,
     compare,
     judge,
     mean_and_interval,
@@ -96,13 +96,13 @@ def main(argv: list[str] | None = None) -> None:
             judge(pilot.name, pilot.sha256, act, scenario, range(options.seeds))
             for (pilot, scenario), act in zip(flights, acts, strict=True)
         ]
-        first: dict[str, Flown] = {}  # in each scenario
+        first: dict[str, EvaluatedMissions] = {}  # in each scenario
         comparisons = []
         for one in flown:
             baseline = first.setdefault(one.evaluation.fingerprint, one)
             if one is not baseline:
                 comparisons.append(compare(one, baseline))
-        report = Report(evaluations=[one.evaluation for one in flown], comparisons=comparisons)
+        report = EvaluationReport(evaluations=[one.evaluation for one in flown], comparisons=comparisons)
         if options.json:
             files.write(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
         show(report)
@@ -148,7 +148,7 @@ def _pilot(given: str) -> Pilot:
     return Pilot(policy.name, policy.sha256, policy.scenario.name, partial(steer, policy))
 
 
-def show(report: Report) -> None:
+def show(report: EvaluationReport) -> None:
     """Prints a table for each evaluation, and one of all when there are more."""
     # A file or a pipe has no width of its own; rich would wrap at 80.
     console = Console(width=None if sys.stdout.isatty() else 100, highlight=False)
@@ -174,7 +174,7 @@ def _details(evaluation: Evaluation) -> Table:
     return table
 
 
-def _overview(report: Report) -> Table:
+def _overview(report: EvaluationReport) -> Table:
     """The figures that matter most, of all policies, and how much they differ from the first's."""
     table = _table()
     table.add_column("", overflow="fold")

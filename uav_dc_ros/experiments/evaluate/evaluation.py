@@ -14,7 +14,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, fly
+from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, roll_out
 from uav_dc_ros.stats import interval
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
@@ -94,7 +94,7 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     differences: dict[str, Figure]
 
 
-class Report(msgspec.Struct, frozen=True, kw_only=True):
+class EvaluationReport(msgspec.Struct, frozen=True, kw_only=True):
     """What `python -m uav_dc_ros.evaluate --json` writes.
 
     Attributes:
@@ -107,7 +107,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flown:
+class EvaluatedMissions:
     """An evaluation, and each of its figures mission by mission: `[S]`, NaN where a mission has none."""
 
     evaluation: Evaluation
@@ -129,9 +129,11 @@ def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEE
     return judge(policy.name, policy.sha256, steer(policy, scenario), scenario, seeds).evaluation
 
 
-def judge(name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Sequence[int]) -> Flown:
+def judge(
+    name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Sequence[int]
+) -> EvaluatedMissions:
     """Flies one mission per seed with whoever steers by `act`."""
-    missions = fly(scenario, act, seeds)
+    missions = roll_out(scenario, act, seeds)
     values = {f.name: np.asarray(getattr(missions, f.name), np.float64) for f in fields(Missions)}
     values["landing_rate"] = values.pop("landed")
     evaluation = Evaluation(
@@ -144,10 +146,10 @@ def judge(name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Se
         users_total=scenario.n_users,
         **{figure: _figure(of_missions) for figure, of_missions in values.items()},
     )
-    return Flown(evaluation=evaluation, values=values)
+    return EvaluatedMissions(evaluation=evaluation, values=values)
 
 
-def compare(flown: Flown, baseline: Flown) -> Comparison:
+def compare(flown: EvaluatedMissions, baseline: EvaluatedMissions) -> Comparison:
     """`flown` less `baseline`, which has flown the same seeds in the same scenario."""
     mine, other = flown.evaluation, baseline.evaluation
     return Comparison(
@@ -214,12 +216,12 @@ def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) ->
     try:
         # Slow to import, and not always there.
         from uav_dc_ros.env.render import save_picture
-        from uav_dc_ros.experiments.evaluate.trajectory import fly_track
+        from uav_dc_ros.experiments.evaluate.trajectory import roll_out_trajectory
     except ModuleNotFoundError:
         raise UavDcError(
             'matplotlib is not installed; expected it from: pip install "uav_dc_ros[train]"'
         ) from None
     try:
-        save_picture(fly_track(scenario, act, seed), path)
+        save_picture(roll_out_trajectory(scenario, act, seed), path)
     except (OSError, ValueError) as error:
         raise UavDcError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from None

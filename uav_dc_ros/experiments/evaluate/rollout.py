@@ -79,7 +79,7 @@ def flight(
         yield state, outcome
 
 
-def fly(
+def roll_out(
     scenario: Scenario,
     act: Act,
     seeds: Sequence[int],

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from uav_dc_ros import files
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.env.render import PATH_COLOURS, picture
-from uav_dc_ros.env.trajectory import Track
+from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper import style
 from uav_dc_ros.experiments.paper.evidence import SMOOTHING, Evidence, name, smooth
@@ -46,7 +46,7 @@ def drawable(results: Results) -> list[str]:
     ]
 
 
-def draw(figure: str, results: Results, tracks: Sequence[Track], path: Path) -> None:
+def draw(figure: str, results: Results, tracks: Sequence[Trajectory], path: Path) -> None:
     """Writes one figure as a PNG file.
 
     Args:
@@ -200,7 +200,7 @@ def _legend(axes: Axes, n_lines: int, vary: tuple[str, ...]) -> None:
     style.dress(axes)
 
 
-def _montage(plan: FigurePlan, scale: Scale, tracks: Sequence[Track]) -> Figure:
+def _montage(plan: FigurePlan, scale: Scale, tracks: Sequence[Trajectory]) -> Figure:
     """The pictures of missions, three in a row."""
     if not tracks:
         raise TrainingError("0 missions to draw; expected at least 1")

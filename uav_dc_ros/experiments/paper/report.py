@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from uav_dc_ros import files
-from uav_dc_ros.env.trajectory import Track
+from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.experiments.paper.claims import Finding, check, count
 from uav_dc_ros.experiments.paper.evidence import RULES, Part, Table, Verdict
 from uav_dc_ros.experiments.paper.figures import draw, drawable
@@ -24,7 +24,9 @@ _VERDICTS: dict[Verdict, str] = {
 }
 
 
-def write(results: Results, tracks: Sequence[Track], folder: Path, only: Sequence[str] | None = None) -> None:
+def write(
+    results: Results, tracks: Sequence[Trajectory], folder: Path, only: Sequence[str] | None = None
+) -> None:
     """Draws figures and writes what came of the claims into an existing folder.
 
     Args:

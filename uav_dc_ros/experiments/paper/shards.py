@@ -175,7 +175,7 @@ def train_shard(shard: Shard, checkpoint: Path | None = None, tell: Tell | None 
 
     from uav_dc_ros.experiments.train import checkpoint as checkpoints
     from uav_dc_ros.experiments.train.training import Training, prepare_torch
-    from uav_dc_ros.experiments.train.validation import fly_greedily
+    from uav_dc_ros.experiments.train.validation import roll_out_greedily
 
     prepare_torch(n_threads=1)
     training = Training(shard.population, torch.device("cpu"))
@@ -192,7 +192,7 @@ def train_shard(shard: Shard, checkpoint: Path | None = None, tell: Tell | None 
     first, count = shard.greedy_seeds
     return Trained(
         curves=training.curves,
-        greedy=fly_greedily(training, range(first, first + count)),
+        greedy=roll_out_greedily(training, range(first, first + count)),
         parameters=[training.learner.parameters(run) for run in range(len(shard.population.runs))],
     )
 

@@ -15,9 +15,9 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env.trajectory import Track
+from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.trajectory import fly_track
+from uav_dc_ros.experiments.evaluate.trajectory import roll_out_trajectory
 from uav_dc_ros.experiments.paper import shards
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results
@@ -107,16 +107,16 @@ def trajectories(planned: Sequence[Planned], scale: Scale, found: Found) -> Traj
     return {environment: trained.parameters[run] for environment, (trained, run) in own.items()}
 
 
-def fly_tracks(networks: Trajectories, scale: Scale) -> list[Track]:
+def fly_tracks(networks: Trajectories, scale: Scale) -> list[Trajectory]:
     """A greedy mission of each network in its environment."""
     scenario, sizes = _trajectory_network(scale)
 
-    def track(environment: int) -> Track:
+    def track(environment: int) -> Trajectory:
         def act(state: world.State) -> Array:
             seen = observe(OBSERVATION, scenario, state)
             return network.q_values(sizes, networks[environment], seen).argmax(-1)
 
-        return fly_track(scenario, act, GREEDY_SEEDS[0], layout(environment, (scenario.n_users, 2)))
+        return roll_out_trajectory(scenario, act, GREEDY_SEEDS[0], layout(environment, (scenario.n_users, 2)))
 
     return [track(environment) for environment in sorted(networks)]
 

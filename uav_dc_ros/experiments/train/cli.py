@@ -23,7 +23,7 @@ from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture, steer
 from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run
-from uav_dc_ros.experiments.train.progress import Display, Report
+from uav_dc_ros.experiments.train.progress import ProgressDisplay, ProgressReport
 from uav_dc_ros.experiments.train.replay_from_bags import Remembered, check_remembered, remember
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     device = _device(options.device, options.threads)
     # These need torch, which _device() has asked for.
     from uav_dc_ros.experiments.train import checkpoint
-    from uav_dc_ros.experiments.train.tensorboard import Scalars
+    from uav_dc_ros.experiments.train.tensorboard import TensorBoardLog
     from uav_dc_ros.experiments.train.training import Training
     from uav_dc_ros.experiments.train.validation import validate
 
@@ -134,8 +134,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
     try:
         with ExitStack() as stack:
             stack.callback(_discard_empty, folder)
-            display = stack.enter_context(Display(training, every))
-            scalars = stack.enter_context(Scalars(options.tensorboard, options.out.name, training))
+            display = stack.enter_context(ProgressDisplay(training, every))
+            scalars = stack.enter_context(TensorBoardLog(options.tensorboard, options.out.name, training))
             while training.n_flown < population.n_episodes:
                 training.fly_episode()
                 scalars.add_episode()
@@ -151,7 +151,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
                     scalars.add_scores(found.brought_home)
                     checkpoint.save(saved, training, progress)
                 score = math.nan if progress["score"] is None else progress["score"]
-                display.show(Report.of(training, score))
+                display.show(ProgressReport.of(training, score))
     except KeyboardInterrupt:
         if not saved.is_file():
             shutil.rmtree(folder, ignore_errors=True)

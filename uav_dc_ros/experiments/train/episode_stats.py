@@ -30,7 +30,7 @@ CURVES = (
 _N_FIGURES = len(CURVES) - 1
 
 
-class Books:
+class EpisodeStats:
     """Sums over the steps of each mission, and over the missions of an episode."""
 
     def __init__(self, scenario: Scenario, like: Array) -> None:

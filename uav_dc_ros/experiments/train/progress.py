@@ -12,12 +12,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.train.training import Training
 
-# Episodes of each run that the figures of a `Report` look back on.
+# Episodes of each run that the figures of a `ProgressReport` look back on.
 _LATEST = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class ProgressReport:
     """How training stands after an episode; means are over all runs and their latest episodes.
 
     Attributes:
@@ -36,7 +36,7 @@ class Report:
     score: float
 
     @classmethod
-    def of(cls, training: "Training", score: float) -> "Report":
+    def of(cls, training: "Training", score: float) -> "ProgressReport":
         """The report of a training after an episode."""
         latest = {name: values[-_LATEST:] for name, values in training.curves.items()}
         known = np.isfinite(latest["reward"])
@@ -53,7 +53,7 @@ class Report:
         )
 
 
-class Display:
+class ProgressDisplay:
     """Shows reports as they come; a context manager."""
 
     def __init__(self, training: "Training", line_every: int) -> None:
@@ -75,7 +75,7 @@ class Display:
             "", total=training.population.n_episodes, completed=self._first, text=""
         )
 
-    def __enter__(self) -> "Display":
+    def __enter__(self) -> "ProgressDisplay":
         self._bars.start()
         return self
 
@@ -84,7 +84,7 @@ class Display:
     ) -> None:
         self._bars.stop()
 
-    def show(self, report: Report) -> None:
+    def show(self, report: ProgressReport) -> None:
         """Shows one report; its rate is in agent-steps, each a step and a gradient step of one run."""
         rate = self._steps * (report.episode - self._first) / (time.monotonic() - self._started)
         text = (

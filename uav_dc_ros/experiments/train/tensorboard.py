@@ -9,7 +9,7 @@ from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train.training import Training
 
 
-class Scalars:
+class TensorBoardLog:
     """Writes the curves of every run under `DIR/NAME/seed_S`; writes nothing without a folder."""
 
     def __init__(self, folder: Path | None, name: str, training: Training) -> None:
@@ -38,7 +38,7 @@ class Scalars:
         except OSError as error:
             raise TrainingError(f"--tensorboard {folder} cannot be written: {error.strerror}") from None
 
-    def __enter__(self) -> "Scalars":
+    def __enter__(self) -> "TensorBoardLog":
         return self
 
     def __exit__(

@@ -20,7 +20,7 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import BatchWorld
 from uav_dc_ros.core.reward import Rewards
-from uav_dc_ros.experiments.train.episode_stats import CURVES, Books
+from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
 from uav_dc_ros.experiments.train.population import Population, Run, architecture, layout
 from uav_dc_ros.recordings.transitions import Transition
 
@@ -71,7 +71,7 @@ class Training:
         self._buffer = ReplayBuffer(len(population.runs), capacity, architectures[0].n_inputs, device)
         paid = rewards(population.runs, self._world_array)
         self._worlds = BatchWorld(population.scenario, self._layouts(1)[0], paid)
-        self._books = Books(population.scenario, self._worlds.state.total_reward)
+        self._books = EpisodeStats(population.scenario, self._worlds.state.total_reward)
         self._curves = np.full(
             (population.n_episodes, len(CURVES), len(population.runs)), np.nan, dtype=np.float32
         )

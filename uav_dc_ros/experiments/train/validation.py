@@ -8,7 +8,7 @@ import torch
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.world import State
-from uav_dc_ros.experiments.evaluate.rollout import Missions, fly
+from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.experiments.train.population import layout
 from uav_dc_ros.experiments.train.training import Training, rewards
 
@@ -18,7 +18,7 @@ VALIDATION_SEEDS = range(1_000_000, 1_000_100)
 _BATTERY = 0.1
 
 
-def fly_greedily(training: Training, seeds: range) -> Missions:
+def roll_out_greedily(training: Training, seeds: range) -> Missions:
     """Every run's greedy policy on the missions with these seeds, each `[N, S]`.
 
     A run with an environment of its own starts from that layout; the seed decides how the users walk.
@@ -32,7 +32,7 @@ def fly_greedily(training: Training, seeds: range) -> Missions:
         seen = torch.from_numpy(observe(population.observation, population.scenario, state))
         return learner.greedy(seen.to(training.device)).cpu().numpy()
 
-    return fly(
+    return roll_out(
         population.scenario,
         act,
         seeds,
@@ -57,7 +57,7 @@ class Validation(NamedTuple):
 
 def validate(training: Training) -> Validation:
     """Flies the validation missions with every run's greedy policy."""
-    scenario, missions = training.population.scenario, fly_greedily(training, VALIDATION_SEEDS)
+    scenario, missions = training.population.scenario, roll_out_greedily(training, VALIDATION_SEEDS)
     brought_home = np.where(missions.landed, missions.users_collected, 0).mean(axis=-1)
     max_steps = scenario.mission.max_steps
     spent = np.where(missions.landed, missions.arrival_step, max_steps).mean(axis=-1) / max_steps

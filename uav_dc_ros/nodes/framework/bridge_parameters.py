@@ -1,7 +1,7 @@
 """The bridge's ROS parameters: the way to the vehicle, and how carefully it is flown. Knows no ROS."""
 
 from uav_dc_ros.nodes.framework.parameters import Parameter, one_of
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import MARGIN_M
 from uav_dc_ros.topics import SYSTEM_MAX, VEHICLES
 
@@ -43,7 +43,7 @@ FENCE_MARGIN_M = Parameter(
 
 def _setting(name: str, description: str, unit: str = "", least: float = 0.0, most: float = 0.0) -> Parameter:
     """A parameter that is a field of `autopilot.watch.Settings`, and has its default."""
-    default = getattr(Settings, name)
+    default = getattr(SafetySettings, name)
     if isinstance(default, bool):
         return Parameter(name=name, default=default, description=description)
     return Parameter(name=name, default=default, least=least, most=most, unit=unit, description=description)
@@ -64,13 +64,13 @@ SETTINGS = (
     _setting("least_battery", "minimum battery charge, 0 to 1; below it the mission ends", "", 0.0, 1.0),
     Parameter(
         name="then",
-        default=str(Settings.then),
+        default=str(SafetySettings.then),
         description="failsafe action of the bridge: return or land",
         parse=one_of("return", "land"),
     ),
     Parameter(
         name="flying_at_start",
-        default=Settings.flying_at_start,
+        default=SafetySettings.flying_at_start,
         description="action when the bridge starts beside a vehicle in the commanded mode: resume or land",
         parse=one_of("resume", "land"),
     ),

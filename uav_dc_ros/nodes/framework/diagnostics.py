@@ -30,7 +30,7 @@ LATENCIES = ("transport", "handling")  # from publishing to the receipt, and to 
 LATENCIES_KEPT = 4096  # of one topic and period: the last ones
 
 
-class Meter:
+class MessageStatistics:
     """Counts what a node hears and says, and how long messages took.
 
     Attributes:

@@ -18,7 +18,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from uav_dc_ros import cdr, messages, topics
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.framework import diagnostics, other_publishers
-from uav_dc_ros.nodes.framework.diagnostics import Meter
+from uav_dc_ros.nodes.framework.diagnostics import MessageStatistics
 from uav_dc_ros.nodes.framework.lifecycle_node import ManagedNode
 from uav_dc_ros.nodes.framework.node_table import rows
 from uav_dc_ros.nodes.framework.process_control import SUPERVISED
@@ -69,7 +69,7 @@ class MissionNode(ManagedNode):
         self, name: str, overrides: Sequence[rclpy.Parameter] = (), context: Context | None = None
     ) -> None:
         super().__init__(name, overrides, context)
-        self.meter = Meter()
+        self.meter = MessageStatistics()
         self.is_supervised = SUPERVISED in os.environ
         self.restarts = int(os.environ.get(SUPERVISED) or 0)
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)

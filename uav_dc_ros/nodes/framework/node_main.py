@@ -33,7 +33,7 @@ NOT_BEGUN = 2
 GAVE_UP = 3
 
 
-class Stopper:
+class StopMonitor:
     """Turns SIGINT, SIGTERM, SIGHUP and, under run_all, the end of standard input into a request to stop.
 
     A waiting executor sleeps in C, where Python's handlers do not run: signals arrive through a file
@@ -132,7 +132,7 @@ def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> 
         for node in nodes:
             executor.add_node(node)
             node.serve = executor.spin_once
-        stopper = Stopper(executor.wake)
+        stopper = StopMonitor(executor.wake)
         reporter = process_control.Reporter(nodes)
         reporter.report()
         for node in nodes:
@@ -181,7 +181,7 @@ def _begin(nodes: Sequence[MissionNode]) -> bool:
 def _run(
     nodes: Sequence[MissionNode],
     executor: DirectExecutor,
-    stopper: Stopper,
+    stopper: StopMonitor,
     reporter: process_control.Reporter,
 ) -> int:
     """Spin until the nodes are asked to stop, and stop them safely, also when a callback failed."""

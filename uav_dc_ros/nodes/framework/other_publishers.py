@@ -29,7 +29,7 @@ class AnotherMissionError(NodeError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rivals:
+class OtherPublishers:
     """Publishers that do not belong to this mission.
 
     Attributes:
@@ -60,7 +60,7 @@ def find(
     rows: Mapping[str, NodeRow],
     restarted: Collection[str] = (),
     absent: Collection[str] = (),
-) -> Rivals:
+) -> OtherPublishers:
     """Rivals among the publishers of exclusive topics.
 
     Args:
@@ -83,7 +83,7 @@ def find(
                 foreign.setdefault(name, []).append(topic)
             elif count > (ours[name] not in absent) and ours[name] not in restarted:
                 doubles.setdefault(name, []).append(topic)
-    return Rivals(foreign=foreign, doubles=doubles)
+    return OtherPublishers(foreign=foreign, doubles=doubles)
 
 
 def publishers(node: Node) -> dict[str, list[str]]:

@@ -55,7 +55,7 @@ class Parameter:
         return f"{kind} from {self.least} to {self.most}{f' {self.unit}' if self.unit else ''}"
 
     def typed(self, given: Any) -> Any:
-        """A value as one of the parameter's type, where it denotes one: `hold_s:=10` and `pace:=90` do."""
+        """A value as one of the parameter's type, where it denotes one: `dwell_s:=1` and `pace:=90` do."""
         if isinstance(self.default, list):
             return list(given) if isinstance(given, list | tuple) else given
         if isinstance(self.default, str) and isinstance(given, bool | int | float):

@@ -9,7 +9,7 @@ V = TypeVar("V", Mission, Rates)
 WAITING_MAX = 1000  # steps of which one half was heard: more are rubbish, or long past
 
 
-class StepPairs:
+class StepSynchronizer:
     """Brings together the `mission` and the `rates` of a step, which arrive in any order."""
 
     def __init__(self) -> None:

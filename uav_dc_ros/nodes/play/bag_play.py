@@ -20,7 +20,7 @@ from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN
 from uav_dc_ros.nodes.ros import environment
 
 if TYPE_CHECKING:
-    from uav_dc_ros.nodes.play.player import Plan
+    from uav_dc_ros.nodes.play.player import PlaybackOptions
 
 MAX_GAP_S = 600.0
 CLOCK_HZ = 40.0  # rosbag2's default
@@ -114,14 +114,14 @@ def run(options: argparse.Namespace) -> int:
         return _play(reader, _plan(reader, options))
 
 
-def _plan(reader: BagReader, options: argparse.Namespace) -> "Plan":
+def _plan(reader: BagReader, options: argparse.Namespace) -> "PlaybackOptions":
     """What is to be played.
 
     Raises:
         ParameterError: the bag does not hold it.
         BagError: the bag holds nothing.
     """
-    from uav_dc_ros.nodes.play.player import Plan
+    from uav_dc_ros.nodes.play.player import PlaybackOptions
 
     if not reader.message_count:
         raise BagError(f"bag {options.bag} holds no message; expected at least one to play")
@@ -130,7 +130,7 @@ def _plan(reader: BagReader, options: argparse.Namespace) -> "Plan":
         raise ParameterError(f"--start {options.start:g}: bag {options.bag} lasts {length_s:.3f} s")
     if options.paused and (sys.stdin is None or not sys.stdin.isatty()):
         raise ParameterError("--paused: standard input is no terminal, so no key could end the pause")
-    return Plan(
+    return PlaybackOptions(
         path=options.bag,
         names=_names(reader, options),
         start_s=options.start,
@@ -194,7 +194,7 @@ def _check_known(reader: BagReader, option: str, given: Iterable[str]) -> None:
             raise ParameterError(f"{option} {topic}: no such topic in bag {reader.path}; it has {known}")
 
 
-def _play(reader: BagReader, plan: "Plan") -> int:
+def _play(reader: BagReader, plan: "PlaybackOptions") -> int:
     """Play with a node of its own.
 
     Raises:
@@ -204,7 +204,7 @@ def _play(reader: BagReader, plan: "Plan") -> int:
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions
 
-    from uav_dc_ros.nodes.play.display import PlayDisplay, text_of
+    from uav_dc_ros.nodes.play.display import PlaybackDisplay, text_of
     from uav_dc_ros.nodes.play.player import Player
 
     length_s = (reader.last_ns - reader.first_ns) * 1e-9
@@ -214,7 +214,7 @@ def _play(reader: BagReader, plan: "Plan") -> int:
             os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        with PlayDisplay(plan.start_s, end_s) as display:
+        with PlaybackDisplay(plan.start_s, end_s) as display:
             node = Node("player", start_parameter_services=False, enable_rosout=False)
             player = Player(node, plan, display, reader)
             display.tell(

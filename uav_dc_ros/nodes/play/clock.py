@@ -8,7 +8,7 @@ CLOCK_TOPIC = "/clock"
 RATE_MIN, RATE_MAX = 1e-3, 1e6
 
 
-class PlayClock:
+class PlaybackClock:
     """Log times of a bag against the steady clock, from one anchor: lateness of a message delays no other.
 
     Args:

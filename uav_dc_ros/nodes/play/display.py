@@ -17,7 +17,7 @@ DRAWING_S = 0.01
 OVERDUE_S = 1.0
 
 
-class PlayDisplay:
+class PlaybackDisplay:
     """Shows how far a bag has been played; a context manager. It draws only when it is asked to.
 
     Args:

@@ -31,7 +31,7 @@ READ = 64  # bytes at once
 HELP = "space: pause, s or right: step, + or up: faster, - or down: slower, q: quit"
 
 
-class Keys:
+class Keyboard:
     """Reads keys, where standard input is a terminal and the command is in its foreground.
 
     A context manager: inside, keys come at once and are not shown. Ctrl-C and Ctrl-Z stay what they are.

@@ -34,7 +34,7 @@ def message_class(topic: RecordedTopic) -> type:
     return found
 
 
-class Outlet:
+class PlaybackPublisher:
     """Publishes the messages of one recorded topic.
 
     Args:

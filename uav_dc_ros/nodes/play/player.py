@@ -19,11 +19,11 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.read_ahead import ReadAhead
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
-from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN, PlayClock
-from uav_dc_ros.nodes.play.display import PlayDisplay
-from uav_dc_ros.nodes.play.keyboard import HELP, Keys
-from uav_dc_ros.nodes.play.playback_publisher import Outlet
-from uav_dc_ros.nodes.play.subscriber_monitor import Audience
+from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN, PlaybackClock
+from uav_dc_ros.nodes.play.display import PlaybackDisplay
+from uav_dc_ros.nodes.play.keyboard import HELP, Keyboard
+from uav_dc_ros.nodes.play.playback_publisher import PlaybackPublisher
+from uav_dc_ros.nodes.play.subscriber_monitor import SubscriberMonitor
 from uav_dc_ros.nodes.ros import convert, qos
 from uav_dc_ros.topics import TOPICS
 
@@ -41,7 +41,7 @@ FASTER = 1.25  # three times is about twice as fast
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class PlaybackOptions:
     """What is to be played, and how.
 
     Attributes:
@@ -87,9 +87,11 @@ class Player:
         BagError: nothing of the bag can be played, or its QoS makes no sense.
     """
 
-    def __init__(self, node: Node, plan: Plan, display: PlayDisplay, reader: BagReader) -> None:
+    def __init__(
+        self, node: Node, plan: PlaybackOptions, display: PlaybackDisplay, reader: BagReader
+    ) -> None:
         self.node, self.plan, self.display, self.reader = node, plan, display, reader
-        self.outlets: dict[str, Outlet] = {}
+        self.outlets: dict[str, PlaybackPublisher] = {}
         self.messages = 0
         length_s = max(1.0, (reader.last_ns - reader.first_ns) * 1e-9)
         for recorded, name in plan.names.items():
@@ -97,7 +99,7 @@ class Player:
             first = next(reader.messages([recorded]), None) if topic.count else None
             per_s = plan.rate * max(1, topic.count) / length_s
             try:
-                self.outlets[recorded] = Outlet(
+                self.outlets[recorded] = PlaybackPublisher(
                     node, name, topic, message_bytes=len(first.data) if first else 0, per_s=per_s
                 )
             except NodeError as error:
@@ -107,12 +109,12 @@ class Player:
         self._start_ns = self.reader.first_ns + round(self.plan.start_s * 1e9)
         duration_s = self.plan.duration_s
         self._end_ns = None if duration_s is None else self._start_ns + round(duration_s * 1e9)
-        self.clock = PlayClock(self.plan.rate, paused=self.plan.paused)
-        self._keys = Keys(self.clock.hold)
+        self.clock = PlaybackClock(self.plan.rate, paused=self.plan.paused)
+        self._keys = Keyboard(self.clock.hold)
         self._steps = 0  # messages that keys asked for
         self._quit = False
         self._waits = False  # for subscribers, before anything is played
-        self._audience = Audience(node, self.outlets.values())
+        self._audience = SubscriberMonitor(node, self.outlets.values())
         self._graph_at_s = self._tick_at_s = self._clock_at_s = 0.0
         self._clock_publisher: Any = None
         if self.plan.clock_hz is not None:
@@ -210,7 +212,9 @@ class Player:
         outlet.publish(message.data)
         self.messages += 1
 
-    def _wait_for(self, there: Callable[[], bool], outlet: Outlet, deadline_s: float = math.inf) -> None:
+    def _wait_for(
+        self, there: Callable[[], bool], outlet: PlaybackPublisher, deadline_s: float = math.inf
+    ) -> None:
         """Wait for subscribers of an outlet, up to a deadline, or until a key ends the play."""
         tell_at_s = time.monotonic() + STUCK_S
         while not there():

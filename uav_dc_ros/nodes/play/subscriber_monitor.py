@@ -7,12 +7,12 @@ from rclpy.node import Node
 
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.node_table import NODES
-from uav_dc_ros.nodes.play.playback_publisher import Outlet
+from uav_dc_ros.nodes.play.playback_publisher import PlaybackPublisher
 from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.topics import TOPICS
 
 
-class Audience:
+class SubscriberMonitor:
     """Looks at the graph around some outlets.
 
     Args:
@@ -20,7 +20,7 @@ class Audience:
         outlets: its outlets.
     """
 
-    def __init__(self, node: Node, outlets: Collection[Outlet]) -> None:
+    def __init__(self, node: Node, outlets: Collection[PlaybackPublisher]) -> None:
         self._node = node
         self._outlets = outlets
         self._told: set[tuple[str, str]] = set()
@@ -29,7 +29,7 @@ class Audience:
         """Number of subscribers that hear, by published topic."""
         return {outlet.name: outlet.publisher.get_subscription_count() for outlet in self._outlets}
 
-    def subscribers(self, outlet: Outlet) -> str:
+    def subscribers(self, outlet: PlaybackPublisher) -> str:
         """Full names of the nodes that subscribe to an outlet's topic."""
         ends = self._node.get_subscriptions_info_by_topic(outlet.name)
         return ", ".join(sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends))
@@ -49,7 +49,7 @@ class Audience:
         for namespace, ends_by_topic in publishers.items():
             found = other_publishers.find(ends_by_topic, namespace, NODES, absent=NODES)
             if found.doubles:
-                return other_publishers.Rivals(doubles=found.doubles).told()
+                return other_publishers.OtherPublishers(doubles=found.doubles).told()
         return None
 
     def others(self) -> Iterator[str]:

@@ -26,7 +26,7 @@ def union(ends: Sequence[TopicEndpointInfo]) -> QoSProfile:
     )
 
 
-class _Ear:
+class _Subscription:
     """A subscription, and the middleware's count of what it lost."""
 
     def __init__(self, subscription: Any) -> None:
@@ -45,7 +45,7 @@ class _Ear:
             return self.subscription.handle.take_message(self.subscription.msg_type, True)
 
 
-class Hearing:
+class AdaptiveSubscription:
     """A topic that is recorded.
 
     Args:
@@ -64,10 +64,10 @@ class Hearing:
         self.callback = callback
         self.publishers = 0
         self._node = node
-        self._ear: _Ear
+        self._ear: _Subscription
         self._kind: Any = None  # the class of its messages; None: it is not to adapt
         self._profile: QoSProfile
-        self._leaving: _Ear | None = None
+        self._leaving: _Subscription | None = None
         self._seen: set[tuple[int, int]] = set()  # messages, while two subscriptions hear them
         self._lost = 0  # by subscriptions that are gone
 
@@ -78,7 +78,7 @@ class Hearing:
 
     def add(self, subscription: Any, *, adapts: bool) -> None:
         """Use a subscription that somebody else has made; one that does not adapt stays as it is."""
-        self._ear = _Ear(subscription)
+        self._ear = _Subscription(subscription)
         self._kind = subscription.msg_type if adapts else None
         self._profile = subscription.qos_profile
 
@@ -88,9 +88,9 @@ class Hearing:
         self._profile = union(ends)
         self._ear = self._made(self.callback)
 
-    def _made(self, callback: Callback) -> _Ear:
+    def _made(self, callback: Callback) -> _Subscription:
         handler: Any = callback  # rclpy sees by the signature what it takes; its types do not
-        return _Ear(
+        return _Subscription(
             self._node.create_subscription(
                 self._kind,
                 self.name,
@@ -143,7 +143,7 @@ class Hearing:
         return self._lost + sum(ear.lost() for ear in self._ears)
 
     @property
-    def _ears(self) -> list[_Ear]:
+    def _ears(self) -> list[_Subscription]:
         return [self._ear] if self._leaving is None else [self._leaving, self._ear]
 
     def drain(self, until_ns: int, deadline_s: float) -> int:

@@ -13,13 +13,13 @@ from uav_dc_ros import __version__, cli
 from uav_dc_ros.bags.compression import COMPRESSIONS
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework import parameters as p
-from uav_dc_ros.nodes.record.recorder_base import BagNode
+from uav_dc_ros.nodes.record.recorder_base import RecorderBase
 from uav_dc_ros.nodes.ros import environment
 
 NODE = "bag_record"
 
 
-class Record(BagNode):
+class BagRecorder(RecorderBase):
     """Records until it is stopped, and tells what it recorded.
 
     Args:
@@ -96,4 +96,4 @@ def run(options: argparse.Namespace) -> int:
     }
     environment.prepare(alone=False)  # what is recorded may come from anywhere
     remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
-    node_main.main(lambda: Record(values), arguments=remapped)
+    node_main.main(lambda: BagRecorder(values), arguments=remapped)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
-from uav_dc_ros.nodes.record.adaptive_subscription import Hearing
+from uav_dc_ros.nodes.record.adaptive_subscription import AdaptiveSubscription
 from uav_dc_ros.nodes.ros import message_types, qos, rclpy_private
 from uav_dc_ros.topics import TOPICS, Topic
 
@@ -31,7 +31,7 @@ DRAIN_S = 2.0  # for messages that have arrived when the node is deactivated
 HOUSEKEEPING = ("/parameter_events", "/rosout", "/transition_event")  # of ROS: not unless asked for by name
 
 
-class BagNode(MissionNode):
+class RecorderBase(MissionNode):
     """Records the topics of its row, and whatever else it is to.
 
     Attributes:
@@ -48,7 +48,7 @@ class BagNode(MissionNode):
         super().__init__(name, *arguments)
         self.writer: BagWriter | None = None
         self.asked: set[str] = set()
-        self._hearings: dict[str, Hearing] = {}  # by full name
+        self._hearings: dict[str, AdaptiveSubscription] = {}  # by full name
         self._announced: set[str] = set()
         self._not_recorded: dict[str, str] = {}  # reasons
         self._seen: Set[str] = set()  # topics at the last look
@@ -148,7 +148,7 @@ class BagNode(MissionNode):
         """
         assert self.writer is not None, "it was configured"
         name = self.resolve_topic_name(topic.name)
-        hearing = Hearing(self, name, topic.type, self._hear(name, topic.name, topic))
+        hearing = AdaptiveSubscription(self, name, topic.type, self._hear(name, topic.name, topic))
         override = f"qos_overrides.{name}.subscription."
         overridden = any(given.startswith(override) for given in rclpy_private.overrides(self))
         all_of_it = replace(topic, asks_reliable=topic.reliable)
@@ -228,7 +228,7 @@ class BagNode(MissionNode):
         """Namespaces inside ours that are not ours to record; `found` are topics with their types."""
         return set()
 
-    def _keep_up(self, hearing: Hearing) -> None:
+    def _keep_up(self, hearing: AdaptiveSubscription) -> None:
         """Adapt to publishers that came or went."""
         hearing.settle()
         publishers = self.count_publishers(hearing.name)
@@ -266,7 +266,7 @@ class BagNode(MissionNode):
             several = f"it has several types: {', '.join(types)}"
             self._leave_out(name, several if len(types) > 1 else f"type {type} is not installed here")
             return
-        hearing = Hearing(self, name, type, self._hear(name, name, None))
+        hearing = AdaptiveSubscription(self, name, type, self._hear(name, name, None))
         hearing.publishers = len(ends)
         try:
             hearing.subscribe(kind, ends)

@@ -52,7 +52,7 @@ class Confirmed:
         self._was_there = False
 
 
-class Lease:
+class LivelinessMonitor:
     """Whether anybody who publishes a topic lives.
 
     Args:

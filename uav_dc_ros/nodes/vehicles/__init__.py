@@ -8,11 +8,11 @@ from rclpy.node import Node
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.nodes.vehicles import mavros_messages
-from uav_dc_ros.nodes.vehicles.mavros import Mavros
-from uav_dc_ros.nodes.vehicles.px4 import Px4, load_messages
+from uav_dc_ros.nodes.vehicles.mavros import MavrosVehicle
+from uav_dc_ros.nodes.vehicles.px4 import Px4Vehicle, load_messages
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address
-from uav_dc_ros.offboard.mavlink.vehicle import Mavlink, load_codec
+from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle, load_codec
 from uav_dc_ros.offboard.vehicle import Vehicle
 
 
@@ -46,10 +46,12 @@ def make(
     check(kind, connect, values["system"], values["arm"])
     if kind == "mavlink":
         named = values["system"] or system
-        return Mavlink(connect, datum=datum, place=place, anchor=anchor, system=named)
+        return MavlinkVehicle(connect, datum=datum, place=place, anchor=anchor, system=named)
     if kind == "mavros":
-        return Mavros(node, place=place, anchor=anchor, datum=datum, arms=values["arm"], restarted=restarted)
-    return Px4(node, place=place, anchor=anchor, datum=datum, restarted=restarted)
+        return MavrosVehicle(
+            node, place=place, anchor=anchor, datum=datum, arms=values["arm"], restarted=restarted
+        )
+    return Px4Vehicle(node, place=place, anchor=anchor, datum=datum, restarted=restarted)
 
 
 def check(kind: str, connect: str, system: int, arm: bool) -> None:

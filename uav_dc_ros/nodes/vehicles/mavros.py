@@ -31,7 +31,7 @@ from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.ros.convert import position_m, stamp_ns
 from uav_dc_ros.nodes.vehicles import mavros_messages
 from uav_dc_ros.nodes.vehicles.mavros_commands import Commands
-from uav_dc_ros.nodes.vehicles.other_setpoints import OtherPublishers
+from uav_dc_ros.nodes.vehicles.other_setpoints import OtherSetpointPublishers
 from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.offboard.mavros.telemetry import (
     ESTIMATOR_STATUS,
@@ -43,9 +43,9 @@ from uav_dc_ros.offboard.mavros.telemetry import (
     STATE,
     SYS_STATUS,
     TARGET,
-    Hearing,
+    MavrosTelemetry,
 )
-from uav_dc_ros.offboard.setpoint_stream import Stream
+from uav_dc_ros.offboard.setpoint_stream import SetpointStream
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Wish
 
 SETPOINT = "mavros/setpoint_position/local"
@@ -67,7 +67,7 @@ class Target(NamedTuple):
     yaw_rad: float
 
 
-class Mavros:
+class MavrosVehicle:
     """One vehicle behind MAVROS, on the executor of a node, which also calls its methods.
 
     Args:
@@ -94,10 +94,10 @@ class Mavros:
     ) -> None:
         self._node = node
         self._package = mavros_messages.load(needed_for="arming" if arms else "")
-        self._hearing = Hearing(place, datum, anchor, full=self._package is not None)
-        self._other_publishers = OtherPublishers(node, restarted=restarted or bool(anchor))
+        self._hearing = MavrosTelemetry(place, datum, anchor, full=self._package is not None)
+        self._other_publishers = OtherSetpointPublishers(node, restarted=restarted or bool(anchor))
         self._yaw_rad: float | None = None
-        self._stream: Stream[Target] = Stream(self._publish, "mavros")
+        self._stream: SetpointStream[Target] = SetpointStream(self._publish, "mavros")
         self._publisher: Any = None
         self._subscriptions: dict[str, Any] = {}
         self._commands: Commands | None = None

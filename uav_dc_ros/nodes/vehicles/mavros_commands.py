@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.node import Node
 
 from uav_dc_ros.nodes.vehicles.mavros_messages import PACKAGE, MavrosMsgs
-from uav_dc_ros.offboard.flight_stacks import Dialect
+from uav_dc_ros.offboard.flight_stacks import FlightStack
 from uav_dc_ros.offboard.mavros.telemetry import ESTIMATOR_STATUS, EXTENDED_STATE, POSE
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
 
@@ -55,7 +55,7 @@ class Commands:
 
     # Wishes.
 
-    def ask(self, wish: Wish, dialect: Dialect, up_m: float) -> None:
+    def ask(self, wish: Wish, dialect: FlightStack, up_m: float) -> None:
         """Pass a wish on.
 
         Args:

@@ -8,7 +8,7 @@ LOOK_S = 1.0  # between two looks at the graph
 FORGOTTEN_S = 30.0  # after which the graph has forgotten a bridge that was killed
 
 
-class OtherPublishers:
+class OtherSetpointPublishers:
     """Looks at the graph now and then.
 
     Args:

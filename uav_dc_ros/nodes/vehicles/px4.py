@@ -19,12 +19,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uav_dc_ros.errors import VehicleError
-from uav_dc_ros.nodes.vehicles.other_setpoints import OtherPublishers
+from uav_dc_ros.nodes.vehicles.other_setpoints import OtherSetpointPublishers
 from uav_dc_ros.offboard import flight_stacks
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
-from uav_dc_ros.offboard.px4.telemetry import COMPANION, Px4Hearing
+from uav_dc_ros.offboard.px4.telemetry import COMPANION, Px4Telemetry
 from uav_dc_ros.offboard.send_timer import STREAM_VEHICLE_S
-from uav_dc_ros.offboard.setpoint_stream import Stream
+from uav_dc_ros.offboard.setpoint_stream import SetpointStream
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 
 POSE_S = 0.5
@@ -77,7 +77,7 @@ def versioned(name: str, kind: Any) -> str:
     return f"{name}_v{version}" if version else name
 
 
-class Px4:
+class Px4Vehicle:
     """One vehicle on the topics `fmu/in/...` and `fmu/out/...` of a node's namespace.
 
     Args:
@@ -102,7 +102,7 @@ class Px4:
     ) -> None:
         self._messages = load_messages()
         self._node = node
-        self._hearing = Px4Hearing(place=place, anchor=anchor, datum=datum)
+        self._hearing = Px4Telemetry(place=place, anchor=anchor, datum=datum)
         self._lock = threading.Lock()  # of all below, and of `_hearing`
         self._streamed_vehicle_s = 0.0
         self._sent: Ned | None = None
@@ -111,10 +111,10 @@ class Px4:
         self._messages_sent = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
         self._silent = set(NEEDED)
         self._looked_s, self._seen = -math.inf, ""
-        self._other_publishers = OtherPublishers(node, restarted=restarted or bool(anchor))
+        self._other_publishers = OtherSetpointPublishers(node, restarted=restarted or bool(anchor))
         self._subscriptions: list[Any] = []
         self._publishers: dict[str, Any] = {}
-        self._stream: Stream[Enu] = Stream(self._send, "px4")
+        self._stream: SetpointStream[Enu] = SetpointStream(self._send, "px4")
 
     def open(self) -> None:
         """Begin to listen."""
@@ -170,7 +170,7 @@ class Px4:
         self._stream.steer(setpoint)
 
     def ask(self, wish: Wish) -> None:
-        """Pass a wish on, once; whether it was fulfilled, `telemetry` tells. PX4 takes off by setpoints."""
+        """Send a command, once; `telemetry` reports what came of it. PX4 takes off by setpoints."""
         match wish:
             case SetMode(Mode.RETURN):
                 self._command(RETURN)

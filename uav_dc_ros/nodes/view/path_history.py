@@ -11,7 +11,7 @@ APART_NS = 2 * 10**9  # ... are one: a real vehicle tells twenty a second
 POSES_MAX = 1000  # of a path: more nobody sees, and each picture holds all of them
 
 
-class Track:
+class PathHistory:
     """The way of the UAV in the mission now.
 
     A path of any length is kept in bounded memory: one that grows too long loses every second of its poses,

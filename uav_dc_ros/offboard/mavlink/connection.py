@@ -17,11 +17,11 @@ CONNECT_S = 2.0
 READ_BYTES = 65536
 
 
-class LinkDown(Exception):
+class ConnectionLost(Exception):
     """A link that is broken, or cannot be opened; the message says why."""
 
 
-class Link(Protocol):
+class Connection(Protocol):
     """A way to an autopilot."""
 
     def fileno(self) -> int:
@@ -77,7 +77,7 @@ class Address:
         """As `parse` reads it."""
         return f"{self.kind}:{self.place}:{self.number}"
 
-    def open(self) -> Link:
+    def open(self) -> Connection:
         """Open a link.
 
         Raises:
@@ -93,7 +93,7 @@ class Address:
         except OSError as error:
             why = error.strerror or str(error)
             what = "does not answer" if self.kind == "tcp" else "cannot be opened"
-            raise LinkDown(f"{self} {what}: {why}") from None
+            raise ConnectionLost(f"{self} {what}: {why}") from None
 
 
 def load_serial(address: Address) -> Any:
@@ -126,9 +126,9 @@ class _Tcp:
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise LinkDown(f"{self.address} broke: {error.strerror}") from None
+            raise ConnectionLost(f"{self.address} broke: {error.strerror}") from None
         if not data:
-            raise LinkDown(f"{self.address} was closed by the other side")
+            raise ConnectionLost(f"{self.address} was closed by the other side")
         return data
 
     def write(self, data: bytes) -> bool:
@@ -137,9 +137,9 @@ class _Tcp:
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            raise LinkDown(f"{self.address} broke: {error.strerror}") from None
+            raise ConnectionLost(f"{self.address} broke: {error.strerror}") from None
         if sent < len(data):  # half a message would spoil the next one
-            raise LinkDown(f"{self.address} takes nothing any more")
+            raise ConnectionLost(f"{self.address} takes nothing any more")
         return True
 
     def answer_here(self) -> None:
@@ -175,7 +175,7 @@ class _Udp:
         except (BlockingIOError, ConnectionRefusedError):  # refused: nobody is there yet
             return b""
         except OSError as error:
-            raise LinkDown(f"{self.address} broke: {error.strerror}") from None
+            raise ConnectionLost(f"{self.address} broke: {error.strerror}") from None
         self.peer = self.peer or self.sender
         return data
 
@@ -209,15 +209,15 @@ class _Serial:
         try:
             return bytes(self.port.read(READ_BYTES))
         except OSError as error:
-            raise LinkDown(f"{self.address} broke: {error}") from None
+            raise ConnectionLost(f"{self.address} broke: {error}") from None
 
     def write(self, data: bytes) -> bool:
         try:
             sent = self.port.write(data)
         except OSError as error:
-            raise LinkDown(f"{self.address} broke: {error}") from None
+            raise ConnectionLost(f"{self.address} broke: {error}") from None
         if sent is not None and sent < len(data):
-            raise LinkDown(f"{self.address} takes nothing any more")
+            raise ConnectionLost(f"{self.address} takes nothing any more")
         return True
 
     def answer_here(self) -> None:

@@ -17,7 +17,7 @@ ANSWERS = "answers to commands"
 TARGETS = "position targets"
 
 
-class Rivals:
+class OtherControllers:
     """Compares what was sent with what comes back. All times are the vehicle's.
 
     What a router sends back is known by its number; what an earlier process of the same bridge left behind

@@ -11,7 +11,7 @@ from typing import Any
 
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM
-from uav_dc_ros.offboard.mavlink.telemetry import ACCEPTED, HELPFUL_HZ, IN_PROGRESS, ONCE, Hearing
+from uav_dc_ros.offboard.mavlink.telemetry import ACCEPTED, HELPFUL_HZ, IN_PROGRESS, ONCE, MavlinkTelemetry
 from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S, STREAM_VEHICLE_S, Heartbeat, following
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
 
@@ -40,7 +40,7 @@ class Session:
         stream_s: when the next setpoint is due, steady clock.
     """
 
-    def __init__(self, codec: Any, hearing: Hearing, write: Callable[[bytes], bool]) -> None:
+    def __init__(self, codec: Any, hearing: MavlinkTelemetry, write: Callable[[bytes], bool]) -> None:
         self.hearing, self.stream_s = hearing, -math.inf
         self._codec, self._write_bytes = codec, write
         self._mav = codec.MAVLink(None, SYSTEM, COMPONENT)
@@ -153,11 +153,11 @@ class Session:
             if now_s - last_s >= again_s or name not in self._asked_s:
                 self._asked_s[name] = now_s
                 number = getattr(self._codec, f"MAVLINK_MSG_ID_{name}")
-                self._send_command(SET_INTERVAL, float(number), 1e6 / rate_hz)
+                self._send_command_long(SET_INTERVAL, float(number), 1e6 / rate_hz)
                 if name in ONCE:
-                    self._send_command(REQUEST, float(number))
+                    self._send_command_long(REQUEST, float(number))
 
-    def _send_command(self, command: int, *parameters: float) -> None:
+    def _send_command_long(self, command: int, *parameters: float) -> None:
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
         self.hearing.rivals.sent_command(command, self.hearing.vehicle_s)
         self._write(self._mav.command_long_encode(self.hearing.system, AUTOPILOT, command, 0, *filled))
@@ -168,12 +168,12 @@ class Session:
             return  # who knows what it does by now; a link may also keep things to deliver them late
         match wish:
             case SetMode(mode):
-                self._send_command(SET_MODE, CUSTOM_MODE, *dialect.mode_parameters(Mode(mode)))
+                self._send_command_long(SET_MODE, CUSTOM_MODE, *dialect.mode_parameters(Mode(mode)))
             case Arm():
-                self._send_command(ARM, 1.0)
+                self._send_command_long(ARM, 1.0)
             case TakeOff(altitude_m) if not dialect.climbs_by_setpoint and known.position is not None:
                 climb_m = altitude_m - known.position.up_m  # above home, which is where it stands
-                self._send_command(TAKE_OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, climb_m)
+                self._send_command_long(TAKE_OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, climb_m)
 
     def _send_setpoint(self, setpoint: Enu, vehicle_s: float) -> None:
         hearing = self.hearing

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from uav_dc_ros.offboard.flight_stacks import COPTERS, DIALECTS, Dialect
+from uav_dc_ros.offboard.flight_stacks import COPTERS, DIALECTS, FlightStack
 
 SYSTEM, COMPONENT = 255, 191  # of this end: what FS_GCS_ENABLE of ArduPilot looks after; an onboard computer
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -26,7 +26,7 @@ class Systems:
 
     def __init__(self, named: int | None, again: bool = False) -> None:
         self.named, self.number = named, named
-        self.dialect: Dialect | None = None
+        self.dialect: FlightStack | None = None
         self._listens = LISTENED if not again else LISTENED_AGAIN if named is None else 1
         self._heartbeats = 0  # of the vehicle
         self._present: dict[int, tuple[float, str]] = {}  # vehicles that could be meant: when they spoke last

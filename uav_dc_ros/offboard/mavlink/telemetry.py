@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from uav_dc_ros.offboard import limits
-from uav_dc_ros.offboard.flight_stacks import BATTERY, LANDING, ON_GROUND, Dialect
+from uav_dc_ros.offboard.flight_stacks import BATTERY, LANDING, ON_GROUND, FlightStack
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, sphere_scale
 from uav_dc_ros.offboard.mavlink.message_order import Discard, Sequence, VehicleClock
-from uav_dc_ros.offboard.mavlink.other_controllers import Rivals
+from uav_dc_ros.offboard.mavlink.other_controllers import OtherControllers
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM, Systems
 from uav_dc_ros.offboard.vehicle import Limits, Mode, Telemetry
 
@@ -57,7 +57,7 @@ IS_POSSIBLE: dict[str, Callable[[Any], bool]] = {
 }
 
 
-class Hearing:
+class MavlinkTelemetry:
     """One vehicle, as it tells of itself.
 
     Args:
@@ -82,7 +82,7 @@ class Hearing:
         self, datum: Geodetic | None, place: Enu, system: int | None = None, again: bool = False
     ) -> None:
         self.datum, self.place = datum, place
-        self.systems, self.rivals = Systems(system, again), Rivals((SYSTEM, COMPONENT))
+        self.systems, self.rivals = Systems(system, again), OtherControllers((SYSTEM, COMPONENT))
         self.parameters = limits.Parameters()
         self.discarded: Counter[str] = Counter()
         self._sequence, self._clock = Sequence(), VehicleClock()
@@ -113,7 +113,7 @@ class Hearing:
         return self.systems.number
 
     @property
-    def dialect(self) -> Dialect | None:
+    def dialect(self) -> FlightStack | None:
         """What kind of autopilot it has; None: it has not spoken yet."""
         return self.systems.dialect
 

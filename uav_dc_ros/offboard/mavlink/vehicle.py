@@ -16,9 +16,9 @@ from typing import Any, Self
 
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.frames import Enu, Geodetic
-from uav_dc_ros.offboard.mavlink.connection import Address, Link, LinkDown, load_serial
+from uav_dc_ros.offboard.mavlink.connection import Address, Connection, ConnectionLost, load_serial
 from uav_dc_ros.offboard.mavlink.session import Session
-from uav_dc_ros.offboard.mavlink.telemetry import Hearing
+from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.realtime import run_when_due
 from uav_dc_ros.offboard.vehicle import Telemetry, Wish
 
@@ -42,7 +42,7 @@ def load_codec() -> Any:
         ) from None
 
 
-class Mavlink:
+class MavlinkVehicle:
     """One vehicle on one link, from `with Mavlink(...) as vehicle` to the end of the block.
 
     Args:
@@ -71,12 +71,12 @@ class Mavlink:
         codec = load_codec()
         if self.address.kind == "serial":
             load_serial(self.address)
-        self._hearing = Hearing(datum, place, system, again=bool(anchor))
+        self._hearing = MavlinkTelemetry(datum, place, system, again=bool(anchor))
         self._session = Session(codec, self._hearing, self._write)
         self._lock = threading.Lock()  # of both
         self._down: str | None = f"{self.address} is not open yet"
         self._failed: VehicleError | None = None
-        self._link: Link | None = None
+        self._link: Connection | None = None
         self._wake_out, self._wake_in = os.pipe()
         os.set_blocking(self._wake_in, False)
         os.set_blocking(self._wake_out, False)
@@ -177,19 +177,19 @@ class Mavlink:
                 now_s = time.monotonic()
                 heard_s = now_s if data else heard_s
                 if now_s - heard_s > SILENCE_S:
-                    raise LinkDown(f"{self.address} says nothing for {SILENCE_S:g} s")
+                    raise ConnectionLost(f"{self.address} says nothing for {SILENCE_S:g} s")
                 with self._lock:
                     if self._session.receive(data, now_s):
                         self._link.answer_here()
                     self._session.send(now_s)
-            except LinkDown as error:
+            except ConnectionLost as error:
                 self._drop(str(error))
         self._drop("closed")
 
     def _write(self, data: bytes) -> bool:
         return self._link is not None and self._link.write(data)
 
-    def _pause(self, seconds: float, link: Link | None = None) -> None:
+    def _pause(self, seconds: float, link: Connection | None = None) -> None:
         """Wait for something to do, or a time."""
         files: list[Any] = [self._wake_out] if link is None else [self._wake_out, link]
         ready, _, _ = select.select(files, [], [], seconds)
@@ -199,7 +199,7 @@ class Mavlink:
     def _open(self) -> None:
         try:
             link = self.address.open()
-        except LinkDown as error:
+        except ConnectionLost as error:
             self._drop(str(error))
         except VehicleError as error:
             self._failed, self._ended = error, True

@@ -7,7 +7,7 @@ SystemStatusDiag.) Each status bears the node's name and, as its hardware, the l
 
 from collections.abc import Mapping
 
-from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4, Dialect
+from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4, FlightStack
 
 HEARTBEAT, SYSTEM = "Heartbeat", "System"  # tasks
 BEATS, KIND, VEHICLE, MODE, STATE = (
@@ -41,7 +41,7 @@ class Diagnostics:
     """
 
     def __init__(self) -> None:
-        self.dialect: Dialect | None = None
+        self.dialect: FlightStack | None = None
         self.mode_name = ""
         self.armed: bool | None = None
         self.heartbeat_s: float | None = None

@@ -21,12 +21,12 @@ from uav_dc_ros.offboard.flight_stacks import (
     ON_GROUND,
     PREARM_CHECK,
     PX4,
-    Dialect,
+    FlightStack,
 )
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavros.diagnostics import Diagnostics
 from uav_dc_ros.offboard.mavros.vehicle_time import VehicleTime
-from uav_dc_ros.offboard.stamp_order import Order
+from uav_dc_ros.offboard.stamp_order import StampOrder
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry
 
 POSE, FIX = "mavros/local_position/pose", "mavros/global_position/global"
@@ -48,7 +48,7 @@ FIX_S = 2.0  # age of a fix that still belongs to a vehicle on the ground
 ALOFT_M = 1.0  # above where it stood: it does not stand there any more
 
 
-class Hearing:
+class MavrosTelemetry:
     """One vehicle, as MAVROS tells of it. Times are steady, seconds; positions metres.
 
     Args:
@@ -86,7 +86,7 @@ class Hearing:
         self._fix: Geodetic | None = None
         self._batteries: dict[str, tuple[float | None, float | None]] = {}  # charge, volts
         self._time = VehicleTime()
-        self._order = Order()
+        self._order = StampOrder()
         self._tilt_rad: float | None = None
         self._home: Enu | None = None  # in MAVROS's frame, as the next
         self._target: Enu | None = None
@@ -94,7 +94,7 @@ class Hearing:
         self.discarded: Counter[str] = Counter()
 
     @property
-    def dialect(self) -> Dialect | None:
+    def dialect(self) -> FlightStack | None:
         """What kind of autopilot it has."""
         return self.diagnostics.dialect
 

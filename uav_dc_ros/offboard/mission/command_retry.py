@@ -1,6 +1,6 @@
 """When a wish may be uttered again that was not fulfilled."""
 
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import TakeOff, Wish
 
 # As many pauses between wishes to take off. Motors need two seconds to lift the vehicle. ArduPilot disarms it
@@ -8,7 +8,7 @@ from uav_dc_ros.offboard.vehicle import TakeOff, Wish
 TAKEOFF_RETRIES = 1.5
 
 
-class Asked:
+class CommandRetry:
     """The wishes of one phase.
 
     Args:
@@ -18,7 +18,7 @@ class Asked:
     the clock's: a request may be lost then, too.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SafetySettings) -> None:
         self._settings = settings
         self._time_s = 0.0
         self._seen_s: tuple[float, float] | None = None  # vehicle time and steady clock, at the last look

@@ -20,23 +20,23 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import PhaseError
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.command_retry import Asked
-from uav_dc_ros.offboard.mission.crash_detector import Crash
-from uav_dc_ros.offboard.mission.fault_detector import Settings, Watch
-from uav_dc_ros.offboard.mission.fault_timer import Hold
-from uav_dc_ros.offboard.mission.geofence import Fence
-from uav_dc_ros.offboard.mission.landing import DOWN, Descent, Next
-from uav_dc_ros.offboard.mission.policy_timeout import Patience
-from uav_dc_ros.offboard.mission.preflight import Ground, rival
-from uav_dc_ros.offboard.mission.progress import Cell, Course, Dwell, Standing
-from uav_dc_ros.offboard.mission.stall_detector import Tracking
+from uav_dc_ros.offboard.mission.command_retry import CommandRetry
+from uav_dc_ros.offboard.mission.crash_detector import CrashDetector
+from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
+from uav_dc_ros.offboard.mission.fault_timer import FaultTimer
+from uav_dc_ros.offboard.mission.geofence import Geofence
+from uav_dc_ros.offboard.mission.landing import DOWN, Landing, Next
+from uav_dc_ros.offboard.mission.policy_timeout import PolicyTimeout
+from uav_dc_ros.offboard.mission.preflight import Preflight, rival
+from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, Dwell, MissionProgress
+from uav_dc_ros.offboard.mission.stall_detector import StallDetector
 from uav_dc_ros.offboard.vehicle import Mode, SetMode, TakeOff, Telemetry, Wish
 from uav_dc_ros.phases import DECIDED, FLYING, GROUND, STEERED, impossible
 
 POLICY_IS_GONE = "the policy is gone"
 
 
-class Bridge:
+class MissionController:
     """One mission of one vehicle.
 
     Args:
@@ -60,36 +60,36 @@ class Bridge:
     def __init__(
         self,
         scenario: Scenario,
-        settings: Settings,
+        settings: SafetySettings,
         on_change: Callable[[], None] = lambda: None,
-        standing: Standing | None = None,
-        fence: Fence | None = None,
+        standing: Checkpoint | None = None,
+        fence: Geofence | None = None,
     ) -> None:
         self.scenario, self.settings = scenario, settings
-        self.fence = fence or Fence.around(scenario)
+        self.fence = fence or Geofence.around(scenario)
         self.phase, self.reason = Phase.IDLE, "not started"
-        self.course = Course(scenario, standing)
+        self.course = MissionProgress(scenario, standing)
         self.setpoint: Enu | None = None
         self.policy_is_gone = False
         self._entered_step = self.step  # when the phase was entered
         self._on_change = on_change
-        self._asked = Asked(settings)
+        self._asked = CommandRetry(settings)
         self._since_s = 0.0  # vehicle time of the last change of phase
         self._dwell = Dwell(settings)
-        self._patience = Patience(settings, scenario.mission.step_s)
+        self._patience = PolicyTimeout(settings, scenario.mission.step_s)
         self._now_s = 0.0  # vehicle time
         self._steady_s = self._since_steady_s = 0.0  # steady clock: last tick, last change of phase
         self._known = Telemetry()
         home = self.course.standing.home
-        self._watched = Watch(settings, self.course.standing.at_rest_v, Enu(*home) if home else None)
-        self._descent = Descent(self.course, self._watched, settings.then, Phase.ABORTED, "")
-        self._hold = Hold(settings.hold_s)
-        self._crash = Crash(settings)
-        self._tracking = Tracking(self.course, settings)
+        self._watched = FaultDetector(settings, self.course.standing.at_rest_v, Enu(*home) if home else None)
+        self._descent = Landing(self.course, self._watched, settings.then, Phase.ABORTED, "")
+        self._hold = FaultTimer(settings.hold_s)
+        self._crash = CrashDetector(settings)
+        self._tracking = StallDetector(self.course, settings)
         self._finishes = self.course.standing.goal is not None  # the move that an earlier bridge had begun
         self._reported: str | None = None  # another system that commands the vehicle in flight
         self._taken = self.course.standing.released  # somebody else has the vehicle
-        self._ground = Ground(self.course, settings, self.fence, self._watched)
+        self._ground = Preflight(self.course, settings, self.fence, self._watched)
         self._kept = self._to_keep()
 
     @property
@@ -132,7 +132,7 @@ class Bridge:
         return self._ground.warnings(self._known)
 
     @property
-    def standing(self) -> Standing:
+    def standing(self) -> Checkpoint:
         """Where the mission stands now."""
         kept = msgspec.structs.replace(
             self.course.standing,
@@ -423,7 +423,7 @@ class Bridge:
 
     def _descend(self, how: Mode, outcome: Phase, why: str, blind_since_s: float | None = None) -> None:
         """Bring it down; until it obeys, the setpoint holds it where it is."""
-        self._descent = Descent(self.course, self._watched, how, outcome, why, blind_since_s)
+        self._descent = Landing(self.course, self._watched, how, outcome, why, blind_since_s)
         self._descent.obeys(self._known)  # it may come down already
         self._enter(Phase.LANDING, why)
 

@@ -3,11 +3,11 @@
 import math
 
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Telemetry
 
 
-class Crash:
+class CrashDetector:
     """Looks at one phase of a flight after the other.
 
     Args:
@@ -17,7 +17,7 @@ class Crash:
         flies: was it seen in the air, or does its phase say so?
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SafetySettings) -> None:
         self._settings = settings
         self._since_s: dict[str, float] = {}  # vehicle time, by what is wrong
         self.begin(flies=False)

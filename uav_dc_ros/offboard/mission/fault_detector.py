@@ -16,7 +16,7 @@ CLOCK_S = 3.0  # steady time for which the vehicle's own may stand still
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class SafetySettings:
     """How carefully to fly.
 
     Attributes:
@@ -90,7 +90,7 @@ class Fault:
     why: str
 
 
-class Watch:
+class FaultDetector:
     """Finds what is wrong with the telemetry of a vehicle.
 
     Args:
@@ -103,7 +103,9 @@ class Watch:
         home: where the vehicle stood last before it was armed; None: not seen.
     """
 
-    def __init__(self, settings: Settings, at_rest_v: float | None = None, home: Enu | None = None) -> None:
+    def __init__(
+        self, settings: SafetySettings, at_rest_v: float | None = None, home: Enu | None = None
+    ) -> None:
         self.settings = settings
         self.battery = Battery(settings.least_battery, at_rest_v)
         self.home = home

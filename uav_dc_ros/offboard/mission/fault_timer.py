@@ -7,7 +7,7 @@ from uav_dc_ros.offboard.mission.fault_detector import Fault
 from uav_dc_ros.offboard.vehicle import Telemetry
 
 
-class Hold:
+class FaultTimer:
     """A fault that may pass.
 
     Args:

@@ -4,11 +4,11 @@ import math
 
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Limits
 
 
-def misfit(scenario: Scenario, settings: Settings, limits: Limits, home: Enu) -> str | None:
+def misfit(scenario: Scenario, settings: SafetySettings, limits: Limits, home: Enu) -> str | None:
     """Why the autopilot would refuse some cell's centre, with tolerance around it; None: it takes all.
 
     Args:
@@ -44,7 +44,7 @@ def misfit(scenario: Scenario, settings: Settings, limits: Limits, home: Enu) ->
     return None
 
 
-def warnings(scenario: Scenario, settings: Settings, limits: Limits) -> list[str]:
+def warnings(scenario: Scenario, settings: SafetySettings, limits: Limits) -> list[str]:
     """What a user should know of the autopilot's limits, though the mission can be flown."""
     grid, found = scenario.grid, []
     if limits.polygon_fence:

@@ -11,7 +11,7 @@ MARGIN_M = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fence:
+class Geofence:
     """A box in the grid's ENU frame.
 
     Attributes:

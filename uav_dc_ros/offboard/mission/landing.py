@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.fault_detector import Watch
-from uav_dc_ros.offboard.mission.progress import Course
-from uav_dc_ros.offboard.mission.stall_detector import Progress
+from uav_dc_ros.offboard.mission.fault_detector import FaultDetector
+from uav_dc_ros.offboard.mission.progress import MissionProgress
+from uav_dc_ros.offboard.mission.stall_detector import Approach
 from uav_dc_ros.offboard.vehicle import Mode, SetMode, Telemetry, Wish
 
 DOWN = (Mode.LAND, Mode.RETURN)
@@ -38,7 +38,7 @@ class Next:
     asked: bool = False
 
 
-class Descent:
+class Landing:
     """One way down.
 
     Args:
@@ -56,8 +56,8 @@ class Descent:
 
     def __init__(
         self,
-        course: Course,
-        watch: Watch,
+        course: MissionProgress,
+        watch: FaultDetector,
         how: Mode,
         outcome: Phase,
         why: str,
@@ -73,8 +73,8 @@ class Descent:
         self._seen_s: float | None = None  # steady time since when no new position came
         self._position_s: float | None = None  # when the newest came
         self._stood_s: float | None = None  # steady time when it was first seen disarmed
-        self._to_home, self._lower = Progress(NEARER_M), Progress(LOWER_M)
-        self._upward, self._downward = Progress(VERTICAL_M), Progress(VERTICAL_M)
+        self._to_home, self._lower = Approach(NEARER_M), Approach(LOWER_M)
+        self._upward, self._downward = Approach(VERTICAL_M), Approach(VERTICAL_M)
 
     def obeys(self, known: Telemetry) -> bool:
         """Does it come down, as it was told or as its own failsafe or a pilot knows better."""

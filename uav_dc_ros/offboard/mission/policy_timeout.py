@@ -1,9 +1,9 @@
 """How long a policy is waited for: one that is silent, and one that is gone."""
 
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 
 
-class Patience:
+class PolicyTimeout:
     """Of a bridge with its policy.
 
     Args:
@@ -15,7 +15,7 @@ class Patience:
         gone_since: vehicle time and steady clock since when nobody is there; None: somebody is.
     """
 
-    def __init__(self, settings: Settings, step_s: float) -> None:
+    def __init__(self, settings: SafetySettings, step_s: float) -> None:
         self.limit_s = settings.silent_steps * step_s
         self._least_s = settings.silent_s
         self.gone_since: tuple[float, float] | None = None

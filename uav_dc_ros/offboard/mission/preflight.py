@@ -6,16 +6,16 @@ Nothing here is done: each look ends in a `Next`, which the bridge carries out.
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission import field_check
-from uav_dc_ros.offboard.mission.fault_detector import Settings, Watch
-from uav_dc_ros.offboard.mission.geofence import Fence
+from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
+from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.landing import DOWN, Next
-from uav_dc_ros.offboard.mission.progress import Course
+from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, Telemetry, Wish
 
 UNPLACED_S = 5.0  # after which a vehicle that flies has no place on the grid, though a link has told of it
 
 
-class Ground:
+class Preflight:
     """Looks at a vehicle that does not fly the mission yet.
 
     Args:
@@ -31,7 +31,9 @@ class Ground:
         is_a_pilots: had somebody else it armed, or disarmed it? Then it is not to start again by itself.
     """
 
-    def __init__(self, course: Course, settings: Settings, fence: Fence, watch: Watch) -> None:
+    def __init__(
+        self, course: MissionProgress, settings: SafetySettings, fence: Geofence, watch: FaultDetector
+    ) -> None:
         self.course, self.settings, self.fence, self.watch = course, settings, fence, watch
         self.allowed_mode = course.standing.allowed_mode
         self.is_a_pilots = course.standing.is_a_pilots

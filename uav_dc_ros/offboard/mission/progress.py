@@ -10,13 +10,13 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.fault_detector import Settings
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry
 
 Cell = tuple[int, int, int]
 
 
-class Standing(msgspec.Struct, frozen=True, kw_only=True):
+class Checkpoint(msgspec.Struct, frozen=True, kw_only=True):
     """Where a mission stands, for a bridge that was killed and takes it up again.
 
     Attributes:
@@ -52,7 +52,7 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
     at_rest_v: float | None = None
 
 
-class Course:
+class MissionProgress:
     """Steps and cells of one mission.
 
     Args:
@@ -66,9 +66,9 @@ class Course:
         goal: the cell that it is in, or flies to.
     """
 
-    def __init__(self, scenario: Scenario, standing: Standing | None = None) -> None:
+    def __init__(self, scenario: Scenario, standing: Checkpoint | None = None) -> None:
         self.scenario = scenario
-        self.standing = standing or Standing(step=0, cell=scenario.start_cell)
+        self.standing = standing or Checkpoint(step=0, cell=scenario.start_cell)
         self.step, self.cell = self.standing.step, self.standing.cell
         self.goal = self.standing.goal or self.standing.cell
         self.steps_not_reached = self.standing.steps_not_reached
@@ -95,7 +95,7 @@ class Course:
         """Horizontal distance of a position from the dock."""
         return math.dist(position[:2], self.scenario.mission.dock_m)
 
-    def may_end_at(self, position: Enu, settings: Settings) -> bool:
+    def may_end_at(self, position: Enu, settings: SafetySettings) -> bool:
         """May a step end at a position whose time is over, though its goal was not reached."""
         grid = self.scenario.grid
         sizes_m = (grid.cell_m, grid.cell_m, grid.altitude_step_m)
@@ -132,7 +132,7 @@ class Dwell:
         settings: how near, and for how long.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SafetySettings) -> None:
         self._settings = settings
         self._since_s: float | None = None  # vehicle time
 

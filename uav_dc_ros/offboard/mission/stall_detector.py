@@ -4,15 +4,15 @@ import math
 
 from uav_dc_ros.messages import FaultKind
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.fault_detector import Fault, Settings
-from uav_dc_ros.offboard.mission.progress import Course
+from uav_dc_ros.offboard.mission.fault_detector import Fault, SafetySettings
+from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.vehicle import Telemetry
 
 NEARER_M = 1.0  # by what a vehicle has to come nearer to count as doing so
 TARGET_M = 1.0  # by what a target that the autopilot reports may differ from the setpoint, beyond tolerance
 
 
-class Progress:
+class Approach:
     """Of a distance, which has to fall.
 
     Args:
@@ -43,7 +43,7 @@ class Progress:
         return vehicle_s - self._since_s
 
 
-class Tracking:
+class StallDetector:
     """How the vehicle follows its setpoint, and comes nearer to the goal.
 
     Args:
@@ -54,11 +54,11 @@ class Tracking:
         is_late: is the time of the step that it flies over? Then it has to come nearer.
     """
 
-    def __init__(self, course: Course, settings: Settings) -> None:
+    def __init__(self, course: MissionProgress, settings: SafetySettings) -> None:
         self._course, self._settings = course, settings
         self._setpoint: Enu | None = None
         self._sent_s = 0.0  # steady clock: since when it is that
-        self._progress = Progress(NEARER_M)
+        self._progress = Approach(NEARER_M)
         self.begin()
 
     def begin(self) -> None:

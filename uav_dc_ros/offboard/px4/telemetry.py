@@ -10,7 +10,7 @@ from typing import Any
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.flight_stacks import COPTERS
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, tilt_rad, to_enu
-from uav_dc_ros.offboard.stamp_order import Order
+from uav_dc_ros.offboard.stamp_order import StampOrder
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry
 
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: as whom commands are sent, so that answers are told apart
@@ -61,7 +61,7 @@ WHY = (  # of failsafe_flags: what keeps PX4 from OFFBOARD, or from arming
 )
 
 
-class Px4Hearing:
+class Px4Telemetry:
     """One vehicle, as its topics tell of it.
 
     Args:
@@ -100,7 +100,7 @@ class Px4Hearing:
         self._batteries: dict[int, tuple[float, float, bool]] = {}  # by number: charge, volts, does it fail
         self._tilt_rad: float | None = None
         self._home: Ned | None = None
-        self._orders = {name: Order() for name in ORDERED}
+        self._orders = {name: StampOrder() for name in ORDERED}
         self.discarded: Counter[str] = Counter()
         self._flags: Any = None
         self._refusals: dict[str, str] = {}  # by what was refused, the latest at the end

@@ -20,7 +20,7 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import Crowd
+from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings.recorded_step import RecordedStep, is_later_only, with_standing_of
@@ -161,7 +161,7 @@ class World(Book):
         self._scenario, self._seeded, self._real = scenario, seeded, real
         self._lockstep = lockstep or real
         self._before: RecordedStep | None = None
-        self._crowd: Crowd | None = None
+        self._crowd: WalkingUsers | None = None
         self._crowd_of = -1  # seed
 
     def add(self, step: RecordedStep) -> None:
@@ -258,7 +258,7 @@ class World(Book):
     def _users_m(self, seed: int, step: int) -> Array:
         """Users of the mission with a seed after some steps, metres, `[U, 2]`."""
         if self._crowd is None or self._crowd_of != seed or self._crowd.step > step:
-            self._crowd, self._crowd_of = Crowd(self._scenario, seed), seed
+            self._crowd, self._crowd_of = WalkingUsers(self._scenario, seed), seed
         self._crowd.walk(step - self._crowd.step)
         return self._crowd.positions_m
 
