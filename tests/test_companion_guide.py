@@ -172,7 +172,7 @@ def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert "end a second after its last decision" in GUIDE
     assert geofence.MARGIN_M == 20.0
     assert "The fence is the grid with 20 m around it and above its top layer" in GUIDE
-    assert SafetySettings().returning_tries == 3
+    assert SafetySettings().max_return_attempts == 3
     assert "refuses to return three times" in GUIDE.replace("\n", " ")
     assert NODES["policy"].restarts == 3
     assert supervisor.RESTART_WINDOW_S == 60

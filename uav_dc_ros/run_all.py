@@ -103,7 +103,7 @@ def parser(prog: str = PROG) -> cli.Parser:
         action="append",
         default=[],
         metavar="NODE.PARAMETER=VALUE",
-        help="any parameter of a node, such as bridge.then=land; repeatable",
+        help="any parameter of a node, such as bridge.failsafe_action=land; repeatable",
     )
     recording = options.add_mutually_exclusive_group()
     recording.add_argument(
@@ -248,7 +248,9 @@ def _setting(text: str) -> tuple[str, str, str]:
     where, equals, value = text.partition("=")
     node, dot, name = where.partition(".")
     if not (equals and dot and node and name):
-        raise argparse.ArgumentTypeError(f"{text!r}; expected NODE.PARAMETER=VALUE, such as bridge.then=land")
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; expected NODE.PARAMETER=VALUE, such as bridge.failsafe_action=land"
+        )
     return node, name, value
 
 

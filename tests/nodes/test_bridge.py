@@ -1,6 +1,7 @@
 """The bridge's node: missions through real nodes over real DDS, beside a fake autopilot on real MAVLink.
 
-The aircraft is what cannot exist here: see tests/support/fake_autopilot/autopilot.py for what its stand-in imitates.
+The aircraft is what cannot exist here: see tests/support/fake_autopilot/autopilot.py for what its stand-in
+    imitates.
 """
 
 import itertools
@@ -172,7 +173,7 @@ def test_the_second_flight_has_the_grid_of_the_first(ros: Ros, low: tuple[object
 
     def fly(autopilot: Fake, datum: str) -> str:
         given = ("--connect", autopilot.address, "--arm", "--datum", datum, "--no-record")
-        given = ("--vehicle", "mavlink", *given, "--set", "bridge.least_battery=0")
+        given = ("--vehicle", "mavlink", *given, "--set", "bridge.min_battery=0")
         status, output = ros.run_all(*low, *given)
         assert status == 0, output
         return output
@@ -232,7 +233,7 @@ def test_a_killed_policy_makes_the_vehicle_hold_and_a_killed_bridge_takes_the_mi
 def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object, ...]) -> None:
     with fake("ardupilot", speed=8.0) as autopilot:
         options = beside(autopilot, "--arm", "--bag", "bag", "--set", "bridge.flying_at_start=land")
-        process = ros.start("uav_dc_ros.run_all", *low, *options, "--set", "bridge.then=land")
+        process = ros.start("uav_dc_ros.run_all", *low, *options, "--set", "bridge.failsafe_action=land")
         until(lambda: flies_east(autopilot, 3), process)
         killed(ros, "bridge")
         status, output = finish(process)

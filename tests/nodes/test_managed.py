@@ -156,19 +156,22 @@ def test_a_world_that_is_configured_anew_has_the_topics_of_its_vehicle(ros: Ros)
 def test_a_whole_number_is_a_real_one_wherever_it_is_given(ros: Ros, asker: Asker) -> None:
     """On the command line, in a file of parameters, and set while the node runs."""
     file = ros.folder / "whole.yaml"
-    file.write_text("bridge: {ros__parameters: {hold_s: 10, datum: '-35,149,584'}}")
-    given = ("-p", "least_battery:=0", "-p", "silent_steps:=3", "--params-file", str(file))
+    file.write_text("bridge: {ros__parameters: {fault_timeout_s: 10, datum: '-35,149,584'}}")
+    given = ("-p", "min_battery:=0", "-p", "policy_timeout_steps:=3", "--params-file", str(file))
     node = waiting(ros, "bridge", "-p", f"connect:={NOBODY}", *given)
     real = [row for row in NODES["bridge"].parameters if isinstance(row.default, float)]
     whole = {row.name: math.ceil(row.least or 0) for row in real}
     told = asker.ask(node="/bridge", set=whole)
     assert all(answer["success"] for answer in told.values()), told
-    refused = asker.ask(node="/bridge", set={"hold_s": "long", "arm": 1, "retry_s": True, "then": "stay"})
+    refused = asker.ask(
+        node="/bridge",
+        set={"fault_timeout_s": "long", "arm": 1, "command_retry_s": True, "failsafe_action": "stay"},
+    )
     assert {name: answer["reason"] for name, answer in refused.items()} == {
-        "hold_s": "hold_s: 'long'; expected a number from 0.1 to 600.0 s",
+        "fault_timeout_s": "fault_timeout_s: 'long'; expected a number from 0.1 to 600.0 s",
         "arm": "arm: 1; expected true or false",
-        "retry_s": "retry_s: True; expected a number from 0.5 to 60.0 s",
-        "then": "then: 'stay'; expected one of return, land",
+        "command_retry_s": "command_retry_s: True; expected a number from 0.5 to 60.0 s",
+        "failsafe_action": "then: 'stay'; expected one of return, land",
     }
     assert asker.ask(node="/bridge", do="configure") == {"success": True, "state": "inactive"}
     ended(node)

@@ -103,7 +103,7 @@ def test_a_pilot_may_take_over_a_vehicle_that_comes_down(mode: Mode) -> None:
 
 
 def test_a_pilot_may_choose_another_way_down() -> None:
-    flight = fly_to_step(5, SafetySettings(arm=True, then=Mode.LAND))
+    flight = fly_to_step(5, SafetySettings(arm=True, failsafe_action=Mode.LAND))
     flight.vehicle.battery = 0.1
     flight.run(1.0)
     flight.vehicle.asked.clear()
@@ -146,7 +146,7 @@ def test_a_policy_has_its_time_on_the_clock_that_it_lives_by() -> None:
         ({"battery": 0.1}, "battery 10%"),
     ],
 )
-@pytest.mark.parametrize("then", [Mode.RETURN, Mode.LAND])
+@pytest.mark.parametrize("failsafe_action", [Mode.RETURN, Mode.LAND])
 def test_a_fault_that_stays_brings_it_down(fault: dict[str, object], why: str, then: Mode) -> None:
     flight = fly_to_step(5, SafetySettings(arm=True, then=then))
     for name, value in fault.items():
@@ -163,7 +163,7 @@ def test_a_vehicle_that_refuses_to_return_is_told_to_land() -> None:
     flight.vehicle.battery, flight.vehicle.refused = 0.1, (Mode.RETURN,)
     flight.until(Phase.ABORTED, 600.0)
     asked = [wish for wish in flight.vehicle.asked if isinstance(wish, SetMode)]
-    tries = flight.bridge.settings.returning_tries
+    tries = flight.bridge.settings.max_return_attempts
     assert asked[1:] == [SetMode(Mode.RETURN)] * tries + [SetMode(Mode.LAND)]
     assert "it does not return" in flight.bridge.reason
 
@@ -222,7 +222,7 @@ def test_nobody_takes_off_with_a_low_battery() -> None:
 
 
 def test_a_vehicle_that_was_not_seen_for_a_while_has_not_jumped() -> None:
-    flight = fly_to_step(5, SafetySettings(arm=True, jump_m=1.0, position_age_s=2.0))
+    flight = fly_to_step(5, SafetySettings(arm=True, max_position_jump_m=1.0, position_timeout_s=2.0))
     flight.run(4.0)
     flight.vehicle.frozen = True
     before = flight.vehicle.position

@@ -138,7 +138,7 @@ def test_steps_that_the_vehicle_s_speeds_do_not_allow_are_told_before_take_off()
 
 
 def slowly(speed_mps: float, **more: float) -> Flight:
-    flight = Flight(SafetySettings(arm=True, takeoff_s=3000.0, **more))  # type: ignore[arg-type]
+    flight = Flight(SafetySettings(arm=True, takeoff_timeout_s=3000.0, **more))  # type: ignore[arg-type]
     flight.vehicle.speeds_mps["across"] = speed_mps
     return flight
 
@@ -231,7 +231,7 @@ def test_a_vehicle_that_does_not_fly_any_more_ends_the_mission_at_once(
 
 
 def test_a_vehicle_that_stands_where_it_should_fly_ends_the_mission_at_once() -> None:
-    flight = fly_to_step(3, SafetySettings(arm=True, sink_limit_m=1000.0))
+    flight = fly_to_step(3, SafetySettings(arm=True, max_sink_m=1000.0))
     flight.vehicle.stuck = True
     while flight.vehicle.position.up_m > 0.0:
         up_m = max(0.0, flight.vehicle.position.up_m - 1.8)
@@ -242,7 +242,7 @@ def test_a_vehicle_that_stands_where_it_should_fly_ends_the_mission_at_once() ->
 
 
 def test_who_has_come_down_again_after_take_off_is_not_told_to_take_off_anew() -> None:
-    flight = Flight(SafetySettings(arm=True, sink_limit_m=1000.0))
+    flight = Flight(SafetySettings(arm=True, max_sink_m=1000.0))
     flight.until(Phase.TAKEOFF)
     flight.run(10.0)
     flight.vehicle.asked.clear()
@@ -300,7 +300,7 @@ def test_a_return_that_does_not_come_home_lands(wind_mps: float, reports_home: b
             tell(),
             setattr(vehicle, "told", dataclasses.replace(vehicle.told, home=None)),
         )  # type: ignore[method-assign,assignment,func-returns-value]
-    flight = Flight(SafetySettings(arm=True, fastest_mps=30.0), vehicle)
+    flight = Flight(SafetySettings(arm=True, max_speed_mps=30.0), vehicle)
     flight.until(Phase.LANDING)
     begun_s = vehicle.now_s
     flight.until(Phase.ABORTED)
@@ -325,7 +325,7 @@ def test_a_return_that_somebody_else_chose_is_only_watched_and_has_an_end_all_th
 
 @pytest.mark.parametrize("obeys", [True, False])
 def test_a_landing_that_comes_no_lower_has_an_end(obeys: bool) -> None:
-    flight = fly_to_step(5, SafetySettings(arm=True, then=Mode.LAND))
+    flight = fly_to_step(5, SafetySettings(arm=True, failsafe_action=Mode.LAND))
     flight.vehicle.battery, flight.vehicle.stuck, flight.vehicle.deaf = 0.1, True, not obeys
     flight.until(Phase.ABORTED, 200.0)
     what = "it lands" if obeys else "mode COMMANDED"
@@ -365,10 +365,12 @@ def cut(flight: Flight, seconds: float) -> None:
         flight.tick(known=dataclasses.replace(before, heartbeat_s=vehicle.now_s, vehicle_s=vehicle.now_s))
 
 
-@pytest.mark.parametrize("hold_s", [1.0, 1.5, 3.1, 5.0, 8.0])
+@pytest.mark.parametrize("fault_timeout_s", [1.0, 1.5, 3.1, 5.0, 8.0])
 @pytest.mark.parametrize("seconds", [9.0, 30.0])
-def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(hold_s: float, seconds: float) -> None:
-    flight = fly_to_step(5, SafetySettings(arm=True, hold_s=hold_s))
+def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(
+    fault_timeout_s: float, seconds: float
+) -> None:
+    flight = fly_to_step(5, SafetySettings(arm=True, fault_timeout_s=fault_timeout_s))
     flight.vehicle.asked.clear()
     cut(flight, seconds)
     flight.until(Phase.ABORTED)
@@ -378,7 +380,7 @@ def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(hold_s: flo
 
 
 def test_a_link_that_comes_back_in_time_is_held_through() -> None:
-    flight = fly_to_step(5, SafetySettings(arm=True, hold_s=20.0))
+    flight = fly_to_step(5, SafetySettings(arm=True, fault_timeout_s=20.0))
     cut(flight, 10.0)
     assert (flight.bridge.fault_kind, flight.bridge.reason) == (
         FaultKind.LINK, "link lost: no heartbeat for 3 s",
@@ -393,12 +395,12 @@ def test_an_estimate_that_is_lost_while_heartbeats_come_makes_it_land(reports: b
     """It is reported as bad, or reports of it do not come any more."""
     flight = fly_to_step(5)
     vehicle = flight.vehicle
-    lost_s = vehicle.now_s
+    link_lost_timeout_s = vehicle.now_s
     while not flight.bridge.is_over:
         known = dataclasses.replace(vehicle.told, estimate_ok=False)
         if not reports:
-            silent = vehicle.now_s - lost_s > 3.0
-            known = dataclasses.replace(known, estimate_ok=not silent, estimate_s=lost_s)
+            silent = vehicle.now_s - link_lost_timeout_s > 3.0
+            known = dataclasses.replace(known, estimate_ok=not silent, estimate_s=link_lost_timeout_s)
         flight.tick(known=known)
     assert flight.bridge.reason == "the autopilot has lost its position estimate"
     assert vehicle.asked[-1] == SetMode(Mode.LAND)

@@ -121,7 +121,7 @@ def test_a_short_sag_of_the_voltage_does_nothing(kind: str) -> None:
 
 @pytest.mark.parametrize("speed", [1.0, 8.0, 30.0])
 def test_the_failsafe_for_the_ground_station_stays_calm_at_any_speed_of_the_simulator(speed: float) -> None:
-    flight = VirtualFlight("ardupilot", SafetySettings(arm=True, link_age_s=3.0), speed=speed)
+    flight = VirtualFlight("ardupilot", SafetySettings(arm=True, heartbeat_timeout_s=3.0), speed=speed)
     flight.do("param FS_GCS_ENABLE 1")
     flight.until_over()
     check_landed(flight)

@@ -216,7 +216,7 @@ def test_a_vehicle_in_the_air_outside_the_fence_is_refused_at_once() -> None:
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5, 20])
 @pytest.mark.parametrize("unplaced", [True, False])
-@pytest.mark.parametrize("then", [Mode.RETURN, Mode.LAND])
+@pytest.mark.parametrize("failsafe_action", [Mode.RETURN, Mode.LAND])
 def test_a_bridge_that_is_stopped_brings_a_vehicle_down_in_every_phase(
     ticks: int, unplaced: bool, then: Mode
 ) -> None:

@@ -166,8 +166,8 @@ def test_a_vehicle_without_an_estimate_is_not_told_to_return_when_the_bridge_is_
     assert flight.vehicle.asked == [SetMode(Mode.LAND)]
 
 
-@pytest.mark.parametrize(("lost_s", "mode"), [(7.0, Mode.RETURN), (20.0, Mode.LAND)])
-def test_a_vehicle_whose_clock_stands_is_asked_again(lost_s: float, mode: Mode) -> None:
+@pytest.mark.parametrize(("link_lost_timeout_s", "mode"), [(7.0, Mode.RETURN), (20.0, Mode.LAND)])
+def test_a_vehicle_whose_clock_stands_is_asked_again(link_lost_timeout_s: float, mode: Mode) -> None:
     """Nothing comes but heartbeats, and the first request is lost, or as many as are a refusal."""
     flight = fly_to_step(3)
     vehicle = flight.vehicle
@@ -178,7 +178,7 @@ def test_a_vehicle_whose_clock_stands_is_asked_again(lost_s: float, mode: Mode) 
         for _ in range(round(seconds / 0.1)):
             flight.tick(known=dataclasses.replace(told, heartbeat_s=vehicle.now_s, mode=vehicle.mode))
 
-    run(lost_s)
+    run(link_lost_timeout_s)
     assert flight.bridge.phase is Phase.LANDING
     vehicle.deaf = False
     run(5.0)

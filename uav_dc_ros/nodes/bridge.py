@@ -68,7 +68,7 @@ class AutopilotBridge(MissionNode):
         self.scenario = scenarios.load(values["scenario"])
         names = [field.name for field in dataclasses.fields(SafetySettings)]
         settings = {name: values[name] for name in names}
-        self.settings = SafetySettings(**settings | {"then": Mode(values["then"])})
+        self.settings = SafetySettings(**settings | {"failsafe_action": Mode(values["failsafe_action"])})
         self.journal = Journal(values["journal"])
         self.fence = Geofence.around(self.scenario, values["fence_margin_m"])
         vehicles.check(*(values[name] for name in ("vehicle", "connect", "system", "arm")))
@@ -94,7 +94,7 @@ class AutopilotBridge(MissionNode):
         self._told: messages.Mission | None = None
         self._news: list[str] = []  # changes since the last diagnostics
         self._changes = 0
-        self._plausible = Plausibility(self.settings.fastest_mps, self.settings.jump_m)
+        self._plausible = Plausibility(self.settings.max_speed_mps, self.settings.max_position_jump_m)
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`

@@ -28,12 +28,12 @@ LIMIT_S = 120.0
 # The clock runs a hundredth as fast as the vehicle's: what is a blink of it is half a minute of a flight.
 CAREFUL = SafetySettings(
     arm=True,
-    position_age_s=0.5,
-    link_age_s=0.8,
-    hold_s=10.0,
-    lost_s=2.0,
-    silent_s=1.0,
-    landing_progress_s=3600.0,
+    position_timeout_s=0.5,
+    heartbeat_timeout_s=0.8,
+    fault_timeout_s=10.0,
+    link_lost_timeout_s=2.0,
+    policy_timeout_s=1.0,
+    landing_progress_timeout_s=3600.0,
 )
 ON_GROUND = (Phase.CONNECTING, Phase.PREFLIGHT)
 PILOT = {"ardupilot": "ALT_HOLD", "px4": "POSCTL"}

@@ -49,7 +49,7 @@ class CommandRetry:
     def may(self, wish: Wish) -> bool:
         """Utter a wish now: the first time, or long enough after the last; if so, it is."""
         waited_s = self.waited_s(wish)
-        pause_s = self._settings.retry_s * (TAKEOFF_RETRIES if isinstance(wish, TakeOff) else 1.0)
+        pause_s = self._settings.command_retry_s * (TAKEOFF_RETRIES if isinstance(wish, TakeOff) else 1.0)
         if waited_s is not None and waited_s < pause_s:
             return False
         self._last_s[wish] = self._time_s

@@ -82,8 +82,8 @@ class MissionController:
         self._known = Telemetry()
         home = self.course.standing.home
         self._watched = FaultDetector(settings, self.course.standing.at_rest_v, Enu(*home) if home else None)
-        self._descent = Landing(self.course, self._watched, settings.then, Phase.ABORTED, "")
-        self._hold = FaultTimer(settings.hold_s)
+        self._descent = Landing(self.course, self._watched, settings.failsafe_action, Phase.ABORTED, "")
+        self._hold = FaultTimer(settings.fault_timeout_s)
         self._crash = CrashDetector(settings)
         self._tracking = StallDetector(self.course, settings)
         self._finishes = self.course.standing.goal is not None  # the move that an earlier bridge had begun
@@ -360,8 +360,8 @@ class MissionController:
 
     def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
         start, position = self.course.target, known.position
-        if known.vehicle_s - self._since_s > self.settings.takeoff_s:
-            self._give_up(f"not at the start after {self.settings.takeoff_s:g} s")
+        if known.vehicle_s - self._since_s > self.settings.takeoff_timeout_s:
+            self._give_up(f"not at the start after {self.settings.takeoff_timeout_s:g} s")
             return []
         if position is not None and abs(position.up_m - start.up_m) <= self.settings.tolerance_m:
             self.setpoint = start  # at the altitude to fly across
@@ -413,7 +413,7 @@ class MissionController:
             self._descend(Mode.LAND, Phase.LANDED, f"step {self.step}: at the dock ({how})")
         else:
             why = f"step {self.step}: out of steps away from the dock ({how})"
-            self._descend(self.settings.then, Phase.TIMEOUT, why)
+            self._descend(self.settings.failsafe_action, Phase.TIMEOUT, why)
 
     def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
         waited_s = self._asked.waited_s(SetMode(Mode.RETURN))

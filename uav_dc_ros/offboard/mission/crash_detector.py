@@ -29,14 +29,14 @@ class CrashDetector:
         self._since_s.clear()
 
     def look(self, known: Telemetry, setpoint: Enu | None) -> str | None:
-        """What has gone wrong for `crash_s`; None: nothing, or it is not reported."""
+        """What has gone wrong for `crash_timeout_s`; None: nothing, or it is not reported."""
         settings, position = self._settings, known.position
         self.flies |= known.on_ground is False
         wrong: dict[str, str] = {}
-        if known.tilt_rad is not None and math.degrees(known.tilt_rad) > settings.tilt_limit_deg:
+        if known.tilt_rad is not None and math.degrees(known.tilt_rad) > settings.max_tilt_deg:
             wrong["tilt"] = (
                 f"tilted by {math.degrees(known.tilt_rad):.0f} degrees; expected at most "
-                f"{settings.tilt_limit_deg:g}"
+                f"{settings.max_tilt_deg:g}"
             )
         if self.flies and known.on_ground:
             wrong["ground"] = "on the ground, where it should fly"
@@ -44,13 +44,13 @@ class CrashDetector:
             self._lowest_m = min(self._lowest_m, setpoint.up_m)
             self._highest_m = max(self._highest_m, position.up_m)
             low_m = min(self._lowest_m, self._highest_m) - position.up_m
-            if low_m > settings.sink_limit_m:
+            if low_m > settings.max_sink_m:
                 wrong["sinks"] = (
                     f"at {position.up_m:.0f} m, {low_m:.0f} m too low; expected at most "
-                    f"{settings.sink_limit_m:g} m"
+                    f"{settings.max_sink_m:g} m"
                 )
         self._since_s = {what: self._since_s.get(what, known.vehicle_s) for what in wrong}
         for what, why in wrong.items():
-            if known.vehicle_s - self._since_s[what] > settings.crash_s:
+            if known.vehicle_s - self._since_s[what] > settings.crash_timeout_s:
                 return why
         return None

@@ -100,8 +100,8 @@ class Landing:
         self._lost_since_s = None
         if not known.armed:
             return self._stand(now_s, known)
-        if self._watch.clock_stands_for_s(now_s) > self._settings.lost_s:
-            why = f"{self.why}; its clock has stood still for {self._settings.lost_s:g} s"
+        if self._watch.clock_stands_for_s(now_s) > self._settings.link_lost_timeout_s:
+            why = f"{self.why}; its clock has stood still for {self._settings.link_lost_timeout_s:g} s"
             return Next(phase=Phase.ABORTED, why=why)
         if (stall := self._stalls(now_s, known)) is not None:
             returns = known.mode is self.how is Mode.RETURN and self.tries  # as it was asked to
@@ -126,12 +126,12 @@ class Landing:
         self._seen_s = None
         if self._blind_since_s is not None and (heartbeat_s or 0.0) <= self._blind_since_s:
             # No position came because nothing came.
-            self.how, self._blind_since_s = settings.then, None
-            self.why = f"link lost: no heartbeat for {settings.link_age_s:g} s"
+            self.how, self._blind_since_s = settings.failsafe_action, None
+            self.why = f"link lost: no heartbeat for {settings.heartbeat_timeout_s:g} s"
         if self._lost_since_s is None:
             self._lost_since_s = now_s if heartbeat_s is None else min(now_s, heartbeat_s)
-        if now_s - self._lost_since_s > settings.lost_s:
-            why = f"{self.why}; not heard of for {settings.lost_s:g} s"
+        if now_s - self._lost_since_s > settings.link_lost_timeout_s:
+            why = f"{self.why}; not heard of for {settings.link_lost_timeout_s:g} s"
             return Next(phase=Phase.ABORTED, why=why)
         return Next(phase=Phase.LANDING, why=self.why, setpoint=setpoint)
 
@@ -143,7 +143,7 @@ class Landing:
         if self._stood_s is None:
             self._stood_s = now_s
         here = self._position(now_s, known)
-        if (here is None or known.on_ground is False) and now_s - self._stood_s <= settings.hold_s:
+        if (here is None or known.on_ground is False) and now_s - self._stood_s <= settings.fault_timeout_s:
             return Next(phase=Phase.LANDING, why=self.why)  # its other messages come after the heartbeat
         if known.on_ground is False:
             wrong = "disarmed in the air"
@@ -157,13 +157,13 @@ class Landing:
 
     def _position(self, now_s: float, known: Telemetry) -> Enu | None:
         """Where it is; None if the last position is too old to tell."""
-        fresh = known.position_s is not None and now_s - known.position_s <= self._settings.position_age_s
+        fresh = known.position_s is not None and now_s - known.position_s <= self._settings.position_timeout_s
         return known.position if fresh else None
 
     def _refuses_to_return(self, waited_s: float | None) -> bool:
         settings = self._settings
-        answered = waited_s is None or waited_s >= settings.retry_s
-        return self.how is Mode.RETURN and self.tries >= settings.returning_tries and answered
+        answered = waited_s is None or waited_s >= settings.command_retry_s
+        return self.how is Mode.RETURN and self.tries >= settings.max_return_attempts and answered
 
     def _land_instead(self, now_s: float, why: str) -> None:
         self.how, self._instead, self.why = Mode.LAND, True, f"{self.why}; {why}"
@@ -179,8 +179,8 @@ class Landing:
                 progress.begin()
         if here is None or known.position_s == self._position_s:  # nothing new
             self._seen_s = now_s if self._seen_s is None else self._seen_s
-            blind = now_s - self._seen_s > settings.lost_s
-            return f"no position for {settings.lost_s:g} s" if blind else None
+            blind = now_s - self._seen_s > settings.link_lost_timeout_s
+            return f"no position for {settings.link_lost_timeout_s:g} s" if blind else None
         self._position_s, self._seen_s = known.position_s, now_s
         away_m = math.dist(here[:2], home[:2]) if home is not None else 0.0
         stalled_s = min(
@@ -190,12 +190,12 @@ class Landing:
         )
         landing_s = self._lower.stalled_s(here.up_m, vehicle_s)
         if known.mode is Mode.RETURN and not known.on_ground and not self._instead:
-            limit_s = settings.return_progress_s * (1.0 if home is not None else HOMELESS)
+            limit_s = settings.return_progress_timeout_s * (1.0 if home is not None else HOMELESS)
             if stalled_s <= limit_s:
                 return None
             far = f" ({away_m:.0f} m away)" if home is not None else ""
             return f"it returns, and has come no nearer to home{far} for {limit_s:g} s"
-        if landing_s > settings.landing_progress_s:
+        if landing_s > settings.landing_progress_timeout_s:
             what = "it lands" if known.mode is Mode.LAND else f"mode {known.mode_name or known.mode.value}"
-            return f"{what}, and has neither descended nor disarmed for {settings.landing_progress_s:g} s"
+            return f"{what}, and has neither descended nor disarmed for {settings.landing_progress_timeout_s:g} s"
         return None

@@ -16,8 +16,8 @@ class PolicyTimeout:
     """
 
     def __init__(self, settings: SafetySettings, step_s: float) -> None:
-        self.limit_s = settings.silent_steps * step_s
-        self._least_s = settings.silent_s
+        self.limit_s = settings.policy_timeout_steps * step_s
+        self._least_s = settings.policy_timeout_s
         self.gone_since: tuple[float, float] | None = None
 
     def is_over(self, since: tuple[float, float], now: tuple[float, float]) -> bool:

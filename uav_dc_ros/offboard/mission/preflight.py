@@ -90,7 +90,9 @@ class Preflight:
         if flies:
             if settings.flying_at_start == "land":
                 why = "it flew already when the bridge came"
-                return Next(phase=Phase.LANDING, why=why, setpoint=known.position, down=settings.then)
+                return Next(
+                    phase=Phase.LANDING, why=why, setpoint=known.position, down=settings.failsafe_action
+                )
             why = "it flies already: to the cell where the mission stands"
             return Next(phase=Phase.TAKEOFF, why=why, setpoint=self._above(known))
         # An autopilot may want to see setpoints before it follows any.
@@ -103,7 +105,7 @@ class Preflight:
         unplaced = not lost and known.armed and known.on_ground is False and known.position is None
         since_s = self._unplaced_since_s = (self._unplaced_since_s or now_s) if unplaced else None
         if self.course.standing.flies:
-            if waited_s > self.settings.lost_s:
+            if waited_s > self.settings.link_lost_timeout_s:
                 why = f"{why}; waited {waited_s:.0f} s"
                 left_alone = lost or not known.armed or self._is_anothers(known)
                 return Next(phase=Phase.ABORTED, why=why) if left_alone else self._down(known, why)
@@ -122,7 +124,7 @@ class Preflight:
     def _down(self, known: Telemetry, why: str, outcome: Phase = Phase.ABORTED) -> Next:
         """Go on coming down as it did before, or as it is told to."""
         before = self.course.standing
-        down = known.mode if known.mode in DOWN else before.down or self.settings.then
+        down = known.mode if known.mode in DOWN else before.down or self.settings.failsafe_action
         asked = before.asked and before.down is known.mode
         return Next(phase=Phase.LANDING, why=why, down=down, outcome=outcome, asked=asked)
 
@@ -146,7 +148,7 @@ class Preflight:
             return Next(phase=Phase.ABORTED, why=f"in mode {_name(known)} when the bridge came back")
         if breach is not None:
             why = f"outside the fence when the bridge came back: {breach}"
-            return Next(phase=Phase.LANDING, why=why, down=self.settings.then)
+            return Next(phase=Phase.LANDING, why=why, down=self.settings.failsafe_action)
         return None
 
     def prepare(self, now_s: float, known: Telemetry) -> Next:
@@ -187,7 +189,7 @@ class Preflight:
         breach = self.fence.breach(above)
         why = f"the target is outside the fence: {breach}" if breach is not None else self._misfit(known)
         if why is not None:
-            down = Mode.LAND if known.on_ground else self.settings.then
+            down = Mode.LAND if known.on_ground else self.settings.failsafe_action
             return Next(phase=Phase.LANDING, why=why, down=down)
         return Next(phase=Phase.TAKEOFF, why="armed, in the commanded mode", setpoint=above)
 

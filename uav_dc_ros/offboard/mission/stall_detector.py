@@ -103,7 +103,7 @@ class StallDetector:
         if known.position is None or known.position_s == self._position_s:
             return self._stall
         self._position_s = known.position_s
-        away_m, limit_s = self._course.distance_m(known.position), self._settings.progress_s
+        away_m, limit_s = self._course.distance_m(known.position), self._settings.progress_timeout_s
         if self._progress.stalled_s(away_m, known.vehicle_s) <= limit_s or not self.is_late:
             self._stall = None
             return None
