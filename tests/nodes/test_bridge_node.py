@@ -22,7 +22,7 @@ from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
-from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Command, Mode, Telemetry
 
 DATUM = Geodetic(latitude_deg=47.4, longitude_deg=8.5, altitude_m=400.0)
 FLIES = Telemetry(
@@ -42,7 +42,7 @@ class Stub:
 
     def __init__(self) -> None:
         self.known, self.datum = FLIES, None
-        self.asked: list[Wish] = []
+        self.asked: list[Command] = []
         self.setpoints: list[Enu | None] = []
         self.opened = self.closed = 0
         self.broken = ""
@@ -62,11 +62,11 @@ class Stub:
         now_s = time.monotonic()
         return replace(self.known, heartbeat_s=now_s, position_s=now_s)
 
-    def steer(self, setpoint: Enu | None) -> None:
+    def set_setpoint(self, setpoint: Enu | None) -> None:
         self.setpoints.append(setpoint)
 
-    def ask(self, wish: Wish) -> None:
-        self.asked.append(wish)
+    def ask(self, command: Command) -> None:
+        self.asked.append(command)
 
     def close(self) -> None:
         self.closed += 1
@@ -129,7 +129,7 @@ def test_the_vehicle_is_seen_obeying_while_the_bridge_stops(made: Made) -> None:
 
     node.create_subscription(String, "mode", obey, 1)
     made.until(lambda: publisher.get_subscription_count() == 1)
-    made.vehicle.ask = lambda wish: publisher.publish(String(data=wish.mode))  # type: ignore[method-assign]
+    made.vehicle.ask = lambda command: publisher.publish(String(data=command.mode))  # type: ignore[method-assign]
     node.trigger_deactivate()
     assert node._known.mode is Mode.RETURN
     assert node.bridge.is_done_with(node._known)

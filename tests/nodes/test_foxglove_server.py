@@ -36,7 +36,7 @@ def client(server: FoxgloveServer) -> FoxgloveClient:
 def test_a_client_is_told_every_topic_with_its_type(server: FoxgloveServer) -> None:
     with client(server) as viewer:
         assert viewer.server["name"] == "test"
-        assert viewer.server["capabilities"] == []  # whoever looks on cannot steer
+        assert viewer.server["capabilities"] == []  # whoever looks on cannot set_setpoint
         assert set(viewer.channels) == set(ROWS)
         for name, channel in viewer.channels.items():
             assert channel["encoding"] == "cdr"

@@ -171,7 +171,7 @@ def test_the_stream_is_20_hz_without_the_executor_and_ends_a_second_after_the_la
         target = Enu(20.0, 5.0, 10.0)
         began_s = time.monotonic()
         while time.monotonic() - began_s < 2.0:  # the executor stands still
-            vehicle.steer(target)
+            vehicle.set_setpoint(target)
             last_s = time.monotonic()
             time.sleep(0.5)
         time.sleep(LIFE_S + 3.0)
@@ -204,7 +204,7 @@ def test_names_can_be_remapped_and_others_who_fly_the_same_are_told(ros: Ros) ->
         until(executor, vehicle, lambda known: known.other_controller == rivals)
         node.destroy_publisher(other)
         until(executor, vehicle, lambda known: known.other_controller is None)
-        vehicle.steer(START)
+        vehicle.set_setpoint(START)
         mavros.wait_for("setpoint")
         restarted = stack.enter_context(mavros_of(node, anchor=vehicle.anchor))
         known = until(executor, restarted, lambda known: known.missing is None)

@@ -64,7 +64,7 @@ class Direct:
     def stop(self) -> None:
         pass
 
-    def steer(self, target: Any) -> None:
+    def set_setpoint(self, target: Any) -> None:
         if target is not None:
             self.send(target)
 
@@ -182,19 +182,19 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
         node.tell()
         known = vehicle.telemetry()
         refusals.add(known.refusal)
-        for wish in bridge.tick(clock.now_s, known):
-            vehicle.ask(wish)
+        for command in bridge.tick(clock.now_s, known):
+            vehicle.ask(command)
         if bridge.phase is Phase.READY and bridge.fault is None:
             assert bridge.move(bridge.step, way_home(bridge)) is None
             cells.append(bridge.course.goal)
-        vehicle.steer(bridge.setpoint)
+        vehicle.set_setpoint(bridge.setpoint)
     assert bridge.phase is Phase.LANDED, log[-5:]
     assert cells == [(2, 0, 0), (2, 1, 0), (2, 1, 0)]
     c = node.copter
     assert (c.landed, c.armed, node.autopilot.interrupted) == (True, False, 0)
     grid = np.add((c.ned[1], c.ned[0]), START[:2])
     assert np.allclose(grid, SCENARIO.mission.dock_m, atol=2.0)
-    asked = [(name, vars(wish)) for name, wish in node.services if "interval" not in name]
+    asked = [(name, vars(command)) for name, command in node.services if "interval" not in name]
     mode, land = ("OFFBOARD", "AUTO.LAND") if c.px4 else ("GUIDED", "LAND")
     takeoff = [] if c.px4 else [("mavros/cmd/takeoff", {"altitude": pytest.approx(10.0, abs=0.1)})]
     others = [entry for i, entry in enumerate(asked) if i == 0 or entry != asked[i - 1]]
@@ -204,7 +204,7 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
         *takeoff,
         ("mavros/set_mode", {"custom_mode": land}),
     ]
-    intervals = {wish.message_id for name, wish in node.services if "interval" in name}
+    intervals = {command.message_id for name, command in node.services if "interval" in name}
     assert intervals <= {32, 245, 230}
     assert 32 in intervals, "no pose came for two seconds"
     if c.px4:

@@ -27,7 +27,7 @@ from uav_dc_ros.offboard.mavros.telemetry import MavrosTelemetry
 from uav_dc_ros.offboard.mavros.vehicle_time import PATIENCE_S, VehicleTime
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
 from uav_dc_ros.offboard.setpoint_stream import LIFE_S, SetpointStream
-from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
+from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, TakeOff
 
 PLACE = Enu(20.0, 0.0, 0.0)
 LINK = "uas:///uas1"
@@ -89,7 +89,7 @@ def test_in_the_air_or_without_an_estimate_nothing_is_the_place() -> None:
             heartbeat(hearing, beats, "OFFBOARD", state, health=health)
         hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 100.0, 1.0)
         known = hearing.telemetry(1.0)
-        assert (known.position, hearing.may_steer) == (None, False)
+        assert (known.position, hearing.takes_setpoints) == (None, False)
         assert known.missing is not None
         assert "expected it" in known.missing or "not ready to arm" in known.missing
 
@@ -104,7 +104,7 @@ def test_an_anchor_needs_no_ground() -> None:
     known = hearing.telemetry(1.0)
     assert known.missing is None
     assert known.position == pytest.approx((20.1, 0.0, 23.0))
-    assert (known.armed, known.on_ground, hearing.may_steer) == (True, False, True)
+    assert (known.armed, known.on_ground, hearing.takes_setpoints) == (True, False, True)
     for wrong in ("1,2", "1,2,nan", "1,2,3,4", "here"):
         with pytest.raises(VehicleError, match=r"^anchor of MAVROS: .*; expected EAST,NORTH,UP"):
             MavrosTelemetry(PLACE, anchor=wrong)
@@ -160,7 +160,7 @@ def test_mode_arming_and_ground_follow_from_the_diagnostics() -> None:
         heartbeat(hearing, 4, "AUTO.LOITER", "Active" if armed else "Standby", kind)
         heartbeat(hearing, 5, mode, state, kind)
         known = hearing.telemetry(1.0)
-        told = (known.mode, known.armed, known.on_ground, hearing.may_steer)
+        told = (known.mode, known.armed, known.on_ground, hearing.takes_setpoints)
         assert told == (expected, armed, on_ground, steered), (kind, mode, state)
         assert known.mode_name == mode
 
@@ -380,7 +380,9 @@ def test_with_mavros_msgs_state_and_ground_are_what_it_says() -> None:
         hearing.on_state(Message(connected=True, armed=True, mode="GUIDED", system_status=4), 2.0)
         hearing.on_extended_state(Message(landed_state=landed_state), 2.0)
         known = hearing.telemetry(2.0)
-        assert (known.on_ground, hearing.may_steer) == (on_ground, steered), "a take-off is not interrupted"
+        assert (known.on_ground, hearing.takes_setpoints) == (on_ground, steered), (
+            "a take-off is not interrupted"
+        )
         assert (known.mode, known.armed, known.heartbeat_s) == (Mode.COMMANDED, True, 2.0)
     hearing.on_state(Message(connected=False, armed=False, mode="", system_status=0), 12.0)
     known = hearing.telemetry(12.0)
@@ -468,7 +470,7 @@ class Node:
 
 
 @pytest.mark.parametrize(
-    ("wish", "dialect", "service", "request_"),
+    ("command", "dialect", "service", "request_"),
     [
         (SetMode(Mode.COMMANDED), ARDUCOPTER, "mavros/set_mode", {"custom_mode": "GUIDED"}),
         (SetMode(Mode.COMMANDED), PX4, "mavros/set_mode", {"custom_mode": "OFFBOARD"}),
@@ -484,11 +486,11 @@ class Node:
     ],
 )
 def test_wishes_become_requests(
-    wish: Wish, dialect: Any, service: str, request_: dict[str, Any] | None
+    command: Command, dialect: Any, service: str, request_: dict[str, Any] | None
 ) -> None:
     node = Node()
     commands = Commands(node, PACKAGE, time.monotonic)  # type: ignore[arg-type]
-    commands.ask(wish, dialect, 2.5)
+    commands.ask(command, dialect, 2.5)
     asked = {name: client.requests for name, client in node.clients.items() if client.requests}
     assert asked == ({service: [Message(**request_)]} if request_ is not None else {})
     assert commands.refusal is None
@@ -578,10 +580,10 @@ def test_the_stream_keeps_its_pace_sends_news_at_once_and_ends_with_those_who_de
     time.sleep(0.2)
     assert not sent
     began_s = time.monotonic()
-    stream.steer("a")
+    stream.set_setpoint("a")
     time.sleep(0.33)
     before_s = time.monotonic()
-    stream.steer("b")
+    stream.set_setpoint("b")
     after_s = time.monotonic()
     time.sleep(LIFE_S + 2.0)
     of_a = [at_s for at_s, target in sent if target == "a"]
@@ -589,7 +591,7 @@ def test_the_stream_keeps_its_pace_sends_news_at_once_and_ends_with_those_who_de
     assert np.median(np.diff(of_b)) == pytest.approx(0.05, abs=0.02)
     assert 1 <= len(of_a) <= (before_s - began_s) / 0.05 + 3
     assert before_s + LIFE_S - 1.0 < of_b[-1] < after_s + LIFE_S + 1.5
-    stream.steer(None)
+    stream.set_setpoint(None)
     time.sleep(0.05)
     count = len(sent)
     time.sleep(0.12)
@@ -605,8 +607,8 @@ def test_a_stream_that_broke_is_not_believed_to_live() -> None:
 
     stream: SetpointStream[str] = SetpointStream(send, "test")
     stream.start()
-    stream.steer("a")
+    stream.set_setpoint("a")
     time.sleep(0.1)
     with pytest.raises(RuntimeError, match="no such publisher"):
-        stream.steer("a")
+        stream.set_setpoint("a")
     stream.stop()

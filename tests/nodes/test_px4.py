@@ -295,7 +295,7 @@ def test_where_it_is_comes_from_ned(msg: Any) -> None:
 
 def test_a_setpoint_goes_out_in_ned(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     goal = Enu(20.0, 10.0, 30.0)
-    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(goal)))
+    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.set_setpoint(goal)))
     setpoint, heartbeat = hand.setpoints[-1][1], hand.heartbeats[-1][1]
     assert list(setpoint.position) == [13.0, 18.0, -29.5]
     assert np.isnan([setpoint.velocity, setpoint.acceleration, setpoint.jerk]).all()
@@ -365,7 +365,7 @@ def test_the_stream_keeps_its_pace(vehicle: px4.Px4Vehicle, spun: Spun, hand: Ha
 
     def beat() -> None:
         hand.say()
-        vehicle.steer(goal)
+        vehicle.set_setpoint(goal)
         spun.pass_time(0.02)
 
     spun.until(lambda: len(hand.setpoints) > 3, beat)
@@ -386,14 +386,14 @@ def test_the_stream_ends_a_second_after_those_who_decide(
     vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand
 ) -> None:
     goal = Enu(0.0, 0.0, 50.0)
-    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(goal)))
-    vehicle.steer(goal)
+    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.set_setpoint(goal)))
+    vehicle.set_setpoint(goal)
     last_ns = time.time_ns()
     spun.pass_time(3.5, hand.say)
     for heard in (hand.heartbeats, hand.setpoints):  # best effort: the last ones may be lost on their way
         assert 0.5 * LIFE_S <= (heard[-1][0] - last_ns) / 1e9 <= LIFE_S + 0.2
     before = len(hand.heartbeats)
-    spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.steer(goal)))
+    spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.set_setpoint(goal)))
 
 
 @pytest.mark.parametrize("gone", ["silence", "xy_valid"])
@@ -402,19 +402,19 @@ def test_the_stream_ends_half_a_second_after_the_last_good_position(
 ) -> None:
     goal = Enu(0.0, 0.0, 50.0)
 
-    def steer() -> None:
-        vehicle.steer(goal)
+    def set_setpoint() -> None:
+        vehicle.set_setpoint(goal)
         if gone != "silence":
             bad = position(hand.msg, START, **{gone: False})
             hand.publishers["vehicle_local_position"].publish(bad)
 
-    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(goal)))
+    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.set_setpoint(goal)))
     last_ns = time.time_ns()
-    spun.pass_time(2.5, steer)
+    spun.pass_time(2.5, set_setpoint)
     assert px4.POSE_S - 0.2 <= (hand.heartbeats[-1][0] - last_ns) / 1e9 <= px4.POSE_S + 1.5
     assert vehicle.telemetry().estimate_ok is (gone == "silence")
     before = len(hand.heartbeats)
-    spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.steer(goal)))
+    spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.set_setpoint(goal)))
 
 
 @pytest.mark.parametrize(
@@ -438,11 +438,13 @@ def test_a_position_that_px4_does_not_trust_is_none(msg: Any, bad: dict[str, Any
 
 
 def test_no_setpoint_no_stream(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
-    spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.steer(Enu(0.0, 0.0, 50.0))))
-    vehicle.steer(None)
+    spun.until(
+        lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.set_setpoint(Enu(0.0, 0.0, 50.0)))
+    )
+    vehicle.set_setpoint(None)
     spun.pass_time(0.1, hand.say)
     before = len(hand.heartbeats), len(hand.setpoints)
-    spun.pass_time(0.4, lambda: (hand.say(), vehicle.steer(None)))
+    spun.pass_time(0.4, lambda: (hand.say(), vehicle.set_setpoint(None)))
     assert (len(hand.heartbeats), len(hand.setpoints)) == before
     vehicle.close()
     vehicle.close()
@@ -466,7 +468,7 @@ def test_a_stream_that_broke_is_not_believed_to_live(vehicle: px4.Px4Vehicle, sp
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(vehicle._publishers["trajectory_setpoint"], "publish", broken)
         with pytest.raises(RuntimeError, match="no such publisher"):
-            spun.pass_time(20.0, lambda: (hand.say(), vehicle.steer(Enu(0.0, 0.0, 50.0))))
+            spun.pass_time(20.0, lambda: (hand.say(), vehicle.set_setpoint(Enu(0.0, 0.0, 50.0))))
 
 
 def test_a_vehicle_whose_time_is_faster_gets_more_of_it(
@@ -478,7 +480,7 @@ def test_a_vehicle_whose_time_is_faster_gets_more_of_it(
         hand.say()
         where = position(hand.msg, START, timestamp=next(stamps))
         hand.publishers["vehicle_local_position"].publish(where)
-        vehicle.steer(Enu(0.0, 0.0, 50.0))
+        vehicle.set_setpoint(Enu(0.0, 0.0, 50.0))
         spun.pass_time(0.02)
 
     spun.until(lambda: len(hand.setpoints) > 3, say)
@@ -494,13 +496,13 @@ def test_a_vehicle_whose_time_is_faster_gets_more_of_it(
 
 
 def test_wishes_as_commands(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
-    for wish in (Arm(), SetMode(Mode.LAND)):
-        vehicle.ask(wish)  # nobody is there yet: to be forgotten, not kept
+    for command in (Arm(), SetMode(Mode.LAND)):
+        vehicle.ask(command)  # nobody is there yet: to be forgotten, not kept
     spun.until(lambda: vehicle.kind == "PX4", hand.say)
     assert hand.commands == []
-    wishes = [SetMode(mode) for mode in (Mode.COMMANDED, Mode.HOLD, Mode.RETURN, Mode.LAND)]
-    for wish in [*wishes, TakeOff(50.0), Arm()]:
-        vehicle.ask(wish)
+    commands = [SetMode(mode) for mode in (Mode.COMMANDED, Mode.HOLD, Mode.RETURN, Mode.LAND)]
+    for command in [*commands, TakeOff(50.0), Arm()]:
+        vehicle.ask(command)
     spun.until(lambda: len(hand.commands) == 5)
     said = [message for _, message in hand.commands]
     assert [(each.command, each.param1, each.param2, each.param3) for each in said] == [
@@ -729,13 +731,13 @@ class Flight:
 
     def tick(self) -> None:
         bridge, vehicle = self.bridge, self.vehicle
-        for wish in bridge.tick(time.monotonic(), vehicle.telemetry()):
-            vehicle.ask(wish)
+        for command in bridge.tick(time.monotonic(), vehicle.telemetry()):
+            vehicle.ask(command)
         if bridge.phase is Phase.READY and bridge.fault is None:
             x, y, _ = bridge.cell
             action = Action.RIGHT if x < 2 else Action.FORWARD if y < 2 else Action.HOVER
             assert bridge.move(bridge.step, action) is None
-        vehicle.steer(bridge.setpoint)
+        vehicle.set_setpoint(bridge.setpoint)
 
     def until(self, done: Callable[[], object], seconds: float = 90.0) -> None:
         """Fly until something is so."""

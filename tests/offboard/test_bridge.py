@@ -47,7 +47,9 @@ def test_without_arm_it_waits_for_a_pilot_and_asks_for_nothing() -> None:
     assert flight.bridge.phase is Phase.PREFLIGHT
     flight.vehicle.mode, flight.vehicle.armed = Mode.COMMANDED, True
     flight.until(Phase.LANDED)
-    assert not any(isinstance(wish, Arm) or wish == SetMode(Mode.COMMANDED) for wish in flight.vehicle.asked)
+    assert not any(
+        isinstance(command, Arm) or command == SetMode(Mode.COMMANDED) for command in flight.vehicle.asked
+    )
 
 
 def test_a_vehicle_whose_motors_need_their_time_is_not_told_to_take_off_anew() -> None:
@@ -55,9 +57,9 @@ def test_a_vehicle_whose_motors_need_their_time_is_not_told_to_take_off_anew() -
     flight.until(Phase.TAKEOFF)
     flight.vehicle.deaf = True  # it has heard, and is still on the ground
     flight.run(2.5)
-    assert sum(isinstance(wish, TakeOff) for wish in flight.vehicle.asked) == 1
+    assert sum(isinstance(command, TakeOff) for command in flight.vehicle.asked) == 1
     flight.run(1.0)
-    assert sum(isinstance(wish, TakeOff) for wish in flight.vehicle.asked) == 2
+    assert sum(isinstance(command, TakeOff) for command in flight.vehicle.asked) == 2
 
 
 def test_a_pilot_who_takes_over_has_it_at_once_and_for_good() -> None:
@@ -162,7 +164,7 @@ def test_a_vehicle_that_refuses_to_return_is_told_to_land() -> None:
     flight = fly_to_step(5)
     flight.vehicle.battery, flight.vehicle.refused = 0.1, (Mode.RETURN,)
     flight.until(Phase.ABORTED, 600.0)
-    asked = [wish for wish in flight.vehicle.asked if isinstance(wish, SetMode)]
+    asked = [command for command in flight.vehicle.asked if isinstance(command, SetMode)]
     tries = flight.bridge.settings.max_return_attempts
     assert asked[1:] == [SetMode(Mode.RETURN)] * tries + [SetMode(Mode.LAND)]
     assert "it does not return" in flight.bridge.reason

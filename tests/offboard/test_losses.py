@@ -248,7 +248,7 @@ def test_who_has_come_down_again_after_take_off_is_not_told_to_take_off_anew() -
     flight.vehicle.asked.clear()
     flight.vehicle.falls = True
     flight.until(Phase.ABORTED, 20.0)
-    assert not any(isinstance(wish, TakeOff) for wish in flight.vehicle.asked)
+    assert not any(isinstance(command, TakeOff) for command in flight.vehicle.asked)
     assert flight.bridge.reason.startswith("on the ground, where it should fly")
 
 
@@ -268,12 +268,12 @@ def test_commands_to_take_off_that_are_lost_are_repeated_before_the_autopilot_di
         lost = 0
         stands_s = 0.0
 
-        def ask(self, wish: object) -> None:
-            if isinstance(wish, TakeOff) and self.lost:
+        def ask(self, command: object) -> None:
+            if isinstance(command, TakeOff) and self.lost:
                 self.lost -= 1
-                self.asked.append(wish)
+                self.asked.append(command)
             else:
-                super().ask(wish)  # type: ignore[arg-type]
+                super().ask(command)  # type: ignore[arg-type]
 
         def pass_time(self, seconds: float, setpoint: Enu | None) -> None:
             super().pass_time(seconds, setpoint)
@@ -305,7 +305,9 @@ def test_a_return_that_does_not_come_home_lands(wind_mps: float, reports_home: b
     begun_s = vehicle.now_s
     flight.until(Phase.ABORTED)
     assert vehicle.now_s - begun_s < 35.0 + 30.0 + 210.0 / 1.5
-    assert [wish for wish in vehicle.asked if wish in (SetMode(Mode.RETURN), SetMode(Mode.LAND))] == [
+    assert [
+        command for command in vehicle.asked if command in (SetMode(Mode.RETURN), SetMode(Mode.LAND))
+    ] == [
         SetMode(Mode.RETURN),
         SetMode(Mode.LAND),
     ]

@@ -124,7 +124,7 @@ def until(
     end = time.monotonic() + 90.0
     while not right(known := vehicle.telemetry()):
         assert time.monotonic() < end, known
-        vehicle.steer(setpoint)
+        vehicle.set_setpoint(setpoint)
         time.sleep(0.005)
     return known
 
@@ -134,12 +134,12 @@ def hover(autopilot: Fake, vehicle: MavlinkVehicle, up_m: float = 10.0) -> Enu:
     known = until(vehicle, lambda known: known.missing is None and known.estimate_ok)
     assert known.position is not None
     target = Enu(known.position.east_m, known.position.north_m, up_m)
-    for wish, right in [
+    for command, right in [
         (SetMode(Mode.COMMANDED), lambda known: known.mode is Mode.COMMANDED),
         (Arm(), lambda known: known.armed),
         (TakeOff(up_m), lambda known: known.on_ground is False),
     ]:
-        vehicle.ask(wish)
+        vehicle.ask(command)
         until(vehicle, right)
     autopilot.wait_for("taken off")
     return target
@@ -194,7 +194,7 @@ def test_the_stream_ends_with_those_who_decide() -> None:
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 def test_the_first_heartbeat_goes_out_as_soon_as_somebody_can_hear_it(kind: str) -> None:
-    """The autopilot of a bridge that was killed waits for it: nobody has to steer first."""
+    """The autopilot of a bridge that was killed waits for it: nobody has to set_setpoint first."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
         autopilot.settimeout(15.0)
         autopilot.bind(("127.0.0.1", 0))
@@ -338,11 +338,11 @@ def test_a_take_off_command_that_was_lost_twice_is_followed_when_it_comes() -> N
     ):
         autopilot.do(f"ignore {mav.MAV_CMD_NAV_TAKEOFF} 2")
         until(vehicle, lambda known: known.missing is None and known.estimate_ok)
-        for wish, right in [
+        for command, right in [
             (SetMode(Mode.COMMANDED), lambda known: known.mode is Mode.COMMANDED),
             (Arm(), lambda known: known.armed),
         ]:
-            vehicle.ask(wish)
+            vehicle.ask(command)
             until(vehicle, right)
         for _ in range(2):
             vehicle.ask(TakeOff(10.0))

@@ -21,11 +21,11 @@ class Stubborn(Vehicle):
 
     stick_is_up = True
 
-    def ask(self, wish: object) -> None:
-        if isinstance(wish, Arm) and self.stick_is_up:
-            self.asked.append(wish)
+    def ask(self, command: object) -> None:
+        if isinstance(command, Arm) and self.stick_is_up:
+            self.asked.append(command)
         else:
-            super().ask(wish)  # type: ignore[arg-type]
+            super().ask(command)  # type: ignore[arg-type]
 
 
 def restarted(flight: Flight) -> Flight:

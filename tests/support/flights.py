@@ -124,8 +124,8 @@ class Flight:
                 self.bridge = self._bridge(standing=self._standing)
             vehicle.pass_time(self.tick_s, self._setpoint)
             return
-        for wish in bridge.tick(vehicle.now_s, vehicle.told):
-            vehicle.ask(wish)
+        for command in bridge.tick(vehicle.now_s, vehicle.told):
+            vehicle.ask(command)
         if vehicle.told.position is not None and vehicle.told.position_s == vehicle.now_s:
             self._say_pose(vehicle.told.position)
         self._decide(bridge)

@@ -196,7 +196,7 @@ class AutopilotBridge(MissionNode):
             raise MessageError("not_now", why)
 
     def _tick(self) -> None:
-        """Look at the vehicle, decide, steer."""
+        """Look at the vehicle, decide, set_setpoint."""
         self._known = known = self.vehicle.telemetry()
         self._keep_pace(known)
         self._publish_pose(known)
@@ -205,9 +205,9 @@ class AutopilotBridge(MissionNode):
             self._begin_if_all_ready()
         if self._begun:
             self.bridge.policy_is_gone = self._policy.is_gone()
-            for wish in self.bridge.tick(time.monotonic(), known):
-                self.vehicle.ask(wish)
-        self.vehicle.steer(self.bridge.setpoint)
+            for command in self.bridge.tick(time.monotonic(), known):
+                self.vehicle.ask(command)
+        self.vehicle.set_setpoint(self.bridge.setpoint)
         self._publish_target()
 
     def _keep_pace(self, known: Telemetry) -> None:

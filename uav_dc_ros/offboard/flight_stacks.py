@@ -70,7 +70,7 @@ class FlightStack:
             return float(custom_mode), 0.0
         return float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
 
-    def may_steer(self, landed_state: int | None) -> bool:
+    def takes_setpoints(self, landed_state: int | None) -> bool:
         """Do setpoints help now, on the ground or in the air."""
         return self.climbs_by_setpoint or landed_state == IN_AIR
 

@@ -32,7 +32,7 @@ class SetpointStream(Generic[Target]):
         """Begin; nothing is sent before there is a target."""
         self._thread.start()
 
-    def steer(self, target: Target | None) -> None:
+    def set_setpoint(self, target: Target | None) -> None:
         """Send this from now on, or nothing; it counts as a sign of life.
 
         Raises:

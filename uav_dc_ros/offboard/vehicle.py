@@ -1,4 +1,4 @@
-"""What passes between the bridge and a transport: telemetry one way, wishes the other."""
+"""What passes between the bridge and a transport: telemetry one way, commands the other."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -101,31 +101,31 @@ class Telemetry:
 
 @dataclass(frozen=True)
 class SetMode:
-    """A wish: change to a mode."""
+    """A command: change to a mode."""
 
     mode: Mode
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A wish: arm. Only ever uttered when the user asked for it."""
+    """A command: arm. Only ever sent when the user asked for it."""
 
 
 @dataclass(frozen=True)
 class TakeOff:
-    """A wish: climb from the ground to an altitude in the grid's frame, metres."""
+    """A command: climb from the ground to an altitude in the grid's frame, metres."""
 
     altitude_m: float
 
 
-Wish = SetMode | Arm | TakeOff
+Command = SetMode | Arm | TakeOff
 
 
 class Vehicle(Protocol):
     """A way to one vehicle. It receives, sends commands and streams setpoints. It decides nothing.
 
     It works from `open` to `close`. Its stream is a sign of life of those who decide: it ends a second
-    after the last call of `steer`, and then the autopilot's own failsafes take over.
+    after the last call of `set_setpoint`, and then the autopilot's own failsafes take over.
     """
 
     def open(self) -> None:
@@ -150,11 +150,11 @@ class Vehicle(Protocol):
             VehicleError: this machine cannot reach it at all.
         """
 
-    def steer(self, setpoint: Enu | None) -> None:
+    def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
 
-    def ask(self, wish: Wish) -> None:
-        """Pass a wish on, once; whether it was fulfilled, `telemetry` tells."""
+    def ask(self, command: Command) -> None:
+        """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
 
     def close(self) -> None:
         """End the stream, and the link; more than once is as good as once."""

@@ -175,11 +175,11 @@ class Flight:
         """What the node's timer does."""
         bridge = self.bridge
         self.known = self.vehicle.telemetry()
-        for wish in bridge.tick(time.monotonic(), self.known):
-            self.vehicle.ask(wish)
+        for command in bridge.tick(time.monotonic(), self.known):
+            self.vehicle.ask(command)
         if bridge.phase is Phase.READY and bridge.fault is None and self.policy is not None:
             bridge.move(bridge.step, self.policy(bridge))
-        self.vehicle.steer(bridge.setpoint)
+        self.vehicle.set_setpoint(bridge.setpoint)
 
     def until(
         self, done: Callable[[], bool], seconds: float = 60.0, beat: Callable[[], None] = lambda: None

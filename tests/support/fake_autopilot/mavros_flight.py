@@ -164,11 +164,11 @@ class Flight:
         """What the node's executor and timer do."""
         spin(self.executor, 0.01)
         bridge = self.bridge
-        for wish in bridge.tick(time.monotonic(), self.vehicle.telemetry()):
-            self.vehicle.ask(wish)
+        for command in bridge.tick(time.monotonic(), self.vehicle.telemetry()):
+            self.vehicle.ask(command)
         if bridge.phase is Phase.READY and bridge.fault is None:
             bridge.move(bridge.step, way_home(bridge))
-        self.vehicle.steer(bridge.setpoint)
+        self.vehicle.set_setpoint(bridge.setpoint)
 
     def until(self, done: Callable[[], bool], seconds: float = 90.0) -> None:
         """Fly until something is so."""

@@ -12,7 +12,7 @@ from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.offboard.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Arm, Command, Limits, Mode, SetMode, TakeOff, Telemetry
 
 SPEED_MPS = {"across": 10.0, "up": 2.5, "down": 1.5}
 RETURN_M = 15.0  # least altitude of a return
@@ -37,7 +37,7 @@ class Vehicle:
     estimate_ok: bool = True
     frozen: bool = False  # its position does not come any more
     silent: bool = False  # nothing comes any more
-    deaf: bool = False  # it follows no wish
+    deaf: bool = False  # it follows no command
     refused: tuple[Mode, ...] = ()
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of what it believes of its position
     said: str = ""
@@ -57,18 +57,18 @@ class Vehicle:
     other_controller: str | None = None
     unplaced: bool = False  # nobody knows where it is on the grid
     missing: str | None = None  # what else has not come
-    asked: list[Wish] = field(default_factory=list)
+    asked: list[Command] = field(default_factory=list)
     told: Telemetry = field(default_factory=Telemetry)
 
     @property
     def on_ground(self) -> bool:
         return self.position.up_m <= 0.05
 
-    def ask(self, wish: Wish) -> None:
-        self.asked.append(wish)
+    def ask(self, command: Command) -> None:
+        self.asked.append(command)
         if self.deaf or self.silent:
             return
-        match wish:
+        match command:
             case SetMode(mode) if mode in self.refused:
                 pass
             case SetMode(mode):
@@ -207,8 +207,8 @@ class Flight:
 
     def tick(self, tick_s: float = TICK_S, known: Telemetry | None = None) -> None:
         bridge, vehicle = self.bridge, self.vehicle
-        for wish in bridge.tick(vehicle.now_s, known or vehicle.told):
-            vehicle.ask(wish)
+        for command in bridge.tick(vehicle.now_s, known or vehicle.told):
+            vehicle.ask(command)
         if bridge.setpoint is not None:
             assert bridge.fence.breach(bridge.setpoint) is None
         if bridge.phase is Phase.READY and self.policy is not None:

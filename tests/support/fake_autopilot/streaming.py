@@ -33,7 +33,7 @@ def transport(address: str) -> None:
     run_when_due()
     with MavlinkVehicle(address) as vehicle:
         while True:
-            vehicle.steer(vehicle.telemetry().position)
+            vehicle.set_setpoint(vehicle.telemetry().position)
             time.sleep(0.1)
 
 

@@ -144,14 +144,14 @@ class VirtualFlight:
         for data in self.channel(list(_split(out)) if self.link_is_up else [], self.now_s):
             self.session.receive(data, self.now_s)
         known = self.hearing.telemetry(self.now_s)
-        for wish in self.bridge.tick(self.now_s, known):
-            self.session.ask(wish)
+        for command in self.bridge.tick(self.now_s, known):
+            self.session.ask(command)
         bridge = self.bridge
         if bridge.phase is Phase.READY and bridge.fault is None and self.policy is not None:
             bridge.move(bridge.step, self.policy(bridge))
         if bridge.setpoint is not None:
             assert bridge.fence.breach(bridge.setpoint) is None
-        self.session.steer(bridge.setpoint, self.now_s)
+        self.session.set_setpoint(bridge.setpoint, self.now_s)
         self.session.send(self.now_s)
 
     def until(self, done: Callable[[], Any], limit_s: float = 600.0) -> None:

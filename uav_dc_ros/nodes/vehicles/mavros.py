@@ -1,6 +1,7 @@
-"""A vehicle behind MAVROS: hears what that publishes, passes wishes on, streams setpoints. Decides nothing.
+"""A vehicle behind MAVROS: hears what that publishes, passes commands on, streams setpoints. Decides nothing.
 
-Standard messages are enough to fly: poses, setpoints, MAVROS's diagnostics, battery and fix. Wishes need the
+Standard messages are enough to fly: poses, setpoints, MAVROS's diagnostics, battery and fix. Commands need
+    the
 services of mavros_msgs, which is used where it is installed. Without it nobody is armed, no mode is changed,
 and ArduPilot is not told to take off: a pilot does all that, lands it, too, and takes over at any time; the
 bridge sees it. What it cannot ask for is in the telemetry's `refusal`, and in the node's log.
@@ -46,7 +47,7 @@ from uav_dc_ros.offboard.mavros.telemetry import (
     MavrosTelemetry,
 )
 from uav_dc_ros.offboard.setpoint_stream import SetpointStream
-from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Command, Mode, Telemetry
 
 SETPOINT = "mavros/setpoint_position/local"
 DIAGNOSTICS = "/diagnostics"  # absolute, as diagnostic_updater publishes it
@@ -178,24 +179,24 @@ class MavrosVehicle:
             self._looked_s, self._wrong = now_s, self._graph_problem()
         return dataclasses.replace(known, missing=self._wrong)
 
-    def steer(self, setpoint: Enu | None) -> None:
+    def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more.
 
         MAVROS passes a yaw on with each position: it is the one that the vehicle has as it begins to follow.
         """
         hearing = self._hearing
-        if setpoint is None or not hearing.may_steer:
-            self._stream.steer(None)
+        if setpoint is None or not hearing.takes_setpoints:
+            self._stream.set_setpoint(None)
             return
         if self._yaw_rad is None or hearing.mode is not Mode.COMMANDED:
             self._yaw_rad = hearing.yaw_rad
-        self._stream.steer(Target(hearing.to_mavros(setpoint), self._yaw_rad))
+        self._stream.set_setpoint(Target(hearing.to_mavros(setpoint), self._yaw_rad))
 
-    def ask(self, wish: Wish) -> None:
-        """Pass a wish on, once; whether it was fulfilled, `telemetry` tells."""
+    def ask(self, command: Command) -> None:
+        """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
         dialect, position = self._hearing.dialect, self._hearing.position
         if dialect is not None and self._commands is not None:
-            self._commands.ask(wish, dialect, position.up_m if position is not None else 0.0)
+            self._commands.ask(command, dialect, position.up_m if position is not None else 0.0)
 
     # Hearing.
 

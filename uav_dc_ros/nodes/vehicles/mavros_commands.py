@@ -9,7 +9,7 @@ from rclpy.node import Node
 from uav_dc_ros.nodes.vehicles.mavros_messages import PACKAGE, MavrosMsgs
 from uav_dc_ros.offboard.flight_stacks import FlightStack
 from uav_dc_ros.offboard.mavros.telemetry import ESTIMATOR_STATUS, EXTENDED_STATE, POSE
-from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
+from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, TakeOff
 
 SET_MODE, ARM, TAKE_OFF = "mavros/set_mode", "mavros/cmd/arming", "mavros/cmd/takeoff"
 SET_INTERVAL = "mavros/set_message_interval"
@@ -21,7 +21,7 @@ SEEN = 64  # texts that are kept
 
 
 class Commands:
-    """Passes wishes on, once each, and keeps what was refused and why. To be used in the executor's thread.
+    """Passes commands on, once each, and keeps what was refused and why. To be used in the executor's thread.
 
     Args:
         node: whose clients they are.
@@ -53,19 +53,19 @@ class Commands:
             self._node.destroy_client(client)
         self._clients = {}
 
-    # Wishes.
+    # Commands.
 
-    def ask(self, wish: Wish, dialect: FlightStack, up_m: float) -> None:
-        """Pass a wish on.
+    def ask(self, command: Command, dialect: FlightStack, up_m: float) -> None:
+        """Pass a command on.
 
         Args:
-            wish: what is wished.
+            command: what is wished.
             dialect: of the autopilot.
             up_m: where the vehicle is, above the grid's ground: MAVROS is told how far to climb from there.
                 (It passes the altitude on as it is; to ArduPilot it is above home, where the vehicle stands.)
         """
         package = self._package
-        match wish:
+        match command:
             case SetMode(mode):
                 name = dialect.names[dialect.asked[Mode(mode)]]
                 if package is None:

@@ -1,4 +1,4 @@
-"""PX4 over uXRCE-DDS: hears its topics, passes wishes on, streams setpoints. It decides nothing.
+"""PX4 over uXRCE-DDS: hears its topics, passes commands on, streams setpoints. It decides nothing.
 
 The stream (see there) also ends while no position has come for `POSE_S` that PX4 trusts; then PX4's own
 failsafe takes over (COM_OF_LOSS_T, COM_OBL_RC_ACT), as it does when the process is gone.
@@ -25,7 +25,7 @@ from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
 from uav_dc_ros.offboard.px4.telemetry import COMPANION, Px4Telemetry
 from uav_dc_ros.offboard.send_timer import STREAM_VEHICLE_S
 from uav_dc_ros.offboard.setpoint_stream import SetpointStream
-from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, Telemetry
 
 POSE_S = 0.5
 LOOK_S = 1.0  # between two looks at which topics there are
@@ -165,13 +165,13 @@ class Px4Vehicle:
         topics = ", ".join(self._topic(name) for name in silent)
         return dataclasses.replace(known, missing=f"nothing came on {topics} yet{self._others(silent)}")
 
-    def steer(self, setpoint: Enu | None) -> None:
+    def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
-        self._stream.steer(setpoint)
+        self._stream.set_setpoint(setpoint)
 
-    def ask(self, wish: Wish) -> None:
+    def ask(self, command: Command) -> None:
         """Send a command, once; `telemetry` reports what came of it. PX4 takes off by setpoints."""
-        match wish:
+        match command:
             case SetMode(Mode.RETURN):
                 self._command(RETURN)
             case SetMode(Mode.LAND):  # here, heading as it does

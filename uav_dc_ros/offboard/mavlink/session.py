@@ -1,7 +1,9 @@
 """MAVLink with one vehicle, without a link and without a clock: bytes in, bytes out, at steady times.
 
-It decides nothing: it passes wishes on, streams setpoints, and asks for what the vehicle does not send. It is
-a sign of life of those who decide: heartbeats and setpoints end `LIFE_S` after the last call of `steer`, and
+It decides nothing: it passes commands on, streams setpoints, and asks for what the vehicle does not send. It
+    is
+a sign of life of those who decide: heartbeats and setpoints end `LIFE_S` after the last call of
+    `set_setpoint`, and
 then the autopilot's own failsafes take over, as they do when the process is gone.
 """
 
@@ -13,7 +15,7 @@ from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM
 from uav_dc_ros.offboard.mavlink.telemetry import ACCEPTED, HELPFUL_HZ, IN_PROGRESS, ONCE, MavlinkTelemetry
 from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S, STREAM_VEHICLE_S, Heartbeat, following
-from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Wish
+from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, TakeOff
 
 ONBOARD_CONTROLLER, NO_AUTOPILOT, ACTIVE = 18, 8, 4  # MAV_TYPE, MAV_AUTOPILOT, MAV_STATE of this end
 SET_MODE, ARM, TAKE_OFF, SET_INTERVAL, REQUEST = 176, 400, 22, 511, 512  # MAV_CMD
@@ -48,8 +50,8 @@ class Session:
         self._setpoint: Enu | None = None
         self._streamed: tuple[Enu | None, float] = None, 0.0  # the last one, and when, vehicle time
         self._alive_s = -math.inf  # last sign of life of those who decide
-        self._wishes: list[Wish] = []
-        self._met_s = math.inf  # when the link was opened; wishes wait until the vehicle was heard on it
+        self._commands: list[Command] = []
+        self._met_s = math.inf  # when the link was opened; commands wait until the vehicle was heard on it
         self._ask_s = -math.inf
         self._asked_s: dict[str, float] = {}
         self._heartbeat = Heartbeat()
@@ -57,11 +59,11 @@ class Session:
     def begin(self, now_s: float) -> None:
         """Another link was opened: whoever is on it sends nothing unasked."""
         self._met_s = self.stream_s = self._ask_s = now_s
-        self._wishes.clear()  # uttered to a vehicle that may be another's by now
+        self._commands.clear()  # sent to a vehicle that may be another's by now
         self._asked_s.clear()
         self._heartbeat.begin()
 
-    def steer(self, setpoint: Enu | None, now_s: float) -> bool:
+    def set_setpoint(self, setpoint: Enu | None, now_s: float) -> bool:
         """Stream a setpoint from now on, or none, and be alive; is there something to send at once."""
         news = setpoint != self._setpoint or now_s - self._alive_s > LIFE_S
         self._setpoint, self._alive_s = setpoint, now_s
@@ -71,9 +73,9 @@ class Session:
         """Somebody is there who will decide."""
         self._alive_s = now_s
 
-    def ask(self, wish: Wish) -> None:
-        """Pass a wish on with what is sent next."""
-        self._wishes.append(wish)
+    def ask(self, command: Command) -> None:
+        """Pass a command on with what is sent next."""
+        self._commands.append(command)
 
     def receive(self, data: bytes, now_s: float) -> bool:
         """Take in what came; was something of the vehicle's among it."""
@@ -89,10 +91,10 @@ class Session:
         if now_s >= self._ask_s or hearing.wanted().keys() - self._asked_s.keys():
             self._ask_s = following(self._ask_s, ASK_S, now_s)
             self._ask_for_messages(now_s)
-        wishes, self._wishes = self._wishes, []
+        commands, self._commands = self._commands, []
         if not hearing.doubts_mode(now_s):  # it may be a pilot; the bridge sends again what was not executed
-            for wish in wishes:
-                self._send_wish(wish, now_s)
+            for command in commands:
+                self._send_command(command, now_s)
         streamed, streamed_vehicle_s = self._streamed
         due = now_s >= self.stream_s or self._setpoint != streamed
         if due or vehicle_s - streamed_vehicle_s >= STREAM_VEHICLE_S:
@@ -162,11 +164,11 @@ class Session:
         self.hearing.rivals.sent_command(command, self.hearing.vehicle_s)
         self._write(self._mav.command_long_encode(self.hearing.system, AUTOPILOT, command, 0, *filled))
 
-    def _send_wish(self, wish: Wish, now_s: float) -> None:
+    def _send_command(self, command: Command, now_s: float) -> None:
         dialect, known = self.hearing.dialect, self.hearing.telemetry(now_s)
         if dialect is None or (known.heartbeat_s or -math.inf) < self._met_s:
             return  # who knows what it does by now; a link may also keep things to deliver them late
-        match wish:
+        match command:
             case SetMode(mode):
                 self._send_command_long(SET_MODE, CUSTOM_MODE, *dialect.mode_parameters(Mode(mode)))
             case Arm():
@@ -180,7 +182,7 @@ class Session:
         if (
             hearing.dialect is None
             or hearing.frame is None
-            or not hearing.dialect.may_steer(hearing.landed_state)
+            or not hearing.dialect.takes_setpoints(hearing.landed_state)
         ):
             return
         ned = hearing.frame.to_autopilot(setpoint)

@@ -20,7 +20,7 @@ from uav_dc_ros.offboard.mavlink.connection import Address, Connection, Connecti
 from uav_dc_ros.offboard.mavlink.session import Session
 from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.realtime import run_when_due
-from uav_dc_ros.offboard.vehicle import Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Command, Telemetry
 
 OPEN_AGAIN_S = 0.5
 SILENCE_S = 10.0  # after which a link that says nothing is opened anew
@@ -139,17 +139,17 @@ class MavlinkVehicle:
                 known = dataclasses.replace(known, missing=self._down)
             return known
 
-    def steer(self, setpoint: Enu | None) -> None:
+    def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at least at 2 Hz."""
         with self._lock:
-            news = self._session.steer(setpoint, time.monotonic())
+            news = self._session.set_setpoint(setpoint, time.monotonic())
         if news:
             self._wake()
 
-    def ask(self, wish: Wish) -> None:
-        """Pass a wish on, once; whether it was fulfilled, `telemetry` tells."""
+    def ask(self, command: Command) -> None:
+        """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
         with self._lock:
-            self._session.ask(wish)
+            self._session.ask(command)
         self._wake()
 
     # The thread.

@@ -152,10 +152,12 @@ class MavrosTelemetry:
         return Enu(*(p - o for p, o in zip(position, self.origin, strict=True)))
 
     @property
-    def may_steer(self) -> bool:
+    def takes_setpoints(self) -> bool:
         """Do setpoints help now, and is it known where they lie."""
         return (
-            self.origin is not None and self.dialect is not None and self.dialect.may_steer(self.landed_state)
+            self.origin is not None
+            and self.dialect is not None
+            and self.dialect.takes_setpoints(self.landed_state)
         )
 
     def telemetry(self, now_s: float, refusal: str | None = None, said: str = "") -> Telemetry:

@@ -1,15 +1,15 @@
-"""When a wish may be uttered again that was not fulfilled."""
+"""When a command may be sent again that was not executed."""
 
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.offboard.vehicle import TakeOff, Wish
+from uav_dc_ros.offboard.vehicle import Command, TakeOff
 
-# As many pauses between wishes to take off. Motors need two seconds to lift the vehicle. ArduPilot disarms it
-# when it stands for ten seconds: within these, three wishes may be lost.
+# As many pauses between commands to take off. Motors need two seconds to lift the vehicle. ArduPilot disarms
+# it when it stands for ten seconds: within these, three commands may be lost.
 TAKEOFF_RETRIES = 1.5
 
 
 class CommandRetry:
-    """The wishes of one phase.
+    """The commands of one phase.
 
     Args:
         settings: how long to wait for an answer.
@@ -22,7 +22,7 @@ class CommandRetry:
         self._settings = settings
         self._time_s = 0.0
         self._seen_s: tuple[float, float] | None = None  # vehicle time and steady clock, at the last look
-        self._last_s: dict[Wish, float] = {}  # when each was uttered last
+        self._last_s: dict[Command, float] = {}  # when each was sent last
 
     def begin(self) -> None:
         """Forget what was asked for in another phase."""
@@ -41,16 +41,16 @@ class CommandRetry:
             self._time_s += now_s - before_s if stands else max(0.0, vehicle_s - before_vehicle_s)
         self._seen_s = vehicle_s, now_s
 
-    def waited_s(self, wish: Wish) -> float | None:
-        """For how long an answer was waited for; None: it was not uttered."""
-        last_s = self._last_s.get(wish)
+    def waited_s(self, command: Command) -> float | None:
+        """For how long an answer was waited for; None: it was not sent."""
+        last_s = self._last_s.get(command)
         return None if last_s is None else self._time_s - last_s
 
-    def may(self, wish: Wish) -> bool:
-        """Utter a wish now: the first time, or long enough after the last; if so, it is."""
-        waited_s = self.waited_s(wish)
-        pause_s = self._settings.command_retry_s * (TAKEOFF_RETRIES if isinstance(wish, TakeOff) else 1.0)
+    def may(self, command: Command) -> bool:
+        """Utter a command now: the first time, or long enough after the last; if so, it is."""
+        waited_s = self.waited_s(command)
+        pause_s = self._settings.command_retry_s * (TAKEOFF_RETRIES if isinstance(command, TakeOff) else 1.0)
         if waited_s is not None and waited_s < pause_s:
             return False
-        self._last_s[wish] = self._time_s
+        self._last_s[command] = self._time_s
         return True

@@ -4,9 +4,9 @@
 
 It enters no phase that may not follow by the table `phases.TRANSITIONS`.
 It decides, and does nothing itself: `tick` is called often with what is known of the vehicle, and returns
-wishes for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
+commands for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
 last good setpoint stays), then to *return* or *land*, and at last to `aborted` with its reason. A pilot who
-changes the mode has the vehicle at once: from then on there are no setpoints and no wishes. Where that mode
+changes the mode has the vehicle at once: from then on there are no setpoints and no commands. Where that mode
 brings it down (an autopilot's failsafe does that, too), it is watched until it stands.
 """
 
@@ -30,7 +30,7 @@ from uav_dc_ros.offboard.mission.policy_timeout import PolicyTimeout
 from uav_dc_ros.offboard.mission.preflight import Preflight, rival
 from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, Dwell, MissionProgress
 from uav_dc_ros.offboard.mission.stall_detector import StallDetector
-from uav_dc_ros.offboard.vehicle import Mode, SetMode, TakeOff, Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, TakeOff, Telemetry
 from uav_dc_ros.phases import DECIDED, FLYING, GROUND, STEERED, impossible
 
 POLICY_IS_GONE = "the policy is gone"
@@ -174,7 +174,7 @@ class MissionController:
         return None
 
     def stop(self, why: str, known: Telemetry | None = None) -> None:
-        """End the mission, since nobody will steer any more; a vehicle that flies comes down.
+        """End the mission, since nobody will set_setpoint any more; a vehicle that flies comes down.
 
         So does one that is armed in the commanded mode before it begins; in another mode it is a pilot's.
 
@@ -201,7 +201,7 @@ class MissionController:
         """Does the vehicle come to its end without any further word."""
         return self.is_over or (self.phase is Phase.LANDING and self._descent.obeys(known))
 
-    def tick(self, now_s: float, known: Telemetry) -> list[Wish]:
+    def tick(self, now_s: float, known: Telemetry) -> list[Command]:
         """Go on.
 
         Args:
@@ -209,7 +209,7 @@ class MissionController:
             known: of the vehicle.
 
         Returns:
-            Wishes to be passed on now, at most one of each kind.
+            Commands to be passed on now, at most one of each kind.
         """
         if self.phase.is_over:
             return []
@@ -231,7 +231,7 @@ class MissionController:
             return []  # hold: the setpoint stays
         if self.phase in DECIDED and not self._policy_lives(known):
             return []
-        wishes = {
+        commands = {
             Phase.CONNECTING: self._connect,
             Phase.PREFLIGHT: self._prepare,
             Phase.TAKEOFF: self._take_off,
@@ -239,12 +239,12 @@ class MissionController:
             Phase.MOVING: self._fly,
             Phase.LANDING: self._land,
         }[self.phase](now_s, known)
-        uttered = [wish for wish in wishes if self._asked.may(wish)]
-        self._descent.tries += sum(isinstance(wish, SetMode) for wish in uttered)
+        sent = [command for command in commands if self._asked.may(command)]
+        self._descent.tries += sum(isinstance(command, SetMode) for command in sent)
         if self._to_keep() != self._kept:
             self._kept = self._to_keep()
             self._on_change()
-        return uttered
+        return sent
 
     def _to_keep(self) -> tuple[object, ...]:
         """What a bridge that is started anew has to know before it is requested, or as soon as it is seen."""
@@ -334,13 +334,13 @@ class MissionController:
 
     # What is to be done in each phase.
 
-    def _connect(self, now_s: float, known: Telemetry) -> list[Wish]:
+    def _connect(self, now_s: float, known: Telemetry) -> list[Command]:
         return self._follow(self._ground.connect(now_s, known, now_s - self._since_steady_s))
 
-    def _prepare(self, now_s: float, known: Telemetry) -> list[Wish]:
+    def _prepare(self, now_s: float, known: Telemetry) -> list[Command]:
         return self._follow(self._ground.prepare(now_s, known))
 
-    def _follow(self, advice: Next) -> list[Wish]:
+    def _follow(self, advice: Next) -> list[Command]:
         """Do what a look at a vehicle led to that is not steered."""
         self.setpoint = advice.setpoint
         if advice.phase.is_over:
@@ -356,9 +356,9 @@ class MissionController:
             self._finish("when the bridge came back")
         else:
             self._enter(advice.phase, advice.why)
-        return [] if advice.wish is None else [advice.wish]
+        return [] if advice.command is None else [advice.command]
 
-    def _take_off(self, now_s: float, known: Telemetry) -> list[Wish]:
+    def _take_off(self, now_s: float, known: Telemetry) -> list[Command]:
         start, position = self.course.target, known.position
         if known.vehicle_s - self._since_s > self.settings.takeoff_timeout_s:
             self._give_up(f"not at the start after {self.settings.takeoff_timeout_s:g} s")
@@ -379,12 +379,12 @@ class MissionController:
             self.course.cell = self.course.goal
             self._enter(Phase.READY, f"at the start, cell {self.cell}")
 
-    def _wait(self, now_s: float, known: Telemetry) -> list[Wish]:
+    def _wait(self, now_s: float, known: Telemetry) -> list[Command]:
         if self._patience.is_over((self._since_s, self._since_steady_s), (known.vehicle_s, now_s)):
             self._give_up(f"no move from the policy for {self._patience.limit_s:g} s")
         return []
 
-    def _fly(self, now_s: float, known: Telemetry) -> list[Wish]:
+    def _fly(self, now_s: float, known: Telemetry) -> list[Command]:
         there, step_s = self._dwell.is_there(self.course.target, known), self.scenario.mission.step_s
         if there:
             self._arrive("there")
@@ -415,7 +415,7 @@ class MissionController:
             why = f"step {self.step}: out of steps away from the dock ({how})"
             self._descend(self.settings.failsafe_action, Phase.TIMEOUT, why)
 
-    def _land(self, now_s: float, known: Telemetry) -> list[Wish]:
+    def _land(self, now_s: float, known: Telemetry) -> list[Command]:
         waited_s = self._asked.waited_s(SetMode(Mode.RETURN))
         return self._follow(self._descent.look(now_s, known, self.setpoint, waited_s))
 

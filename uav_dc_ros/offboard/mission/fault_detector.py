@@ -37,9 +37,9 @@ class SafetySettings:
         failsafe_action: what ends a mission that cannot go on. Without a position, and where the vehicle
             refuses to return, it is to land.
         flying_at_start: what to do with a vehicle that flies already, in the commanded mode.
-        command_retry_s: pause before a wish that was not fulfilled is uttered again, vehicle time.
+        command_retry_s: pause before a command that was not executed is sent again, vehicle time.
         max_return_attempts: how often it is asked to return before it is asked to land.
-        takeoff_timeout_s: longest time from the first wish to take off until the start is reached, vehicle
+        takeoff_timeout_s: longest time from the first command to take off until the start is reached, vehicle
             time.
         max_offset_cells: how far from the goal's centre, in cells, a step may end whose time is over; with
             0.5 the goal is the nearest cell. A vehicle that is farther away flies on.

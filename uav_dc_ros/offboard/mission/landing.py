@@ -8,7 +8,7 @@ from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector
 from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.mission.stall_detector import Approach
-from uav_dc_ros.offboard.vehicle import Mode, SetMode, Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
 
 DOWN = (Mode.LAND, Mode.RETURN)
 HOMELESS = 10.0  # as many times as long is a return waited for whose home is not known
@@ -23,7 +23,7 @@ class Next:
         phase: to be in; `landing` means to descend, and one that is over to end.
         why: in words.
         setpoint: to stream from now on, in the grid's ENU frame; None: none.
-        wish: to utter; None: none.
+        command: to send; None: none.
         down: how to descend.
         outcome: of a mission that descends.
         asked: did an earlier bridge request that way down?
@@ -32,7 +32,7 @@ class Next:
     phase: Phase
     why: str
     setpoint: Enu | None = None
-    wish: Wish | None = None
+    command: Command | None = None
     down: Mode = Mode.LAND
     outcome: Phase = Phase.ABORTED
     asked: bool = False
@@ -115,7 +115,7 @@ class Landing:
             self.why += f"; it does not return ({known.refusal or 'no answer'}): lands"
         refused = f"; {known.refusal}" if known.refusal and self.tries else ""
         return Next(
-            phase=Phase.LANDING, why=f"{self.why}{refused}", setpoint=setpoint, wish=SetMode(self.how)
+            phase=Phase.LANDING, why=f"{self.why}{refused}", setpoint=setpoint, command=SetMode(self.how)
         )
 
     def _wait_for_link(self, now_s: float, known: Telemetry, setpoint: Enu | None) -> Next:

@@ -10,7 +10,7 @@ from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySett
 from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.landing import DOWN, Next
 from uav_dc_ros.offboard.mission.progress import MissionProgress
-from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, Telemetry, Wish
+from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, Telemetry
 
 UNPLACED_S = 5.0  # after which a vehicle that flies has no place on the grid, though a link has told of it
 
@@ -167,7 +167,7 @@ class Preflight:
         wrong = fault.why if fault is not None else self.fence.breach(here) if here is not None else None
         if wrong is not None:
             return Next(phase=Phase.CONNECTING, why=wrong)
-        wish: Wish | None = None
+        command: Command | None = None
         if known.armed:
             why = f"a pilot flies: mode {_name(known)}"
         elif (low := self.watch.battery_is_low(known)) is not None:
@@ -178,10 +178,10 @@ class Preflight:
             why = "waiting for a pilot to set the mode and arm (--arm does it here)"
         else:
             why = known.refusal or "sets the mode and arms"
-            wish = Arm() if known.mode is Mode.COMMANDED else SetMode(Mode.COMMANDED)
+            command = Arm() if known.mode is Mode.COMMANDED else SetMode(Mode.COMMANDED)
             self.allowed_mode = self.allowed_mode or _name(known)
         why = "; ".join([why, *self.warnings(known)])
-        return Next(phase=Phase.PREFLIGHT, why=why, setpoint=here, wish=wish)
+        return Next(phase=Phase.PREFLIGHT, why=why, setpoint=here, command=command)
 
     def _take_it(self, known: Telemetry) -> Next:
         """Begin with a vehicle that is armed, in the commanded mode."""
