@@ -20,8 +20,8 @@ import uav_dc_ros.nodes.policy
 import uav_dc_ros.nodes.record.bag_record
 import uav_dc_ros.nodes.recorder
 import uav_dc_ros.nodes.world
-import uav_dc_ros.run_all  # noqa: F401
-import uav_dc_ros.runner.mission_runner
+import uav_dc_ros.run_all
+import uav_dc_ros.runner.mission_runner  # noqa: F401
 
 LIMIT_S = 90
 

@@ -197,5 +197,6 @@ class Landing:
             return f"it returns, and has come no nearer to home{far} for {limit_s:g} s"
         if landing_s > settings.landing_progress_timeout_s:
             what = "it lands" if known.mode is Mode.LAND else f"mode {known.mode_name or known.mode.value}"
-            return f"{what}, and has neither descended nor disarmed for {settings.landing_progress_timeout_s:g} s"
+            limit_s = settings.landing_progress_timeout_s
+            return f"{what}, and has neither descended nor disarmed for {limit_s:g} s"
         return None
