@@ -50,7 +50,7 @@ def begin():
 if role == "ping":
     threading.Thread(target=begin, daemon=True).start()
 if executor == "DirectExecutor":
-    from uav_dc_ros.nodes.executor import DirectExecutor
+    from uav_dc_ros.nodes.ros.executor import DirectExecutor
     spinner = DirectExecutor()
     spinner.add_node(node)
     spinner.spin(lambda: False)

@@ -43,7 +43,7 @@ import rclpy
 from rclpy.duration import Duration
 from std_msgs.msg import String
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.nodes import fastdds
+from uav_dc_ros.nodes.ros import fastdds
 from uav_dc_ros.nodes.play import PRIORITY
 fastdds.use_profiles()
 if sys.argv[2] == "sleeps":

@@ -39,7 +39,7 @@ PUBLISHER = """
 import random, sys, time
 import rclpy
 from std_msgs.msg import String
-from uav_dc_ros.nodes import fastdds
+from uav_dc_ros.nodes.ros import fastdds
 from uav_dc_ros import cdr
 size, rate_hz, seconds = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
 fastdds.use_profiles()
@@ -65,8 +65,8 @@ import sys, threading
 import rclpy
 from rclpy.qos import HistoryPolicy, QoSProfile
 from std_msgs.msg import String
-from uav_dc_ros.nodes import fastdds
-from uav_dc_ros.nodes.executor import DirectExecutor
+from uav_dc_ros.nodes.ros import fastdds
+from uav_dc_ros.nodes.ros.executor import DirectExecutor
 fastdds.use_profiles()
 rclpy.init()
 node = rclpy.create_node("counter")

@@ -51,11 +51,11 @@ def loaded(code: str, *modules: str) -> list[str]:
     [
         ("env.gym_env", ("matplotlib", "torch", "rclpy", "mcap", "rosbags")),
         ("env.vector_env", ("matplotlib", "torch", "rclpy", "mcap", "rosbags")),
-        ("experiments.train_cli", ("matplotlib", "rclpy", "mcap", "rosbags", "ruamel")),
-        ("experiments.training", ("matplotlib", "rclpy", "mcap", "rosbags", "ruamel")),
+        ("experiments.train.cli", ("matplotlib", "rclpy", "mcap", "rosbags", "ruamel")),
+        ("experiments.train.training", ("matplotlib", "rclpy", "mcap", "rosbags", "ruamel")),
         ("run_all", ("numpy", "rclpy", "rich", "msgspec")),
         (
-            "nodes.flight",
+            "runner.mission_runner",
             (
                 *("rosbags", "mcap", "ruamel", "rich", "matplotlib", "gymnasium"),
                 *("uav_dc_ros.nodes.vehicles", "uav_dc_ros.offboard.mavlink.vehicle", "pymavlink"),
@@ -69,8 +69,8 @@ def test_a_module_brings_nothing_that_it_does_not_need(module: str, unwanted: tu
 
 def test_a_simulated_run_brings_no_way_to_an_autopilot() -> None:
     code = (
-        "from uav_dc_ros.runner.mission_runner import Flight\nfrom uav_dc_ros.run_config import RunConfig\n"
-        "Flight(RunConfig(record=False))"
+        "from uav_dc_ros.runner.mission_runner import MissionRunner\nfrom uav_dc_ros.run_config import RunConfig\n"
+        "MissionRunner(RunConfig(record=False))"
     )
     vehicles = ("uav_dc_ros.nodes.vehicles", "uav_dc_ros.offboard.datums", "pymavlink", "pymap3d", "px4_msgs")
     assert loaded(code, *vehicles) == []

@@ -182,7 +182,7 @@ def test_who_goes_on_with_a_bag_repeats_the_latched_messages_too(tmp_path: Path)
 SYNCING = """
 import sys, time
 from pathlib import Path
-from tests.bags.made import STRING, text
+from tests.support.bags import STRING, text
 from uav_dc_ros.bags.write import BagWriter
 bag = BagWriter(Path(sys.argv[1]), {}, split_s=0.5)
 bag.add_topic("/a", STRING)

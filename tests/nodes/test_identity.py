@@ -114,8 +114,8 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
 HEEDLESS = """
 import sys
 from uav_dc_ros import bag
-from uav_dc_ros.nodes.audience import Audience
-Audience.mission = lambda *_: None
+from uav_dc_ros.nodes.play.subscriber_monitor import SubscriberMonitor
+SubscriberMonitor.mission = lambda *_: None
 sys.exit(bag.main())
 """
 

@@ -35,7 +35,7 @@ QOS = """
 WRITER = """
 import sys
 from pathlib import Path
-from tests.bags.made import STRING, text
+from tests.support.bags import STRING, text
 from uav_dc_ros.bags.write import BagWriter
 folder, first, resume = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "resume"
 bag = BagWriter(folder, {"seed": "3"}, resume=resume)

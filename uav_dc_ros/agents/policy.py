@@ -67,7 +67,7 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         name: the policy's name.
         algorithm: `dqn` or `dueling_dqn`.
         aggregation: what the dueling network subtracts from the advantage; without meaning for `dqn`.
-        observation: what the policy sees, see `env.observations`.
+        observation: what the policy sees, see `core.observations`.
         hidden: units of each hidden layer.
         actions: labels of the actions, in the order of the network's outputs.
         hyperparameters: how it learnt.
@@ -135,7 +135,7 @@ class Policy:
     def observe(
         self, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
     ) -> Array:
-        """What this policy sees of a mission, float32 `[..., D]`; see `env.observations.encode`."""
+        """What this policy sees of a mission, float32 `[..., D]`; see `core.observations.encode`."""
         return observations.encode(
             self.config.observation,
             scenario,

@@ -31,7 +31,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
     Observation:
         `Box`, float32. `observation="position"`: the UAV's cell, each index scaled to [0, 1].
         `"mission"` (default): also the remaining steps and how far each cluster is collected. `"map"`:
-        also the way to each cluster and to the dock. The exact layout is in `env.observations`.
+        also the way to each cluster and to the dock. The exact layout is in `core.observations`.
 
     Reward:
         From r^t = beta * (data collected so far, mean over users, scaled) + zeta * R_plus (eq. 7):

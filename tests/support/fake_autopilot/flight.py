@@ -22,7 +22,7 @@ from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Telemetry
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SCENARIO = scenarios.load("five_clusters")
 KINDS = ("ardupilot", "px4")
 WIRES = ("tcp", "udp")

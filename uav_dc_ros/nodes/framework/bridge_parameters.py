@@ -42,7 +42,7 @@ FENCE_MARGIN_M = Parameter(
 
 
 def _setting(name: str, description: str, unit: str = "", least: float = 0.0, most: float = 0.0) -> Parameter:
-    """A parameter that is a field of `autopilot.watch.Settings`, and has its default."""
+    """A parameter that is a field of `SafetySettings`, and has its default."""
     default = getattr(SafetySettings, name)
     if isinstance(default, bool):
         return Parameter(name=name, default=default, description=description)
