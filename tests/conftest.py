@@ -89,10 +89,10 @@ class Ros:
             **popen,
         )
 
-    def stranger(self, name: str, *arguments: object) -> subprocess.Popen[str]:
-        """Start a script of `tests/nodes` beside the nodes; its input and output are piped."""
+    def stranger(self, name: str, *arguments: object, folder: str = "nodes") -> subprocess.Popen[str]:
+        """Start a script of a folder of the tests beside the nodes; its input and output are piped."""
         return subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("nodes") / f"{name}.py"), *map(str, arguments)],
+            [sys.executable, str(ROOT / "tests" / folder / f"{name}.py"), *map(str, arguments)],
             env=self.environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -69,7 +69,8 @@ def test_a_module_brings_nothing_that_it_does_not_need(module: str, unwanted: tu
 
 def test_a_simulated_run_brings_no_way_to_an_autopilot() -> None:
     code = (
-        "from uav_dc_ros.runner.mission_runner import MissionRunner\nfrom uav_dc_ros.run_config import RunConfig\n"
+        "from uav_dc_ros.runner.mission_runner import MissionRunner\n"
+        "from uav_dc_ros.run_config import RunConfig\n"
         "MissionRunner(RunConfig(record=False))"
     )
     vehicles = ("uav_dc_ros.nodes.vehicles", "uav_dc_ros.offboard.datums", "pymavlink", "pymap3d", "px4_msgs")

@@ -32,8 +32,8 @@ class Topic:
         latched: durability transient local instead of volatile, offered and asked for.
         depth: messages that a publisher keeps.
         lease_s: liveliness lease that publishers offer, seconds: they assert their liveliness within it, for
-            who asks for that (see `nodes.ros.liveliness`); None: none is offered, and one that was killed is missed
-            after tens of seconds.
+            who asks for that (see `nodes.ros.liveliness`); None: none is offered, and one that was killed is
+            missed after tens of seconds.
         recorded: does the recorder write it?
         exclusive: does a mission have one publisher of it, and none beside it?
     """

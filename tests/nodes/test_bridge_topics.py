@@ -59,7 +59,7 @@ def test_a_mission_on_px4_s_topics(
         pytest.skip("px4_msgs is made with compilers for C and C++, and Python's headers; some are missing")
     messages = px4_messages.build(tmp_path_factory.mktemp("px4") / "messages")
     ros.environment["PYTHONPATH"] += f":{messages}"
-    px4 = ros.stranger("fake_px4", messages, 8, "/")
+    px4 = ros.stranger("px4", messages, 8, "/", folder="support/fake_autopilot")
     assert px4.stdin is not None
     try:
         summary = ros.folder / "summary.json"

@@ -680,7 +680,7 @@ class Fake:
     """The stand-in, a process; `events` are what it told."""
 
     def __init__(self, ros: Ros, messages: Path, namespace: str) -> None:
-        self.process = ros.stranger("fake_px4", messages, SPEED, namespace)
+        self.process = ros.stranger("px4", messages, SPEED, namespace, folder="support/fake_autopilot")
         self.events: list[dict[str, Any]] = []
         threading.Thread(target=self._listen, daemon=True).start()
 

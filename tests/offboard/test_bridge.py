@@ -20,7 +20,7 @@ from tests.support.fake_autopilot.simulated import (
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.controller import Standing
+from uav_dc_ros.offboard.mission.controller import Checkpoint
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff
 
@@ -148,9 +148,9 @@ def test_a_policy_has_its_time_on_the_clock_that_it_lives_by() -> None:
         ({"battery": 0.1}, "battery 10%"),
     ],
 )
-@pytest.mark.parametrize("failsafe_action", [Mode.RETURN, Mode.LAND])
+@pytest.mark.parametrize("then", [Mode.RETURN, Mode.LAND])
 def test_a_fault_that_stays_brings_it_down(fault: dict[str, object], why: str, then: Mode) -> None:
-    flight = fly_to_step(5, SafetySettings(arm=True, then=then))
+    flight = fly_to_step(5, SafetySettings(arm=True, failsafe_action=then))
     for name, value in fault.items():
         setattr(flight.vehicle, name, value)
     flight.until(Phase.ABORTED, 600.0)
@@ -258,7 +258,7 @@ def test_a_silent_policy_ends_the_mission_after_two_steps() -> None:
 
 def test_a_vehicle_that_flies_already_goes_on_where_it_was() -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
-    flight = Flight(SafetySettings(), vehicle, standing=Standing(step=7, cell=(3, 3, 1), flies=True))
+    flight = Flight(SafetySettings(), vehicle, standing=Checkpoint(step=7, cell=(3, 3, 1), flies=True))
     flight.until(Phase.LANDED)
     assert flight.executed == list(range(7, SCENARIO.mission.max_steps))
 
@@ -272,7 +272,7 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
     while vehicle.now_s < at_s and not first.bridge.is_over:
         first.tick(0.2)
     before = first.bridge.phase
-    standing = msgspec.json.decode(msgspec.json.encode(first.bridge.standing), type=Standing)
+    standing = msgspec.json.decode(msgspec.json.encode(first.bridge.standing), type=Checkpoint)
     setpoint = first.bridge.setpoint
     flew = vehicle.armed and not vehicle.on_ground
     if flew and pilot:
@@ -301,7 +301,7 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
 
 def test_a_bridge_that_comes_back_to_a_vehicle_outside_the_fence_brings_it_home() -> None:
     vehicle = Vehicle(position=Enu(2000.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
-    flight = Flight(ARMING, vehicle, standing=Standing(step=7, cell=(3, 3, 1), flies=True))
+    flight = Flight(ARMING, vehicle, standing=Checkpoint(step=7, cell=(3, 3, 1), flies=True))
     flight.until(Phase.ABORTED)
     assert flight.executed == []
     assert flight.bridge.reason.startswith("outside the fence when the bridge came back: 2000.0 m east")

@@ -10,7 +10,7 @@ import pytest
 from tests.support.fake_autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.controller import Standing
+from uav_dc_ros.offboard.mission.controller import Checkpoint
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.vehicle import Limits, Mode, SetMode, TakeOff, Telemetry
@@ -75,7 +75,7 @@ def test_a_landing_without_a_position_is_none() -> None:
 def test_a_bridge_that_was_killed_while_it_landed_judges_where_the_vehicle_stands() -> None:
     flight = Flight()
     flight.until(Phase.LANDING)
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Standing)
+    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Checkpoint)
     for off_m, phase in ((0.0, Phase.LANDED), (40.0, Phase.ABORTED)):
         place = Enu(SCENARIO.mission.dock_m[0] - off_m, SCENARIO.mission.dock_m[1], 0.0)
         again = Flight(ARMING, Vehicle(position=place, mode=Mode.LAND), standing=standing)

@@ -87,9 +87,9 @@ def test_what_cannot_be_opened_now_is_told_and_tried_again(tmp_path: Path) -> No
 def test_a_missing_package_is_told_with_its_extra(package: str, address: str) -> None:
     code = (
         f"import sys; sys.modules['{package}'] = None\n"
-        "from uav_dc_ros.offboard.mavlink.vehicle import Mavlink\n"
+        "from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle\n"
         "from uav_dc_ros.errors import VehicleError\n"
-        f"try: Mavlink('{address}')\n"
+        f"try: MavlinkVehicle('{address}')\n"
         "except VehicleError as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -47,11 +47,11 @@ def check_whole(told: dict[str, Any], name: str = "none", scenario: Scenario = S
     ]
     assert told["executed"] == list(range(scenario.mission.max_steps))
     assert told["cells"] == expected_cells(scenario)
-    north_m, east_m, down_m = told["failsafe_action"]["ned"][1]
+    north_m, east_m, down_m = told["then"]["ned"][1]
     assert np.allclose((east_m, north_m), scenario.mission.dock_m, atol=CAREFUL.tolerance_m)
     assert down_m == 0.0
-    assert told["failsafe_action"]["landed"][1], told["log"]
-    assert not told["failsafe_action"]["armed"][1]
+    assert told["then"]["landed"][1], told["log"]
+    assert not told["then"]["armed"][1]
     assert told["interrupted"] == 0, "no setpoint while it took off"
 
 
@@ -82,11 +82,11 @@ def test_a_fault_on_the_way(flights: Any, kind: str, wire: str, name: str, reaso
     assert told["phase"] == Phase.ABORTED
     assert reason in told["reason"], told["log"]
     if name == "mode":  # the pilot's from then on
-        assert told["failsafe_action"]["mode"] == [PILOT[kind]] * 2
-        assert told["failsafe_action"]["armed"] == [True, True]
+        assert told["then"]["mode"] == [PILOT[kind]] * 2
+        assert told["then"]["armed"] == [True, True]
         assert told["modes"][-1] == PILOT[kind]
     else:
-        assert not told["failsafe_action"]["armed"][1], "it stands"
+        assert not told["then"]["armed"][1], "it stands"
 
 
 @pytest.mark.long
@@ -96,7 +96,7 @@ def test_another_fault_on_the_way(kind: str, wire: str, name: str, reason: str) 
     check(name, told)
     assert told["phase"] == Phase.ABORTED
     assert reason in told["reason"], told["log"]
-    assert not told["failsafe_action"]["armed"][1], "it stands"
+    assert not told["then"]["armed"][1], "it stands"
 
 
 def test_arming_that_is_refused_is_told_in_the_autopilots_own_words() -> None:

@@ -8,7 +8,7 @@ import pytest
 from tests.support.fake_autopilot.simulated import ARMING, START, Flight, Vehicle, fly_to_step
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.controller import Standing
+from uav_dc_ros.offboard.mission.controller import Checkpoint
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, Telemetry
 
@@ -30,7 +30,7 @@ class Stubborn(Vehicle):
 
 def restarted(flight: Flight) -> Flight:
     """Another bridge beside the same vehicle, that knows what the journal tells."""
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Standing)
+    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Checkpoint)
     return Flight(flight.bridge.settings, flight.vehicle, standing=standing)
 
 
@@ -216,13 +216,13 @@ def test_a_vehicle_in_the_air_outside_the_fence_is_refused_at_once() -> None:
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5, 20])
 @pytest.mark.parametrize("unplaced", [True, False])
-@pytest.mark.parametrize("failsafe_action", [Mode.RETURN, Mode.LAND])
+@pytest.mark.parametrize("then", [Mode.RETURN, Mode.LAND])
 def test_a_bridge_that_is_stopped_brings_a_vehicle_down_in_every_phase(
     ticks: int, unplaced: bool, then: Mode
 ) -> None:
     vehicle = Vehicle(position=ALOFT, mode=Mode.COMMANDED, armed=True, unplaced=unplaced)
     vehicle.pass_time(0.1, None)
-    flight = Flight(SafetySettings(then=then), vehicle)
+    flight = Flight(SafetySettings(failsafe_action=then), vehicle)
     for _ in range(ticks):
         flight.tick()
     flight.bridge.stop("the bridge was stopped", vehicle.told)

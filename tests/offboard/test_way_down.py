@@ -8,7 +8,7 @@ import pytest
 from tests.support.fake_autopilot.simulated import ARMING, SCENARIO, START, Flight, Vehicle, fly_to_step
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.controller import Standing
+from uav_dc_ros.offboard.mission.controller import Checkpoint
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Mode, SetMode
 
@@ -17,7 +17,7 @@ GROUND = Enu(START.east_m, START.north_m, 0.0)
 
 def restarted(flight: Flight) -> Flight:
     """Another bridge beside the same vehicle, that knows what the journal tells."""
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Standing)
+    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Checkpoint)
     return Flight(flight.bridge.settings, flight.vehicle, standing=standing)
 
 
@@ -128,7 +128,7 @@ def test_what_a_pilot_has_is_let_alone_also_without_a_position() -> None:
 
 def test_a_mode_that_was_entered_is_known_to_a_bridge_that_is_started_anew() -> None:
     """The pilot goes back to the mode that the vehicle was in before the commanded one was requested."""
-    kept: list[Standing] = []
+    kept: list[Checkpoint] = []
     vehicle = Vehicle(position=GROUND, mode_name="STABILIZE")
     flight = Flight(vehicle=vehicle)
     note = flight.bridge._on_change
@@ -189,7 +189,7 @@ def test_a_vehicle_whose_clock_stands_is_asked_again(link_lost_timeout_s: float,
 @pytest.mark.parametrize("again", [True, False])
 def test_a_vehicle_that_flies_goes_straight_up_or_down_then_across(up_m: float, again: bool) -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, up_m), mode=Mode.COMMANDED, armed=True)
-    standing = Standing(step=0, cell=SCENARIO.start_cell, flies=True) if again else None
+    standing = Checkpoint(step=0, cell=SCENARIO.start_cell, flies=True) if again else None
     flight = Flight(SafetySettings(), vehicle, standing=standing)
     while abs(vehicle.position.up_m - START.up_m) > 3.0:
         assert vehicle.position[:2] == (300.0, 300.0)

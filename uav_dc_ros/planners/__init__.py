@@ -1,8 +1,8 @@
 """Policies that learn nothing, to see whether learning is worth it.
 
 Each is a function of the state of many missions that gives an action for each, as a trained policy's
-`steer` is: see `experiments.evaluate.rollout.Act`. They know the clusters' centres, which a policy that was trained
-in the scenario has learnt, but not where single users are.
+`steer` is: see `experiments.evaluate.rollout.Act`. They know the clusters' centres, which a policy that was
+trained in the scenario has learnt, but not where single users are.
 """
 
 from collections.abc import Callable
