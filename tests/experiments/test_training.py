@@ -424,7 +424,7 @@ def test_policies_are_chosen_for_users_and_for_battery(monkeypatch):
         reward=nothing,
         episode_return=nothing,
     )
-    monkeypatch.setattr(validation, "fly_greedily", lambda training, seeds: missions)
+    monkeypatch.setattr(validation, "roll_out_greedily", lambda training, seeds: missions)
     found = validate(Training(population(scenario, *[run(scenario, i) for i in range(4)]), CPU))
     np.testing.assert_allclose(found.brought_home, [3.0, 3.01, 3.1, 0.0])
     assert np.argsort(-found.merit).tolist() == [2, 0, 1, 3]

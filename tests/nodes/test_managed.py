@@ -171,7 +171,7 @@ def test_a_whole_number_is_a_real_one_wherever_it_is_given(ros: Ros, asker: Aske
         "fault_timeout_s": "fault_timeout_s: 'long'; expected a number from 0.1 to 600.0 s",
         "arm": "arm: 1; expected true or false",
         "command_retry_s": "command_retry_s: True; expected a number from 0.5 to 60.0 s",
-        "failsafe_action": "then: 'stay'; expected one of return, land",
+        "failsafe_action": "failsafe_action: 'stay'; expected one of return, land",
     }
     assert asker.ask(node="/bridge", do="configure") == {"success": True, "state": "inactive"}
     ended(node)

@@ -165,7 +165,7 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
     clock = Clock()
     node = Node(kind, clock)
     monkeypatch.setattr(mavros, "time", clock)
-    monkeypatch.setattr(mavros, "Stream", Direct)
+    monkeypatch.setattr(mavros, "SetpointStream", Direct)
     monkeypatch.setattr(mavros.mavros_messages, "load", lambda needed_for: PACKAGE)
     vehicle = MavrosVehicle(node, place=START, arms=True)  # type: ignore[arg-type]
     vehicle.open()
