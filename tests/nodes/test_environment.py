@@ -169,7 +169,7 @@ for _ in range(kills):
     world.kill()
     world.wait()
     assert shared() != before, "the world that was killed left nothing: nothing is tested"
-    for _ in range(3):  # on a busy machine a process of ours may have left in a hurry: the next start removes it
+    for _ in range(3):  # what a busy machine left behind is removed at the next start
         subprocess.run([*run_all, "--pace", "lockstep"], check=True, stdout=subprocess.DEVNULL)
         if shared() == before:
             break
