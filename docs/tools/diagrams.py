@@ -196,11 +196,13 @@ def _route(source: str, target: str) -> list[tuple[float, float]]:
         step = _ROW.index(target) - _ROW.index(source)
         if step == 1:
             return [(x + width, y + 12), (to_x, to_y + 12)]
+        if step > 1:  # over those between
+            return [(x + width - 16, y), (x + width - 16, y - 18), (to_x + 16, y - 18), (to_x + 16, to_y)]
         return [(x, y + height - 10), (to_x + to_width, to_y + height - 10)]
     if target == "aborted":
         return [(middle, y), (middle, to_y + to_height)]
     if target == "landing":
-        return [(middle - 20, y + height), (middle - 20, to_y)]
+        return [(middle - 34, y + height), (middle - 34, to_y)]
     # Past landing, on the ground: straight down, behind it.
     down = min(max(middle + (20 if target == "timeout" else 0), to_x + 12), to_x + to_width - 12)
     return [(down, y + height), (down, to_y)]

@@ -91,7 +91,10 @@ def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]
             raise ParameterError(f"{told}: expected --{name}, which tells all nodes alike")
         if row is None:
             known = ", ".join(row.name for row in NODES[node].parameters if row.name not in OPTIONS)
-            raise ParameterError(f"{told}: node {node} has no such parameter; expected some of {known}")
+            expected = (
+                f"expected some of {known}" if known else "expected none: it has options of run_all only"
+            )
+            raise ParameterError(f"{told}: node {node} has no such parameter; {expected}")
         value = setting
         if isinstance(setting, str) and not isinstance(row.default, str):
             with contextlib.suppress(msgspec.DecodeError):
