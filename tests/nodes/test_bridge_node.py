@@ -48,7 +48,7 @@ class Stub:
         self.broken = ""
 
     @property
-    def anchor(self) -> str:
+    def grid_origin(self) -> str:
         return str(self.datum or "")
 
     def open(self) -> None:
@@ -65,7 +65,7 @@ class Stub:
     def set_setpoint(self, setpoint: Enu | None) -> None:
         self.setpoints.append(setpoint)
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         self.asked.append(command)
 
     def close(self) -> None:
@@ -129,7 +129,7 @@ def test_the_vehicle_is_seen_obeying_while_the_bridge_stops(made: Made) -> None:
 
     node.create_subscription(String, "mode", obey, 1)
     made.until(lambda: publisher.get_subscription_count() == 1)
-    made.vehicle.ask = lambda command: publisher.publish(String(data=command.mode))  # type: ignore[method-assign]
+    made.vehicle.send_command = lambda command: publisher.publish(String(data=command.mode))  # type: ignore[method-assign]
     node.trigger_deactivate()
     assert node._known.mode is Mode.RETURN
     assert node.bridge.is_done_with(node._known)

@@ -183,7 +183,7 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
         known = vehicle.telemetry()
         refusals.add(known.refusal)
         for command in bridge.tick(clock.now_s, known):
-            vehicle.ask(command)
+            vehicle.send_command(command)
         if bridge.phase is Phase.READY and bridge.fault is None:
             assert bridge.move(bridge.step, way_home(bridge)) is None
             cells.append(bridge.course.goal)

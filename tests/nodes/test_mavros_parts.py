@@ -94,10 +94,10 @@ def test_in_the_air_or_without_an_estimate_nothing_is_the_place() -> None:
         assert "expected it" in known.missing or "not ready to arm" in known.missing
 
 
-def test_an_anchor_needs_no_ground() -> None:
-    anchor = "15.1,-6.0,-7.000000000000001"
-    hearing = MavrosTelemetry(PLACE, anchor=anchor)
-    assert ",".join(map(repr, hearing.origin or ())) == anchor
+def test_a_grid_origin_needs_no_ground() -> None:
+    grid_origin = "15.1,-6.0,-7.000000000000001"
+    hearing = MavrosTelemetry(PLACE, grid_origin=grid_origin)
+    assert ",".join(map(repr, hearing.origin or ())) == grid_origin
     for beats in (1, 2, 3):
         heartbeat(hearing, beats, "OFFBOARD", "Active")
     hearing.on_pose(Enu(5.0, 6.0, 30.0), 0.5, 100.0, 1.0)
@@ -106,8 +106,8 @@ def test_an_anchor_needs_no_ground() -> None:
     assert known.position == pytest.approx((20.1, 0.0, 23.0))
     assert (known.armed, known.on_ground, hearing.takes_setpoints) == (True, False, True)
     for wrong in ("1,2", "1,2,nan", "1,2,3,4", "here"):
-        with pytest.raises(VehicleError, match=r"^anchor of MAVROS: .*; expected EAST,NORTH,UP"):
-            MavrosTelemetry(PLACE, anchor=wrong)
+        with pytest.raises(VehicleError, match=r"^grid origin: .*; expected EAST,NORTH,UP"):
+            MavrosTelemetry(PLACE, grid_origin=wrong)
 
 
 def test_with_a_datum_the_fix_says_where_it_stands_across_and_the_ground_how_high() -> None:
@@ -490,7 +490,7 @@ def test_wishes_become_requests(
 ) -> None:
     node = Node()
     commands = Commands(node, PACKAGE, time.monotonic)  # type: ignore[arg-type]
-    commands.ask(command, dialect, 2.5)
+    commands.send_command(command, dialect, 2.5)
     asked = {name: client.requests for name, client in node.clients.items() if client.requests}
     assert asked == ({service: [Message(**request_)]} if request_ is not None else {})
     assert commands.refusal is None
@@ -501,16 +501,16 @@ def test_refusals_are_told_with_the_autopilots_own_words() -> None:
     commands = Commands(node, PACKAGE, lambda: now_s[0])  # type: ignore[arg-type]
     arming = node.clients["mavros/cmd/arming"]
     arming.answer = Message(success=False, result=4)
-    commands.ask(Arm(), ARDUCOPTER, 0.0)
+    commands.send_command(Arm(), ARDUCOPTER, 0.0)
     assert commands.refusal == "arming refused: result 4"
     commands.on_statustext(Message(severity=6, text="idle talk"))
     commands.on_statustext(Message(severity=2, text="Arm: waiting for home "))
     assert commands.refusal == "arming refused: Arm: waiting for home"
     arming.answer = Message(success=True, result=0)
-    commands.ask(Arm(), ARDUCOPTER, 0.0)
+    commands.send_command(Arm(), ARDUCOPTER, 0.0)
     assert commands.refusal is None
     arming.ready = False
-    commands.ask(Arm(), ARDUCOPTER, 0.0)
+    commands.send_command(Arm(), ARDUCOPTER, 0.0)
     now_s[0] += 60.0
     assert "nobody offers mavros/cmd/arming" in str(commands.refusal) or "waiting" in str(commands.refusal)
     assert len(arming.requests) == 2
@@ -536,9 +536,9 @@ def test_without_mavros_msgs_nothing_is_asked_for_and_the_pilot_is_told_once() -
     node = Node()
     commands = Commands(node, None, time.monotonic)  # type: ignore[arg-type]
     for _ in range(3):
-        commands.ask(SetMode(Mode.LAND), ARDUCOPTER, 10.0)
-        commands.ask(TakeOff(10.0), ARDUCOPTER, 0.0)
-        commands.ask(Arm(), ARDUCOPTER, 0.0)
+        commands.send_command(SetMode(Mode.LAND), ARDUCOPTER, 10.0)
+        commands.send_command(TakeOff(10.0), ARDUCOPTER, 0.0)
+        commands.send_command(Arm(), ARDUCOPTER, 0.0)
     commands.ask_for_messages(["mavros/local_position/pose"])
     assert not any(client.requests for client in node.clients.values())
     assert commands.refusal == "arming refused: mavros_msgs is not installed: a pilot has to arm"

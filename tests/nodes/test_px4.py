@@ -307,9 +307,9 @@ def test_a_setpoint_goes_out_in_ned(vehicle: px4.Px4Vehicle, spun: Spun, hand: H
 
 def test_the_grid_has_a_datum_once_px4_knows_the_earth(msg: Any) -> None:
     hearing = standing(msg)
-    assert hearing.anchor == "local:2.0,-3.0,0.5"
+    assert hearing.grid_origin == "local:2.0,-3.0,0.5"
     hearing.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
-    datum = Geodetic.parse(hearing.anchor)
+    datum = Geodetic.parse(hearing.grid_origin)
     # PX4 counts from a point 3 m south and 2 m east of where the vehicle stands, half a metre above it.
     assert ZURICH.seen_from(datum) == pytest.approx((2.0, -3.0, 0.5), abs=1e-5)
     known = hearing.telemetry().position
@@ -319,14 +319,14 @@ def test_the_grid_has_a_datum_once_px4_knows_the_earth(msg: Any) -> None:
     hearing.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
     hearing.on_vehicle_local_position(position(msg, Ned(3.0, -42.0, 0.5), moved), 2.0)
     assert hearing.telemetry().position == pytest.approx(PLACE, abs=1e-3)
-    assert hearing.anchor == str(datum)
+    assert hearing.grid_origin == str(datum)
 
 
 @pytest.mark.parametrize("reference", [None, ZURICH], ids=["local", "global"])
 def test_a_bridge_that_comes_back_in_the_air_has_the_same_grid(msg: Any, reference: Geodetic | None) -> None:
     hearing = standing(msg, place=Enu(100.0, 0.0, 0.0))
     hearing.on_vehicle_local_position(position(msg, START, reference), 1.0)
-    again = Px4Telemetry(place=Enu(100.0, 0.0, 0.0), anchor=hearing.anchor)
+    again = Px4Telemetry(place=Enu(100.0, 0.0, 0.0), grid_origin=hearing.grid_origin)
     for each in (hearing, again):
         each.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 2.0)
         each.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
@@ -336,10 +336,10 @@ def test_a_bridge_that_comes_back_in_the_air_has_the_same_grid(msg: Any, referen
     assert again.telemetry().position == pytest.approx(hearing.telemetry().position, abs=1e-6)
 
 
-@pytest.mark.parametrize("anchor", ["local:", "local:1,2", "local:1,2,nan", "local:a,b,c", "47,8"])
-def test_an_anchor_that_is_none(anchor: str) -> None:
+@pytest.mark.parametrize("grid_origin", ["local:", "local:1,2", "local:1,2,nan", "local:a,b,c", "47,8"])
+def test_an_invalid_grid_origin(grid_origin: str) -> None:
     with pytest.raises(VehicleError, match="expected"):
-        Px4Telemetry(place=PLACE, anchor=anchor)
+        Px4Telemetry(place=PLACE, grid_origin=grid_origin)
 
 
 def test_a_grid_with_a_datum_needs_a_px4_that_knows_the_earth(msg: Any) -> None:
@@ -497,12 +497,12 @@ def test_a_vehicle_whose_time_is_faster_gets_more_of_it(
 
 def test_wishes_as_commands(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     for command in (Arm(), SetMode(Mode.LAND)):
-        vehicle.ask(command)  # nobody is there yet: to be forgotten, not kept
+        vehicle.send_command(command)  # nobody is there yet: to be forgotten, not kept
     spun.until(lambda: vehicle.kind == "PX4", hand.say)
     assert hand.commands == []
     commands = [SetMode(mode) for mode in (Mode.COMMANDED, Mode.HOLD, Mode.RETURN, Mode.LAND)]
     for command in [*commands, TakeOff(50.0), Arm()]:
-        vehicle.ask(command)
+        vehicle.send_command(command)
     spun.until(lambda: len(hand.commands) == 5)
     said = [message for _, message in hand.commands]
     assert [(each.command, each.param1, each.param2, each.param3) for each in said] == [
@@ -732,7 +732,7 @@ class Flight:
     def tick(self) -> None:
         bridge, vehicle = self.bridge, self.vehicle
         for command in bridge.tick(time.monotonic(), vehicle.telemetry()):
-            vehicle.ask(command)
+            vehicle.send_command(command)
         if bridge.phase is Phase.READY and bridge.fault is None:
             x, y, _ = bridge.cell
             action = Action.RIGHT if x < 2 else Action.FORWARD if y < 2 else Action.HOVER
@@ -851,10 +851,10 @@ def test_without_a_position_it_holds_until_px4_gives_up(
 def test_a_bridge_that_is_started_again_in_the_air_goes_on(flight: Flight) -> None:
     flight.until(lambda: flight.bridge.step == 2)
     flight.do("speed 0.2")  # PX4 waits a second of its time, and no more
-    standing, anchor, place = flight.bridge.standing, flight.vehicle.anchor, Enu(7.0, 7.0, 7.0)
+    standing, grid_origin, place = flight.bridge.standing, flight.vehicle.grid_origin, Enu(7.0, 7.0, 7.0)
     flight.vehicle.close()
     flight.bridge = MissionController(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
-    flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], place=place, anchor=anchor)
+    flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], place=place, grid_origin=grid_origin)
     flight.vehicle.open()
     flight.until(lambda: flight.log[-1][2].startswith("it flies already"))
     flight.spun.pass_time(1.0, flight.tick)  # until PX4 has found the new publishers

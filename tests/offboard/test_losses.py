@@ -268,12 +268,12 @@ def test_commands_to_take_off_that_are_lost_are_repeated_before_the_autopilot_di
         lost = 0
         stands_s = 0.0
 
-        def ask(self, command: object) -> None:
+        def send_command(self, command: object) -> None:
             if isinstance(command, TakeOff) and self.lost:
                 self.lost -= 1
                 self.asked.append(command)
             else:
-                super().ask(command)  # type: ignore[arg-type]
+                super().send_command(command)  # type: ignore[arg-type]
 
         def pass_time(self, seconds: float, setpoint: Enu | None) -> None:
             super().pass_time(seconds, setpoint)

@@ -139,7 +139,7 @@ def hover(autopilot: Fake, vehicle: MavlinkVehicle, up_m: float = 10.0) -> Enu:
         (Arm(), lambda known: known.armed),
         (TakeOff(up_m), lambda known: known.on_ground is False),
     ]:
-        vehicle.ask(command)
+        vehicle.send_command(command)
         until(vehicle, right)
     autopilot.wait_for("taken off")
     return target
@@ -168,8 +168,8 @@ def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told
         known = until(vehicle, lambda known: known.missing is None)
         # Not exactly: the plane at the grid's corner is no longer level half a kilometre away (0.02 m).
         assert known.position == pytest.approx(place, abs=0.05)
-        assert vehicle.anchor
-        assert HOME.seen_from(Geodetic.parse(vehicle.anchor)) == pytest.approx(place, abs=0.05)
+        assert vehicle.grid_origin
+        assert HOME.seen_from(Geodetic.parse(vehicle.grid_origin)) == pytest.approx(place, abs=0.05)
         assert vehicle.kind == "PX4"
 
 
@@ -342,12 +342,12 @@ def test_a_take_off_command_that_was_lost_twice_is_followed_when_it_comes() -> N
             (SetMode(Mode.COMMANDED), lambda known: known.mode is Mode.COMMANDED),
             (Arm(), lambda known: known.armed),
         ]:
-            vehicle.ask(command)
+            vehicle.send_command(command)
             until(vehicle, right)
         for _ in range(2):
-            vehicle.ask(TakeOff(10.0))
+            vehicle.send_command(TakeOff(10.0))
             autopilot.wait_for("lost")
-        vehicle.ask(TakeOff(10.0))
+        vehicle.send_command(TakeOff(10.0))
         autopilot.wait_for("taken off")
 
 
@@ -369,7 +369,7 @@ def test_it_comes_back_to_a_vehicle_that_flies_and_repeats_no_wish() -> None:
         target = hover(autopilot, vehicle)
         autopilot.do("drop 0.3")
         until(vehicle, lambda known: (known.heartbeat_s or 0.0) < time.monotonic() - 0.2, target)
-        vehicle.ask(SetMode(Mode.RETURN))  # nobody hears it, and it is not kept for later
+        vehicle.send_command(SetMode(Mode.RETURN))  # nobody hears it, and it is not kept for later
         known = until(vehicle, lambda known: (known.heartbeat_s or 0.0) > time.monotonic() - 0.02, target)
         assert known.armed
         far = target._replace(north_m=20.0)

@@ -21,11 +21,11 @@ class Stubborn(Vehicle):
 
     stick_is_up = True
 
-    def ask(self, command: object) -> None:
+    def send_command(self, command: object) -> None:
         if isinstance(command, Arm) and self.stick_is_up:
             self.asked.append(command)
         else:
-            super().ask(command)  # type: ignore[arg-type]
+            super().send_command(command)  # type: ignore[arg-type]
 
 
 def restarted(flight: Flight) -> Flight:

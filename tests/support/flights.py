@@ -125,7 +125,7 @@ class Flight:
             vehicle.pass_time(self.tick_s, self._setpoint)
             return
         for command in bridge.tick(vehicle.now_s, vehicle.told):
-            vehicle.ask(command)
+            vehicle.send_command(command)
         if vehicle.told.position is not None and vehicle.told.position_s == vehicle.now_s:
             self._say_pose(vehicle.told.position)
         self._decide(bridge)

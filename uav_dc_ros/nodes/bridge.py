@@ -206,7 +206,7 @@ class AutopilotBridge(MissionNode):
         if self._begun:
             self.bridge.policy_is_gone = self._policy.is_gone()
             for command in self.bridge.tick(time.monotonic(), known):
-                self.vehicle.ask(command)
+                self.vehicle.send_command(command)
         self.vehicle.set_setpoint(self.bridge.setpoint)
         self._publish_target()
 
@@ -246,7 +246,7 @@ class AutopilotBridge(MissionNode):
 
     def _tell_grid(self) -> None:
         """Log where the grid lies, as soon as that is known, and how far from the last flight's."""
-        datum, anchor = self.vehicle.datum, self.vehicle.anchor
+        datum, anchor = self.vehicle.datum, self.vehicle.grid_origin
         where = anchor if datum is None else str(datum)
         if where == self._grid:
             return
@@ -275,7 +275,7 @@ class AutopilotBridge(MissionNode):
             seed=self.values["seed"],
             run=self.run,
             standing=self.bridge.standing,
-            anchor=self.vehicle.anchor,
+            anchor=self.vehicle.grid_origin,
             system=self._known.system_id,
         )
         try:

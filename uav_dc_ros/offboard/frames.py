@@ -22,6 +22,33 @@ class Enu(NamedTuple):
     north_m: float
     up_m: float
 
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read `EAST,NORTH,UP`, metres.
+
+        Raises:
+            VehicleError: the text is not three finite numbers.
+        """
+        try:
+            position = cls(*map(float, text.split(",")))
+        except (TypeError, ValueError):
+            position = cls(math.nan, math.nan, math.nan)
+        if not all(map(math.isfinite, position)):
+            raise VehicleError(f"grid origin: {text!r}; expected EAST,NORTH,UP in metres")
+        return position
+
+    def to_text(self) -> str:
+        """As `parse` reads it, with all digits."""
+        return ",".join(map(repr, self))
+
+    def plus(self, other: Self) -> Self:
+        """Sum of two vectors."""
+        return type(self)(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def minus(self, other: Self) -> Self:
+        """Difference of two vectors."""
+        return type(self)(*(a - b for a, b in zip(self, other, strict=True)))
+
 
 class Ned(NamedTuple):
     """North, east, down, metres."""

@@ -136,7 +136,7 @@ class Vehicle(Protocol):
         """Name of the autopilot; empty until it is known."""
 
     @property
-    def anchor(self) -> str:
+    def grid_origin(self) -> str:
         """Where the grid lies, for a transport that is opened again in the air; empty until it is known."""
 
     @property
@@ -153,7 +153,7 @@ class Vehicle(Protocol):
     def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
 
     def close(self) -> None:

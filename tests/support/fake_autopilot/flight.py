@@ -176,7 +176,7 @@ class Flight:
         bridge = self.bridge
         self.known = self.vehicle.telemetry()
         for command in bridge.tick(time.monotonic(), self.known):
-            self.vehicle.ask(command)
+            self.vehicle.send_command(command)
         if bridge.phase is Phase.READY and bridge.fault is None and self.policy is not None:
             bridge.move(bridge.step, self.policy(bridge))
         self.vehicle.set_setpoint(bridge.setpoint)

@@ -165,7 +165,7 @@ class Flight:
         spin(self.executor, 0.01)
         bridge = self.bridge
         for command in bridge.tick(time.monotonic(), self.vehicle.telemetry()):
-            self.vehicle.ask(command)
+            self.vehicle.send_command(command)
         if bridge.phase is Phase.READY and bridge.fault is None:
             bridge.move(bridge.step, way_home(bridge))
         self.vehicle.set_setpoint(bridge.setpoint)

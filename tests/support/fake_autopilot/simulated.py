@@ -64,7 +64,7 @@ class Vehicle:
     def on_ground(self) -> bool:
         return self.position.up_m <= 0.05
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         self.asked.append(command)
         if self.deaf or self.silent:
             return
@@ -208,7 +208,7 @@ class Flight:
     def tick(self, tick_s: float = TICK_S, known: Telemetry | None = None) -> None:
         bridge, vehicle = self.bridge, self.vehicle
         for command in bridge.tick(vehicle.now_s, known or vehicle.told):
-            vehicle.ask(command)
+            vehicle.send_command(command)
         if bridge.setpoint is not None:
             assert bridge.fence.breach(bridge.setpoint) is None
         if bridge.phase is Phase.READY and self.policy is not None:

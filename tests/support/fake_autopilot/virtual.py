@@ -145,7 +145,7 @@ class VirtualFlight:
             self.session.receive(data, self.now_s)
         known = self.hearing.telemetry(self.now_s)
         for command in self.bridge.tick(self.now_s, known):
-            self.session.ask(command)
+            self.session.queue_command(command)
         bridge = self.bridge
         if bridge.phase is Phase.READY and bridge.fault is None and self.policy is not None:
             bridge.move(bridge.step, self.policy(bridge))

@@ -21,7 +21,7 @@ def make(
     values: Mapping[str, Any],
     scenario: Scenario,
     datum: Geodetic | None,
-    anchor: str,
+    grid_origin: str,
     system: int | None = None,
     restarted: bool = False,
 ) -> Vehicle:
@@ -32,8 +32,8 @@ def make(
         values: its parameters.
         scenario: whose start the vehicle stands under, unless there is a datum.
         datum: of the grid; None: see `scenario`.
-        anchor: of the same vehicle before the bridge was started again; empty: there was none.
-        system: likewise its number on the link, where the parameter names none; None: see `anchor`.
+        grid_origin: of the same vehicle before the bridge was started again; empty: there was none.
+        system: likewise its number on the link, where the parameter names none; None: see `grid_origin`.
         restarted: was a bridge killed before it? Topics may still tell of that one.
 
     Raises:
@@ -46,12 +46,12 @@ def make(
     check(kind, connect, values["system"], values["arm"])
     if kind == "mavlink":
         named = values["system"] or system
-        return MavlinkVehicle(connect, datum=datum, place=place, anchor=anchor, system=named)
+        return MavlinkVehicle(connect, datum=datum, place=place, grid_origin=grid_origin, system=named)
     if kind == "mavros":
         return MavrosVehicle(
-            node, place=place, anchor=anchor, datum=datum, arms=values["arm"], restarted=restarted
+            node, place=place, grid_origin=grid_origin, datum=datum, arms=values["arm"], restarted=restarted
         )
-    return Px4Vehicle(node, place=place, anchor=anchor, datum=datum, restarted=restarted)
+    return Px4Vehicle(node, place=place, grid_origin=grid_origin, datum=datum, restarted=restarted)
 
 
 def check(kind: str, connect: str, system: int, arm: bool) -> None:

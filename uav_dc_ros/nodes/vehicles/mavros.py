@@ -74,13 +74,13 @@ class MavrosVehicle:
     Args:
         node: whose topics these are; their names are relative, and can be remapped.
         place: where the vehicle stands when its first position comes, in the grid's ENU frame.
-        anchor: of the same transport before it was started again.
+        grid_origin: of the same transport before it was started again.
         datum: of the grid, for where the vehicle stands across; `place` then only gives its height.
         arms: is it to be asked to arm?
-        restarted: was a bridge killed before it, even one that had no anchor yet?
+        restarted: was a bridge killed before it, even one that had no grid origin yet?
 
     Raises:
-        VehicleError: the anchor is none; it is to arm, and mavros_msgs is not installed.
+        VehicleError: the grid origin is invalid; it is to arm, and mavros_msgs is not installed.
     """
 
     def __init__(
@@ -88,15 +88,15 @@ class MavrosVehicle:
         node: Node,
         *,
         place: Enu,
-        anchor: str = "",
+        grid_origin: str = "",
         datum: Geodetic | None = None,
         arms: bool = False,
         restarted: bool = False,
     ) -> None:
         self._node = node
         self._package = mavros_messages.load(needed_for="arming" if arms else "")
-        self._hearing = MavrosTelemetry(place, datum, anchor, full=self._package is not None)
-        self._other_publishers = OtherSetpointPublishers(node, restarted=restarted or bool(anchor))
+        self._hearing = MavrosTelemetry(place, datum, grid_origin, full=self._package is not None)
+        self._other_publishers = OtherSetpointPublishers(node, restarted=restarted or bool(grid_origin))
         self._yaw_rad: float | None = None
         self._stream: SetpointStream[Target] = SetpointStream(self._publish, "mavros")
         self._publisher: Any = None
@@ -155,10 +155,10 @@ class MavrosVehicle:
         return self._hearing.corner
 
     @property
-    def anchor(self) -> str:
+    def grid_origin(self) -> str:
         """Where MAVROS counts from, in the grid's frame: EAST,NORTH,UP, metres; empty until it is known."""
         origin = self._hearing.origin
-        return "" if origin is None else ",".join(map(repr, origin))
+        return "" if origin is None else origin.to_text()
 
     def telemetry(self) -> Telemetry:
         """What is known of the vehicle now, times as of `time.monotonic`."""
@@ -192,11 +192,11 @@ class MavrosVehicle:
             self._yaw_rad = hearing.yaw_rad
         self._stream.set_setpoint(Target(hearing.to_mavros(setpoint), self._yaw_rad))
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
         dialect, position = self._hearing.dialect, self._hearing.position
         if dialect is not None and self._commands is not None:
-            self._commands.ask(command, dialect, position.up_m if position is not None else 0.0)
+            self._commands.send_command(command, dialect, position.up_m if position is not None else 0.0)
 
     # Hearing.
 

@@ -55,7 +55,7 @@ class Commands:
 
     # Commands.
 
-    def ask(self, command: Command, dialect: FlightStack, up_m: float) -> None:
+    def send_command(self, command: Command, dialect: FlightStack, up_m: float) -> None:
         """Pass a command on.
 
         Args:

@@ -83,12 +83,12 @@ class Px4Vehicle:
     Args:
         node: that hears and sends; somebody else spins it.
         place: where the vehicle stands when its first position comes, in the grid's ENU frame.
-        anchor: of the same transport before it was started again: takes the place of a datum.
+        grid_origin: of the same transport before it was started again: takes the place of a datum.
         datum: of the grid, for a PX4 that knows where on the Earth it is; None: see `place`.
-        restarted: was a bridge killed before it, even one that had no anchor yet?
+        restarted: was a bridge killed before it, even one that had no grid origin yet?
 
     Raises:
-        VehicleError: px4_msgs is missing, or the anchor is none.
+        VehicleError: px4_msgs is missing, or the grid origin is invalid.
     """
 
     def __init__(
@@ -96,13 +96,13 @@ class Px4Vehicle:
         node: Node,
         *,
         place: Enu,
-        anchor: str = "",
+        grid_origin: str = "",
         datum: Geodetic | None = None,
         restarted: bool = False,
     ) -> None:
         self._messages = load_messages()
         self._node = node
-        self._hearing = Px4Telemetry(place=place, anchor=anchor, datum=datum)
+        self._hearing = Px4Telemetry(place=place, grid_origin=grid_origin, datum=datum)
         self._lock = threading.Lock()  # of all below, and of `_hearing`
         self._streamed_vehicle_s = 0.0
         self._sent: Ned | None = None
@@ -111,7 +111,7 @@ class Px4Vehicle:
         self._messages_sent = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
         self._silent = set(NEEDED)
         self._looked_s, self._seen = -math.inf, ""
-        self._other_publishers = OtherSetpointPublishers(node, restarted=restarted or bool(anchor))
+        self._other_publishers = OtherSetpointPublishers(node, restarted=restarted or bool(grid_origin))
         self._subscriptions: list[Any] = []
         self._publishers: dict[str, Any] = {}
         self._stream: SetpointStream[Enu] = SetpointStream(self._send, "px4")
@@ -149,10 +149,10 @@ class Px4Vehicle:
             return self._hearing.datum
 
     @property
-    def anchor(self) -> str:
+    def grid_origin(self) -> str:
         """Where the grid lies: its datum, or else PX4's origin in it; empty until it is known."""
         with self._lock:
-            return self._hearing.anchor
+            return self._hearing.grid_origin
 
     def telemetry(self) -> Telemetry:
         """What is known of the vehicle now, times as of `time.monotonic`."""
@@ -169,7 +169,7 @@ class Px4Vehicle:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
         self._stream.set_setpoint(setpoint)
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Send a command, once; `telemetry` reports what came of it. PX4 takes off by setpoints."""
         match command:
             case SetMode(Mode.RETURN):

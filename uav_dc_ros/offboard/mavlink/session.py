@@ -73,7 +73,7 @@ class Session:
         """Somebody is there who will decide."""
         self._alive_s = now_s
 
-    def ask(self, command: Command) -> None:
+    def queue_command(self, command: Command) -> None:
         """Pass a command on with what is sent next."""
         self._commands.append(command)
 

@@ -323,8 +323,7 @@ class MavlinkTelemetry:
                 return
             # Here is `place`, as far as the autopilot knows: the datum lies as far away as that says.
             here = self._frame_at(Enu(0.0, 0.0, 0.0)).from_autopilot(self._ned)
-            offset = Enu(*(h - p for h, p in zip(here, self.place, strict=True)))
-            self.datum = self._origin.at(offset)
+            self.datum = self._origin.at(here.minus(self.place))
             self.frame = self._frame_at(self._origin.seen_from(self.datum))
         if self.frame is not None:
             self._position = self.frame.from_autopilot(self._ned)

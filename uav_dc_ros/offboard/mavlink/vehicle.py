@@ -49,7 +49,7 @@ class MavlinkVehicle:
         address: such as `tcp:127.0.0.1:5760`.
         datum: of the grid. None: the vehicle stands at `place` when its first position comes.
         place: in the grid's ENU frame, see `datum`.
-        anchor: of the same transport before it was started again: takes the place of a datum.
+        grid_origin: of the same transport before it was started again: takes the place of a datum.
         system: whom to talk to; None: to the only autopilot on the link.
 
     Raises:
@@ -62,16 +62,16 @@ class MavlinkVehicle:
         *,
         datum: Geodetic | None = None,
         place: Enu = ORIGIN,
-        anchor: str = "",
+        grid_origin: str = "",
         system: int | None = None,
     ) -> None:
-        if anchor:
-            datum = Geodetic.parse(anchor)
+        if grid_origin:
+            datum = Geodetic.parse(grid_origin)
         self.address = Address.parse(address)
         codec = load_codec()
         if self.address.kind == "serial":
             load_serial(self.address)
-        self._hearing = MavlinkTelemetry(datum, place, system, again=bool(anchor))
+        self._hearing = MavlinkTelemetry(datum, place, system, again=bool(grid_origin))
         self._session = Session(codec, self._hearing, self._write)
         self._lock = threading.Lock()  # of both
         self._down: str | None = f"{self.address} is not open yet"
@@ -109,7 +109,7 @@ class MavlinkVehicle:
         os.close(self._wake_out)
 
     @property
-    def anchor(self) -> str:
+    def grid_origin(self) -> str:
         """The grid's datum, as `Geodetic.parse` reads it; empty until it is known."""
         return str(self.datum or "")
 
@@ -146,10 +146,10 @@ class MavlinkVehicle:
         if news:
             self._wake()
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
         with self._lock:
-            self._session.ask(command)
+            self._session.queue_command(command)
         self._wake()
 
     # The thread.

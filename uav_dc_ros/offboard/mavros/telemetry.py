@@ -54,7 +54,7 @@ class MavrosTelemetry:
     Args:
         place: where the vehicle stands when its first position comes, in the grid's ENU frame.
         datum: of the grid: gives that place across, from a fix on the ground; `place` only gives the height.
-        anchor: `origin` as text, of a transport before it was started again: needs neither.
+        grid_origin: `origin` as text, of a transport before it was started again: needs neither.
         full: is mavros_msgs there?
 
     Attributes:
@@ -66,14 +66,14 @@ class MavrosTelemetry:
         discarded: messages that were ignored, by reason.
 
     Raises:
-        VehicleError: the anchor is none.
+        VehicleError: the grid origin is invalid.
     """
 
     def __init__(
-        self, place: Enu, datum: Geodetic | None = None, anchor: str = "", full: bool = False
+        self, place: Enu, datum: Geodetic | None = None, grid_origin: str = "", full: bool = False
     ) -> None:
         self.place, self.datum, self.full = place, datum, full
-        self.origin = parse_anchor(anchor) if anchor else None
+        self.origin = Enu.parse(grid_origin) if grid_origin else None
         self.diagnostics = Diagnostics()
         self.yaw_rad = 0.0
         self.heard: dict[str, float] = {}
@@ -144,12 +144,12 @@ class MavrosTelemetry:
         """A position in MAVROS's frame, in the grid's."""
         if self.origin is None or local is None:
             return None
-        return Enu(*(o + p for o, p in zip(self.origin, local, strict=True)))
+        return self.origin.plus(local)
 
     def to_mavros(self, position: Enu) -> Enu:
         """A position of the grid, as MAVROS's local ENU; the origin must be known."""
         assert self.origin is not None, "nobody is steered before"
-        return Enu(*(p - o for p, o in zip(position, self.origin, strict=True)))
+        return position.minus(self.origin)
 
     @property
     def takes_setpoints(self) -> bool:
@@ -255,7 +255,7 @@ class MavrosTelemetry:
                 return
             east_m, north_m, _ = self._fix.seen_from(self.datum)
             here = Enu(east_m, north_m, self.place.up_m)
-        self.origin = Enu(*(h - p for h, p in zip(here, self._local, strict=True)))
+        self.origin = here.minus(self._local)
 
     def _find_corner(self, now_s: float) -> None:
         """Find out where the grid lies on the Earth, from a fix of a vehicle that stands."""
@@ -336,18 +336,3 @@ def _finite(point: Any) -> Enu | None:
     """A geometry_msgs/Point; None: it is none."""
     position = Enu(point.x, point.y, point.z)
     return position if all(map(math.isfinite, position)) else None
-
-
-def parse_anchor(text: str) -> Enu:
-    """Read `EAST,NORTH,UP`, metres: where MAVROS counts from, in the grid's frame.
-
-    Raises:
-        VehicleError: it is none.
-    """
-    try:
-        origin = Enu(*(float(part) for part in text.split(",")))
-    except (ValueError, TypeError):
-        origin = Enu(math.nan, 0.0, 0.0)
-    if not all(map(math.isfinite, origin)):
-        raise VehicleError(f"anchor of MAVROS: {text!r}; expected EAST,NORTH,UP in metres")
-    return origin

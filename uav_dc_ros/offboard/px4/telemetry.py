@@ -7,7 +7,6 @@ import math
 from collections import Counter
 from typing import Any
 
-from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.flight_stacks import COPTERS
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, tilt_rad, to_enu
 from uav_dc_ros.offboard.stamp_order import StampOrder
@@ -15,7 +14,7 @@ from uav_dc_ros.offboard.vehicle import Mode, Telemetry
 
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: as whom commands are sent, so that answers are told apart
 CLOCK_S = 10.0  # between two messages; a longer time, or one back, is of another clock
-LOCAL = "local:"  # before an anchor of a vehicle that does not know where on the Earth it is
+LOCAL = "local:"  # before a grid origin of a vehicle that does not know where on the Earth it is
 
 ARMED = 2  # ARMING_STATE
 BATTERY_LOW = 1  # BATTERY_WARNING; what is above is worse
@@ -66,11 +65,11 @@ class Px4Telemetry:
 
     Args:
         place: where it stands when its first position comes, in the grid's ENU frame.
-        anchor: as `anchor` was before a restart: takes the place of a datum.
+        grid_origin: as `grid_origin` was before a restart: takes the place of a datum.
         datum: of the grid; None: see `place`.
 
     Raises:
-        VehicleError: an anchor that is none.
+        VehicleError: a grid origin that is none.
 
     Attributes:
         datum: of the grid, once it is known.
@@ -81,13 +80,13 @@ class Px4Telemetry:
         discarded: messages that were ignored, by reason.
     """
 
-    def __init__(self, *, place: Enu, anchor: str = "", datum: Geodetic | None = None) -> None:
+    def __init__(self, *, place: Enu, grid_origin: str = "", datum: Geodetic | None = None) -> None:
         self.place, self.datum = place, datum
         self.frame: LocalFrame | None = None
-        if anchor.startswith(LOCAL):
-            self.datum, self.frame = None, LocalFrame(origin=_parse_local(anchor))
-        elif anchor:
-            self.datum = Geodetic.parse(anchor)
+        if grid_origin.startswith(LOCAL):
+            self.datum, self.frame = None, LocalFrame(origin=Enu.parse(grid_origin.removeprefix(LOCAL)))
+        elif grid_origin:
+            self.datum = Geodetic.parse(grid_origin)
         self.status: Any = None
         self.position_s: float | None = None
         self.vehicle_s = 0.0
@@ -107,11 +106,11 @@ class Px4Telemetry:
         self._stamp_us = 0
 
     @property
-    def anchor(self) -> str:
+    def grid_origin(self) -> str:
         """The grid's datum; where there is none, PX4's origin in the grid; empty until either is known."""
         if self.datum is not None:
             return str(self.datum)
-        return LOCAL + ",".join(map(repr, self.frame.origin)) if self.frame else ""
+        return LOCAL + self.frame.origin.to_text() if self.frame else ""
 
     @property
     def armed(self) -> bool:
@@ -231,9 +230,7 @@ class Px4Telemetry:
         """
         stands = self._landed if self._landed is not None else self.status is not None and not self.armed
         if self.datum is None and self.frame is None and stands:
-            self.frame = LocalFrame(
-                origin=Enu(*(p - h for p, h in zip(self.place, to_enu(ned), strict=True)))
-            )
+            self.frame = LocalFrame(origin=self.place.minus(to_enu(ned)))
         if reference is None or reference == self._reference:
             return
         if self.datum is None and self.frame is not None:
@@ -280,14 +277,3 @@ def _reference(message: Any) -> Geodetic | None:
     if not (message.xy_global and message.z_global and all(map(math.isfinite, where))):
         return None
     return Geodetic(latitude_deg=where[0], longitude_deg=where[1], altitude_m=where[2])
-
-
-def _parse_local(anchor: str) -> Enu:
-    """Read what `Px4Hearing.anchor` wrote of an origin in the grid."""
-    try:
-        origin = Enu(*map(float, anchor.removeprefix(LOCAL).split(",")))
-    except (TypeError, ValueError):
-        origin = Enu(math.nan, math.nan, math.nan)
-    if not all(map(math.isfinite, origin)):
-        raise VehicleError(f"anchor: {anchor!r}; expected {LOCAL}EAST,NORTH,UP in metres")
-    return origin
