@@ -93,10 +93,9 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
     run = ros.run_id()
     for i in range(tries):
         _, summary = refused(ros, options, f"try{i}")
-        told = summary["reason"]
-        # By run_all itself; or by its world, where the machine was too busy to find others before.
-        assert "another mission is being flown here by /world" in told, told
-        assert f"(run {run}): give this one" in told or "the container of world" in told
+        expected = f"another mission is being flown here by /world (run {run}): give this one a namespace"
+        assert summary["reason"].startswith(expected)
+        assert not (ros.folder / f"try{i}").exists()
     status, rest = stopped(first)
     assert status == 130, rest
     # Path and markers keep the newest only: a recorder on a busy machine misses some.
@@ -108,6 +107,18 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
     expected = json.loads((bag.parent / "alone.json").read_text())
     assert summaries[0] == expected | {"bag": str(ros.folder / "first")}
     assert summaries[-1]["reason"] == "run_all was interrupted"
+
+
+def test_of_two_missions_that_start_at_once_one_is_flown(ros: Ros, options: list[object], bag: Path) -> None:
+    """Before either is found by discovery, the kernel knows."""
+    given = [("--pace", "lockstep", "--bag", name, "--summary", f"{name}.json") for name in ("one", "other")]
+    ended = [finish(each) for each in [ros.start("uav_dc_ros.run_all", *options, *one) for one in given]]
+    (flown,) = [i for i, (status, _) in enumerate(ended) if status == 0]
+    assert ended[1 - flown][0] == 1, ended
+    assert "another mission is being flown here by /world" in ended[1 - flown][1]
+    name = ("one", "other")[flown]
+    assert payloads(ros.folder / name) == payloads(bag)
+    assert not (ros.folder / ("one", "other")[1 - flown]).exists()
 
 
 # A player that does not look who else is there, as those of other projects.

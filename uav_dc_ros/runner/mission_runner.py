@@ -6,7 +6,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -24,10 +24,10 @@ from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.nodes.framework.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.run_config import RunConfig
-from uav_dc_ros.runner import run_options as run_options
+from uav_dc_ros.runner import node_locks, run_options
 from uav_dc_ros.runner.monitor import MissionMonitor, MissionProgress, summary
 from uav_dc_ros.runner.supervisor import Supervisor
-from uav_dc_ros.topics import SIMULATED
+from uav_dc_ros.topics import SIMULATED, TOPICS
 
 if TYPE_CHECKING:
     from uav_dc_ros.runner.console import MissionConsole
@@ -148,6 +148,7 @@ class MissionRunner:
             stack.enter_context(supervisor)
             stack.enter_context(self.display)
             try:
+                stack.enter_context(self._locks(network.node))
                 self._tell_of_world()
                 self._follow(supervisor, network.node, network.executor)
             except NodeError as error:
@@ -175,6 +176,15 @@ class MissionRunner:
         return MissionMonitor(
             *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
             *(self._on_status, self._on_step, self._on_end, self._note, context),
+        )
+
+    def _locks(self, node: MissionMonitor) -> AbstractContextManager[None]:
+        """Locks of the nodes that publish exclusive topics."""
+        exclusive = {topic.name for topic in TOPICS.values() if topic.exclusive}
+        publish = [name for name in self.nodes if exclusive & set(self.rows[name].publishes)]
+        namespace = node.get_namespace().rstrip("/")
+        return node_locks.held(
+            node.context.get_domain_id(), [f"{namespace}/{name}" for name in publish], self.run_id
         )
 
     def _tell_of_world(self) -> None:
