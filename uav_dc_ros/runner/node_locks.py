@@ -1,9 +1,8 @@
 """Locks on this host that let one run_all at a time publish a mission's topics.
 
 DDS discovery takes time, more on a busy machine: two commands that start together may both find the network
-empty. The kernel knows at once. A lock is an abstract Unix socket: it belongs to the network namespace, as the
-middleware's own sockets do, holds across users and across containers on the host's network, and ends with its
-process.
+empty. The kernel answers at once. A lock is an abstract Unix socket: it belongs to the network namespace, as
+the middleware's own sockets do, holds across the users and containers of a host, and ends with its process.
 """
 
 import errno
