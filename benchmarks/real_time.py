@@ -14,7 +14,7 @@ from pathlib import Path
 
 from flights import ENVIRONMENT, NODES, fly
 
-from uav_dc_ros import resources
+from uav_dc_ros import files
 
 BARE = """
 import resource, sys, time
@@ -39,7 +39,7 @@ print(100 * (time.process_time() - cpu) / len(late), late[int(0.99 * (len(late) 
 def main() -> None:
     """Print the share of a core of each node, and the lateness of steps."""
     seconds = int(sys.argv[1]) if len(sys.argv) > 1 else 60
-    shipped = (Path(resources.__file__).parent / "scenarios" / "five_clusters.toml").read_text("utf-8")
+    shipped = (Path(files.__file__).parent / "scenarios" / "five_clusters.toml").read_text("utf-8")
     with tempfile.TemporaryDirectory() as folder:
         scenario = Path(folder) / "seconds.toml"
         text = shipped.replace("step_s = 15.0", "step_s = 1.0").replace(

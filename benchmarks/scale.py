@@ -11,7 +11,7 @@ from pathlib import Path
 
 from flights import NODES, fly
 
-from uav_dc_ros import resources
+from uav_dc_ros import files
 
 CLUSTERS = 5
 USERS = (100, 1_000, 10_000)
@@ -21,7 +21,7 @@ SECONDS_WANTED = 5.0  # of flight, so that every node tells of itself a few time
 def main() -> None:
     """Print steps per second, sizes of payloads, and the nodes' shares of a core."""
     wanted = [int(text) for text in sys.argv[1:]] or USERS
-    shipped = (Path(resources.__file__).parent / "scenarios" / "five_clusters.toml").read_text("utf-8")
+    shipped = (Path(files.__file__).parent / "scenarios" / "five_clusters.toml").read_text("utf-8")
     print(f"lockstep, {os.cpu_count()} cores; payloads in kB, nodes in percent of one core")
     print(f"{'users':>6} {'steps/s':>8} {'users kB':>9} {'rates kB':>9}  " + "  ".join(NODES))
     with tempfile.TemporaryDirectory() as folder:

@@ -144,9 +144,9 @@ def test_a_workspace_flies(options, workspace, tmp_path_factory, repository_file
     program = """
 import json, uav_dc_ros
 from ament_index_python.packages import get_package_share_directory
-from uav_dc_ros import resources, scenarios
+from uav_dc_ros import files, scenarios
 print(json.dumps([uav_dc_ros.__file__, get_package_share_directory("uav_dc_ros"),
-                  str(resources.folder("policies")), scenarios.names()]))
+                  str(files.shipped_folder("policies")), scenarios.names()]))
 """
     told = subprocess.run(
         [sys.executable, "-c", program], env=ros.environment, capture_output=True, text=True, check=True

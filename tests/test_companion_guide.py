@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.doc_commands import parameter, parsed
-from uav_dc_ros import resources, run_all, scenarios
+from uav_dc_ros import files, run_all, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.ros import liveliness
@@ -133,7 +133,7 @@ def test_every_scenario_and_policy_exists(words: list[str]) -> None:
             scenarios.load(ROOT / name.removeprefix(THERE))
     for option, word in itertools.pairwise(words):
         if option == "--policy" and word not in OWN:
-            assert (resources.folder("policies") / word / "config.json").is_file()
+            assert (files.shipped_folder("policies") / word / "config.json").is_file()
 
 
 def test_every_link_leads_somewhere() -> None:

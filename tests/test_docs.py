@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 
 from tests.conftest import ROOT
 from tests.doc_commands import blocks, commands, parameter, parsed
-from uav_dc_ros import bag, resources, scenarios
+from uav_dc_ros import bag, files, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import node_cli
@@ -201,7 +201,7 @@ def test_every_key_in_the_symbol_table_is_a_scenario_s() -> None:
 
 
 def test_every_shipped_policy_is_described() -> None:
-    shipped = {path.parent.name for path in resources.folder("policies").glob("*/config.json")}
+    shipped = {path.parent.name for path in files.shipped_folder("policies").glob("*/config.json")}
     rows = re.findall(r"^\| `(\w+)` \| `\w+` \| ", (DOCS / "training.md").read_text("utf-8"), re.MULTILINE)
     assert shipped == set(rows)
 

@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.conftest import outcome
-from uav_dc_ros import messages, resources, topics
+from uav_dc_ros import files, messages, topics
 from uav_dc_ros.core.grid import ACTION_LABELS, ActionLabel
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import PAYLOADS, FaultKind, Mission, Move, Phase, Rates, Ready, Users
@@ -94,20 +94,20 @@ def test_held_is_a_field_and_in_an_old_payload_a_prefix(told: dict[str, Any], he
 
 @pytest.mark.parametrize("topic", PAYLOADS)
 def test_the_published_schema_is_the_code_s(topic: str) -> None:
-    path = resources.folder("msgs_json") / f"{topic}.schema.json"
+    path = files.shipped_folder("msgs_json") / f"{topic}.schema.json"
     assert path.read_text("utf-8") == messages.schema_text(PAYLOADS[topic]), (
         "run `python -m uav_dc_ros.messages` and look at the difference: it changes the contract"
     )
 
 
 def test_no_schema_is_left_over() -> None:
-    names = {path.name for path in resources.folder("msgs_json").iterdir()}
+    names = {path.name for path in files.shipped_folder("msgs_json").iterdir()}
     assert names == {f"{topic}.schema.json" for topic in PAYLOADS}
 
 
 @pytest.mark.parametrize("topic", PAYLOADS)
 def test_an_independent_validator_agrees(topic: str) -> None:
-    schema = json.loads((resources.folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
+    schema = json.loads((files.shipped_folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)
     good = json.loads(messages.encode(EXAMPLES[topic]))
@@ -152,7 +152,7 @@ def test_what_is_not_a_payload_is_refused_by_reason(text: str | bytes, reason: s
 
 SCHEMAS = {
     topic: jsonschema.Draft202012Validator(
-        json.loads((resources.folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
+        json.loads((files.shipped_folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
     )
     for topic in PAYLOADS
 }

@@ -127,12 +127,12 @@ def test_scenarios_policies_and_schemas_come_from_the_installed_place(installed,
     program = """
 import json
 import uav_dc_ros
-from uav_dc_ros import resources, scenarios
+from uav_dc_ros import files, scenarios
 print(json.dumps({
     "package": uav_dc_ros.__file__,
     "scenarios": {name: scenarios.load(name).n_users for name in scenarios.names()},
-    "policies": str(resources.folder("policies")),
-    "schemas": str(resources.folder("msgs_json")),
+    "policies": str(files.shipped_folder("policies")),
+    "schemas": str(files.shipped_folder("msgs_json")),
 }))
 """
     answer = run_installed(program, installed, tmp_path)

@@ -1,50 +1,58 @@
-"""What the command lines share: mistakes become one line and exit status 2."""
+"""What all commands share: options, exit statuses, and standard output and error."""
 
 import argparse
+import atexit
 import contextlib
 import errno
 import io
 import os
+import queue
 import re
 import signal
 import sys
+import threading
 from collections.abc import Callable
-from typing import Any, NoReturn, TextIO
+from typing import IO, TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 from uav_dc_ros.errors import UavDcError
 
-# What a shell says of a command that Ctrl-C ended.
-INTERRUPTED = 130
-NEGATIVE = re.compile(r"-\.?\d")  # how a value begins that is no option: no option begins so
-# Of standard output and error: of a file that a command writes, each is a UavDcError by then.
+if TYPE_CHECKING:  # rich takes as long to import as the rest of a command line
+    from rich.console import Console
+
+FAILED = 2
+INTERRUPTED = 130  # as a shell reports a command that Ctrl-C ended
+BROKEN_PIPE = 141  # as a shell reports a command whose reader closed the pipe
+NEGATIVE = re.compile(r"-\.?\d")  # the start of a negative number: no option starts like this
+# Errors of standard output and error. An error of any other file is a UavDcError at this point.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE, errno.EBADF)
-BROKEN_PIPE = 141  # what a shell says of a command whose reader went away
 NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*_?")  # between the slashes of a ROS name
+QUEUE_MAX = 10_000  # pieces of text; further ones are dropped
+DRAIN_S = 2.0
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one line, and which guesses at no option."""
+    """An argument parser that reports an error in one line and accepts no abbreviated options."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
         self._negative_number_matcher = NEGATIVE  # argparse's own takes -35.3,149.1 for an option
 
     def error(self, message: str) -> NoReturn:
-        """Exits with status 2."""
-        sys.exit(complain(f"{self.prog}: {message}"))
+        """Exit with status 2."""
+        sys.exit(print_error(f"{self.prog}: {message}"))
 
 
-def whole_number(least: int) -> Callable[[str], int]:
-    """The type of an option that is a whole number of at least `least`."""
+def whole_number(minimum: int) -> Callable[[str], int]:
+    """The type of an option that is a whole number of at least `minimum`."""
 
     def whole(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
-            value = least - 1
-        if not least <= value < 2**62:  # so that sums of it still fit into 64 bits
+            value = minimum - 1
+        if not minimum <= value < 2**62:  # so that sums of it still fit into 64 bits
             raise argparse.ArgumentTypeError(
-                f"{text!r}; expected a whole number of at least {least}, and below 2^62"
+                f"{text!r}; expected a whole number of at least {minimum}, and below 2^62"
             )
         return value
 
@@ -66,29 +74,26 @@ def namespace(text: str) -> str:
 
 
 def on_stop(handler: Callable[..., object]) -> None:
-    """Call a handler for each signal that asks to end: Ctrl-C, SIGTERM, and the end of the terminal.
-
-    The last one only where it is not ignored, as under nohup.
-    """
+    """Handle SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, handler)
 
 
 def run(command: Callable[[], int], prog: str) -> NoReturn:
-    """Exits with what `command` returns; with 2 and one line for something the user can mend."""
+    """Exit with the status that `command` returns; a UavDcError is one line and status 2."""
     open_streams()
     try:
         _check_working_directory()
         try:
             status = command()
-        except SystemExit as left:  # --help, or a mistake in the options
-            status = left.code if isinstance(left.code, int) else 0
+        except SystemExit as exited:  # --help, or an invalid option
+            status = exited.code if isinstance(exited.code, int) else 0
         sys.stdout.flush()
     except UavDcError as error:
-        status = complain(f"{prog}: {error}")
+        status = print_error(f"{prog}: {error}")
     except KeyboardInterrupt:
-        complain(f"{prog}: stopped")
+        print_error(f"{prog}: stopped")
         status = INTERRUPTED
     except OSError as error:
         if error.errno not in OUTPUT_ERRORS:
@@ -96,30 +101,29 @@ def run(command: Callable[[], int], prog: str) -> NoReturn:
         if isinstance(error, BrokenPipeError):  # as of `| head`
             status = BROKEN_PIPE
         else:
-            status = complain(f"{prog}: the output cannot be written: {error.strerror}")
+            status = print_error(f"{prog}: the output cannot be written: {error.strerror}")
     for stream in (sys.stdout, sys.stderr):
         _release(stream)
     sys.exit(status)
 
 
-def complain(text: str) -> int:
-    """Prints a line to standard error, if it can be written; returns 2, a mistake's exit status."""
+def print_error(text: str) -> int:
+    """Print a line to standard error, if possible; returns the exit status of a failed command."""
     with contextlib.suppress(OSError):
         print(text, file=sys.stderr, flush=True)
-    return 2
+    return FAILED
 
 
 def open_streams() -> None:
-    """Makes standard input, output and error fit for a command, whatever it was started with.
+    """Open closed standard streams on /dev/null, and escape characters that the output's encoding lacks.
 
-    A closed one leads nowhere: the next file that is opened must not get its descriptor, and with it what
-    others print. A character that the output's encoding lacks is printed as its escape.
+    Otherwise the next file that is opened gets the descriptor of a closed stream, and receives its output.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free: this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number: this one
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
     for stream in (sys.stdout, sys.stderr):
@@ -128,13 +132,13 @@ def open_streams() -> None:
 
 
 def _release(stream: TextIO) -> None:
-    """Flushes a stream; one that cannot be written leads nowhere then, so that Python ends in silence."""
+    """Flush a stream; redirect it to /dev/null if that fails, so that Python exits without a traceback."""
     try:
         stream.flush()
     except OSError:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
 
 
 def _check_working_directory() -> None:
@@ -142,3 +146,62 @@ def _check_working_directory() -> None:
         os.getcwd()
     except FileNotFoundError:
         raise UavDcError("the working directory was deleted; expected one that exists") from None
+
+
+class Output:
+    """Writes the text of consoles in a thread: a full disk, closed pipe or stalled terminal never blocks.
+
+    Text that cannot be written is dropped.
+    """
+
+    def __init__(self) -> None:
+        self._queue: queue.Queue[tuple[int, bytes] | threading.Event] = queue.Queue(QUEUE_MAX)
+        threading.Thread(target=self._write, name="output", daemon=True).start()
+        atexit.register(self.drain)
+
+    def console(self, stream: TextIO) -> "Console":
+        """A rich console that prints to `stream`, which is sys.stdout or sys.stderr."""
+        from rich.console import Console
+
+        return Console(file=cast(IO[str], _OutputStream(self, stream)), highlight=False, soft_wrap=True)
+
+    def put(self, descriptor: int, data: bytes) -> None:
+        """Queue data for writing; never blocks."""
+        with contextlib.suppress(queue.Full):
+            self._queue.put_nowait((descriptor, data))
+
+    def drain(self) -> None:
+        """Wait until the queue is written, at most `DRAIN_S`."""
+        written = threading.Event()
+        with contextlib.suppress(queue.Full):
+            self._queue.put(written, timeout=DRAIN_S)
+            written.wait(DRAIN_S)
+
+    def _write(self) -> None:
+        while True:
+            piece = self._queue.get()
+            if isinstance(piece, threading.Event):
+                piece.set()
+                continue
+            descriptor, data = piece
+            with contextlib.suppress(OSError):
+                while data:
+                    data = data[os.write(descriptor, data) :]
+
+
+class _OutputStream(io.TextIOBase):
+    """The part of a text stream that rich's consoles need; `Output` writes its text to `target`."""
+
+    def __init__(self, output: Output, target: TextIO) -> None:
+        self._output, self._target = output, target
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]  # io's own is an attribute
+        return self._target.encoding
+
+    def isatty(self) -> bool:
+        return self._target.isatty()
+
+    def write(self, text: str) -> int:
+        self._output.put(self._target.fileno(), text.encode(self.encoding, "backslashreplace"))
+        return len(text)

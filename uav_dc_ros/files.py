@@ -18,8 +18,23 @@ from typing import BinaryIO
 from uav_dc_ros.errors import UavDcError
 
 LINKS_MAX = 40  # of a chain, as in Linux itself
+# Resolved: `colcon build --symlink-install` reaches the package, and nothing beside it, through a link.
+_PACKAGE = Path(__file__).resolve().parent
 # Some file systems cannot sync a folder, and some folders may be written, but not opened.
 _NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
+
+
+def shipped_folder(name: str) -> Path:
+    """The folder `policies`, `msgs_json` or one in `share`: inside the package, or beside it in a checkout.
+
+    Raises:
+        FileNotFoundError: an installation without it.
+    """
+    candidates = (_PACKAGE / name, _PACKAGE.parent / name)
+    for folder in candidates:
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"no folder {name}: expected it at {' or '.join(map(str, candidates))}")
 
 
 def write(path: Path, content: bytes) -> None:

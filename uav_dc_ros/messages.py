@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import force_setattr
 
-from uav_dc_ros import files, resources
+from uav_dc_ros import files
 from uav_dc_ros.core.grid import ActionLabel
 from uav_dc_ros.errors import MessageError
 
@@ -291,4 +291,4 @@ def _same_length(**columns: list[Any]) -> None:
 
 
 if __name__ == "__main__":
-    write_schemas(resources.folder("msgs_json"))
+    write_schemas(files.shipped_folder("msgs_json"))

@@ -246,6 +246,6 @@ def test_names_are_folders_with_a_config(tmp_path, monkeypatch, folder):
     shutil.copytree(folder, tmp_path / "policies" / "a")
     (tmp_path / "policies" / "a.checkpoints").mkdir()
     shutil.copytree(folder, tmp_path / "policies" / ".c.123.partial")  # left by a killed training
-    monkeypatch.setattr(policy.resources, "folder", lambda name: tmp_path / name)
+    monkeypatch.setattr(policy.files, "shipped_folder", lambda name: tmp_path / name)
     assert policy.names() == ["a", "b"]
     assert policy.load("b").folder == tmp_path / "policies" / "b"

@@ -13,6 +13,7 @@ import pytest
 from tests.support.worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
+from uav_dc_ros.core.stats import interval
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.experiments.evaluate import cli
 from uav_dc_ros.experiments.evaluate.cli import main
@@ -27,7 +28,6 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     steer,
 )
 from uav_dc_ros.experiments.evaluate.rollout import flight, roll_out
-from uav_dc_ros.stats import interval
 
 
 def command(*arguments):

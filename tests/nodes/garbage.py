@@ -20,7 +20,7 @@ import jsonschema
 from rclpy.serialization import serialize_message
 
 from tests.nodes import poses
-from uav_dc_ros import cdr, messages, resources
+from uav_dc_ros import cdr, files, messages
 from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
@@ -58,7 +58,7 @@ class Reader:
     """Decides, without the code under test, whether a text is a payload of a topic."""
 
     def __init__(self, topic: str) -> None:
-        schema = json.loads((resources.folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
+        schema = json.loads((files.shipped_folder("msgs_json") / f"{topic}.schema.json").read_text("utf-8"))
         self._validator = jsonschema.Draft202012Validator(schema)
         self._columns = COLUMNS.get(topic, ())
 

@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from tests.nodes.test_drawing import MISSION, SCENARIO
+from uav_dc_ros.cli import Output
 from uav_dc_ros.messages import FaultKind, Phase
-from uav_dc_ros.output import Output
 from uav_dc_ros.runner.console import MissionConsole
 
 FLIGHT = (

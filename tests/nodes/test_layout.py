@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from uav_dc_ros import messages, resources
+from uav_dc_ros import files, messages
 from uav_dc_ros.nodes.live_view import LAYOUT, LAYOUT_FOLDER
 from uav_dc_ros.topics import DIAGNOSTICS, MARKERS, PATH, POSE, TOPICS
 
-FOLDER = resources.folder(LAYOUT_FOLDER)
+FOLDER = files.shipped_folder(LAYOUT_FOLDER)
 WHOLE = json.loads((FOLDER / LAYOUT).read_text("utf-8"))
 PANELS: dict[str, dict[str, Any]] = WHOLE["configById"]
 SCRIPTS = {script["name"]: script["sourceCode"] for script in WHOLE["userNodes"].values()}

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Ros
-from uav_dc_ros import output
-from uav_dc_ros.output import Output
+from uav_dc_ros import cli
+from uav_dc_ros.cli import Output
 
 MISSION = ("--pace", "lockstep", "--no-record", "--nodes", "world,channel_monitor,policy", "--compose")
 MISSION = (*MISSION, "--scenario", "three_clusters", "--summary")
@@ -40,8 +40,8 @@ def test_what_cannot_be_written_is_lost() -> None:
 
 
 def test_a_reader_that_takes_nothing_delays_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output, "WAITING_MAX", 10)
-    monkeypatch.setattr(output, "DRAIN_S", 0.05)
+    monkeypatch.setattr(cli, "QUEUE_MAX", 10)
+    monkeypatch.setattr(cli, "DRAIN_S", 0.05)
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as stalled, os.fdopen(writer, "w") as stream:
         out = Output()

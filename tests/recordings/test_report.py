@@ -13,7 +13,7 @@ import pytest
 from tests.nodes.conftest import SMALL
 from tests.recordings import report_bags
 from tests.support.worlds import saved, tiny
-from uav_dc_ros import bag, resources, scenarios
+from uav_dc_ros import bag, files, scenarios
 from uav_dc_ros.core import world
 from uav_dc_ros.nodes.view import markers
 from uav_dc_ros.recordings.pages import page as pages
@@ -313,7 +313,7 @@ def test_the_verb_needs_plotly_only_to_write(tmp_path, monkeypatch, capsys):
 
 
 def test_users_have_the_colours_of_the_view_in_rviz():
-    style = (resources.folder("recordings") / "pages" / "style.css").read_text("utf-8")
+    style = (files.shipped_folder("recordings") / "pages" / "style.css").read_text("utf-8")
     found = dict(re.findall(r"--(\w+): #([0-9a-f]{6});", style.partition("@media")[0]))
 
     def rgb(name):

@@ -14,7 +14,7 @@ from tests.conftest import Ros, finish, wait_for
 from tests.recordings.made import about, changing, copy, flight, nudged, pose, said, write
 from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag as command
-from uav_dc_ros import cdr, messages, payloads, resources, scenarios
+from uav_dc_ros import cdr, files, messages, payloads, scenarios
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import world
 from uav_dc_ros.messages import Phase
@@ -279,8 +279,8 @@ def test_a_policy_of_ones_own(tmp_path, capsys, inside):
 
 
 def test_shipped_policies_are_found_by_hash_wherever_the_bag_was_flown(flown, capsys, monkeypatch, tmp_path):
-    shutil.copytree(resources.folder("policies") / POLICY, tmp_path / "renamed")
-    monkeypatch.setattr(resources, "folder", lambda name: tmp_path / "none")
+    shutil.copytree(files.shipped_folder("policies") / POLICY, tmp_path / "renamed")
+    monkeypatch.setattr(files, "shipped_folder", lambda name: tmp_path / "none")
     assert "not verified" in verify(capsys, flown)[1]
     assert verify(capsys, flown, "--policy-dir", tmp_path)[1].endswith("\nverified\n")
 

@@ -15,7 +15,7 @@ import safetensors.numpy
 from msgspec import Meta
 from safetensors import SafetensorError
 
-from uav_dc_ros import files, resources
+from uav_dc_ros import files
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.arrays import Array
@@ -179,7 +179,7 @@ class Policy:
 
 def names() -> list[str]:
     """Names of the shipped policies."""
-    root = resources.folder("policies")
+    root = files.shipped_folder("policies")
     # Hidden is what a killed `save` has left behind.
     return sorted(path.parent.name for path in root.glob(f"[!.]*/{CONFIG}"))
 
@@ -192,7 +192,7 @@ def load(name_or_path: str | Path) -> Policy:
             not fit together.
     """
     wanted = str(name_or_path)
-    folder = resources.folder("policies") / wanted if wanted in names() else Path(name_or_path)
+    folder = files.shipped_folder("policies") / wanted if wanted in names() else Path(name_or_path)
     if not folder.is_dir():
         raise PolicyError(
             f"policy {wanted!r}: no such name or folder; expected one of {', '.join(names()) or '(none)'}, "

@@ -8,7 +8,7 @@ stamps, and on `clock`.
 
 from typing import Any
 
-from uav_dc_ros import resources
+from uav_dc_ros import files
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.view.foxglove_server import FoxgloveServer
@@ -42,7 +42,7 @@ class LiveView(MissionNode):
         given = self.values["address"]
         host = ANYWHERE.get(given, given)
         where = f"[{host}]" if ":" in host else host
-        layout = str(resources.folder(LAYOUT_FOLDER) / LAYOUT)
+        layout = str(files.shipped_folder(LAYOUT_FOLDER) / LAYOUT)
         if self.get_namespace() != "/":
             layout += f" (put {self.get_namespace()} in front of its topics)"
         self.get_logger().info(

@@ -10,10 +10,10 @@ from rich.console import JustifyMethod
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from uav_dc_ros.cli import Output
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
-from uav_dc_ros.output import Output
 from uav_dc_ros.phases import DECIDED
 from uav_dc_ros.runner.monitor import MissionProgress
 

@@ -13,9 +13,9 @@ from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.stats import interval
 from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, roll_out
-from uav_dc_ros.stats import interval
 
 # The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
 TEST_SEEDS = range(100)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.stats import interval
 from uav_dc_ros.experiments.paper.evidence import (
     Evidence,
     Weighed,
@@ -14,7 +15,6 @@ from uav_dc_ros.experiments.paper.evidence import (
 )
 from uav_dc_ros.experiments.paper.setting import ALGORITHMS, FORMS, R_PLUS, Ratio, Setting
 from uav_dc_ros.experiments.paper.tables import by_setting, numbers
-from uav_dc_ros.stats import interval
 
 _THREE, _FIVE = Setting(scenario="three_clusters"), Setting(scenario="five_clusters")
 _REWARDS = ("reward_share", "common_share", "greedy_reward_share")

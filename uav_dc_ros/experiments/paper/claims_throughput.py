@@ -1,6 +1,7 @@
 """The paper's claims on the throughput: C10 to C17."""
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.stats import interval
 from uav_dc_ros.experiments.paper.evidence import (
     Evidence,
     Part,
@@ -15,7 +16,6 @@ from uav_dc_ros.experiments.paper.evidence import (
 )
 from uav_dc_ros.experiments.paper.setting import ALGORITHMS, FORMS, R_PLUS, Setting
 from uav_dc_ros.experiments.paper.tables import numbers
-from uav_dc_ros.stats import interval
 
 _THREE, _FIVE = Setting(scenario="three_clusters"), Setting(scenario="five_clusters")
 _SHOWN = ("throughput_bps", "greedy_throughput_bps")

@@ -7,10 +7,10 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Results
 from uav_dc_ros.experiments.paper.setting import Ratio, Setting
-from uav_dc_ros.stats import Interval, interval
 
 Verdict: TypeAlias = Literal["holds", "does not hold", "undecided", "not tested"]
 

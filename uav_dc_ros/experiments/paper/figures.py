@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from uav_dc_ros import files
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.stats import interval
 from uav_dc_ros.env.render import PATH_COLOURS, picture
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
@@ -19,7 +20,6 @@ from uav_dc_ros.experiments.paper.evidence import SMOOTHING, Evidence, name, smo
 from uav_dc_ros.experiments.paper.plan import FIGURES, FigurePlan, Panel
 from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import Scale, Setting
-from uav_dc_ros.stats import interval
 
 # Dots per inch: of a figure, and of the pictures of missions as they come.
 _DPI, _PICTURE_DPI = 150, 100

@@ -7,13 +7,13 @@ from typing import Any
 import msgspec
 
 from uav_dc_ros import files
+from uav_dc_ros.core.stats import Interval
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.experiments.paper.claims import Finding, check, count
 from uav_dc_ros.experiments.paper.evidence import RULES, Part, Table, Verdict
 from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import Metadata, Results
-from uav_dc_ros.stats import Interval
 
 CLAIMS_FILE, VERDICTS_FILE = "claims.md", "claims.json"
 _VERDICTS: dict[Verdict, str] = {

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from itertools import product
 
+from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured, Table, name
 from uav_dc_ros.experiments.paper.setting import Setting
-from uav_dc_ros.stats import Interval, interval
 
 # Measure: title, what to divide by, decimals.
 _UNITS = {

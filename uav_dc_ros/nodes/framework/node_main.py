@@ -146,7 +146,7 @@ def _flown(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> 
             status = _run(nodes, executor, stopper, reporter)
         stopper.close()
     except UavDcError as error:
-        cli.complain(f"error: {error}")
+        cli.print_error(f"error: {error}")
     for node in nodes:
         node.destroy_node()
     return status

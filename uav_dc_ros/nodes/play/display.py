@@ -8,7 +8,7 @@ from typing import Self
 
 from rich.progress import BarColumn, Progress, TextColumn
 
-from uav_dc_ros.output import Output
+from uav_dc_ros.cli import Output
 
 REFRESH_S = 0.1
 PLAIN_LINES = 6  # of progress in a pass through the bag, where there is no terminal

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from uav_dc_ros import __version__, stats
+from uav_dc_ros import __version__
 from uav_dc_ros.bags.read import BagReader
+from uav_dc_ros.core import stats
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError

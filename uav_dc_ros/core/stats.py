@@ -1,0 +1,63 @@
+"""Percentile-bootstrap intervals of means. The resampling is seeded: equal samples give equal intervals."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from uav_dc_ros.core.arrays import Array
+
+_RESAMPLES = 10_000
+_BAND_RESAMPLES = 2_000  # of whole curves: an interval's ends for each of many points
+_BLOCK = 1_000_000  # values resampled at a time: a large sample needs no memory for all of its resamples
+
+
+class Interval(NamedTuple):
+    """A mean with its 95% interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def interval(
+    values: Array, statistic: Callable[[Array], Array] = lambda means: means, level: float = 0.95
+) -> Interval:
+    """The mean of a sample, or a statistic of means, with its interval (somewhat too narrow for small n).
+
+    Args:
+        values: the sample, finite numbers for each independent unit, `[n, ...]` with n >= 1.
+        statistic: from means `[R, ...]` to numbers `[R]`.
+        level: probability that the interval is meant to cover.
+    """
+    values = np.asarray(values, np.float64)
+    low, high = np.quantile(statistic(_resampled_means(values)), [(1 - level) / 2, (1 + level) / 2])
+    return Interval(float(statistic(values.mean(axis=0)[None])[0]), float(low), float(high))
+
+
+def _resampled_means(values: Array) -> Array:
+    n = len(values)
+    if n * _RESAMPLES <= _BLOCK:
+        return values.take(_draws(n), axis=0).mean(axis=1)
+    rng, block = np.random.default_rng(0), max(1, _BLOCK // n)
+    sizes = [min(block, _RESAMPLES - done) for done in range(0, _RESAMPLES, block)]
+    return np.concatenate([values[rng.integers(0, n, (size, n))].mean(axis=1) for size in sizes])
+
+
+@lru_cache(maxsize=4)
+def _draws(n: int) -> Array:
+    """Indices of all resamples of a small sample: drawing them takes longer than everything else."""
+    return np.random.default_rng(0).integers(0, n, (_RESAMPLES, n))
+
+
+def band(curves: Array, level: float = 0.95) -> tuple[Array, Array, Array]:
+    """The mean of curves `[n, T]`, and both ends of its interval at each point, `[T]` each.
+
+    Whole curves are resampled, since the points of one are dependent.
+    """
+    curves = np.asarray(curves, np.float64)
+    n = len(curves)
+    drawn = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), _BAND_RESAMPLES)
+    low, high = np.quantile(drawn / n @ curves, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return curves.mean(axis=0), low, high
