@@ -1,1 +1,1 @@
-"""Agents: Q-network, policy folder, replay buffer and learner. Flying needs `network` and `policy` only: no torch."""
+"""Q-network, policy folder, replay buffer and learner; `network` and `policy` need no torch."""
