@@ -46,7 +46,7 @@ fastdds.use_profiles()
 rclpy.init()
 node = rclpy.create_node("publisher")
 publisher = node.create_publisher(String, "t", 1000 if size < 1000 else 50)
-data = cdr.of_text(random.Random(1).randbytes(size // 2).hex().encode())
+data = cdr.encode_string(random.Random(1).randbytes(size // 2).hex().encode())
 while not publisher.get_subscription_count():
     time.sleep(0.01)
 time.sleep(0.5)
@@ -90,7 +90,7 @@ else:
 
 def bare_hz(folder: Path, size: int) -> float:
     """Messages a second that the mcap writer takes, with its own defaults."""
-    data = cdr.of_text(random.Random(1).randbytes(size // 2).hex().encode())
+    data = cdr.encode_string(random.Random(1).randbytes(size // 2).hex().encode())
     n = int(min(BARE_BYTES / size, 200_000))
     with (folder / "bare.mcap").open("wb") as file:
         writer = Writer(file)

@@ -47,7 +47,7 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path: Path) -> None:
     link.symlink_to("far/target")
     chain.symlink_to(link)
     for content in (b"made through a dangling link", b"replaced"):
-        files.refuse_unwritable(chain)
+        files.check_writable(chain)
         files.write(chain, content)
         assert link.is_symlink()
         assert chain.is_symlink()
@@ -58,7 +58,7 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path: Path) -> None:
 def test_links_in_a_circle_are_an_error(tmp_path: Path) -> None:
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
-    for check in (files.refuse_unwritable, lambda path: files.write(path, b"")):
+    for check in (files.check_writable, lambda path: files.write(path, b"")):
         with pytest.raises(UavDcError, match="a cannot be written: Too many levels of symbolic links"):
             check(tmp_path / "a")
 
@@ -67,7 +67,7 @@ def test_a_device_stays_a_device(device: Path) -> None:
     link = device.with_name("link")
     link.symlink_to(device.name)
     for path in (device, link):
-        files.refuse_unwritable(path)
+        files.check_writable(path)
         files.write(path, b"gone")
         with files.replacing(path) as partial:
             partial.write_bytes(b"gone, too")
@@ -79,7 +79,7 @@ def test_a_device_stays_a_device(device: Path) -> None:
 def test_a_fifo_passes_the_content_on(tmp_path: Path) -> None:
     path = tmp_path / "fifo"
     os.mkfifo(path)
-    files.refuse_unwritable(path)
+    files.check_writable(path)
     with pytest.raises(UavDcError, match="fifo cannot be written: No such device or address"):
         files.write(path, b"nobody reads it")
     for large in (False, True):
@@ -107,7 +107,7 @@ def test_a_fifo_passes_the_content_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"])
 def test_standard_output_is_written_after_what_was_printed(tmp_path: Path, name: str) -> None:
     (tmp_path / "link").symlink_to("/dev/stdout")
-    program = f"{WRITES}path = Path({name!r}); files.refuse_unwritable(path); files.write(path, b'content')"
+    program = f"{WRITES}path = Path({name!r}); files.check_writable(path); files.write(path, b'content')"
     with (tmp_path / "out").open("wb") as out:
         subprocess.run([sys.executable, "-c", program], stdout=out, cwd=tmp_path, check=True)
     assert (tmp_path / "out").read_bytes() == b"printed before\ncontent"
@@ -125,7 +125,7 @@ def test_standard_output_may_be_a_socket(tmp_path: Path) -> None:
 
 
 def test_a_descriptor_that_is_closed_is_an_error() -> None:
-    for check in (files.refuse_unwritable, lambda path: files.write(path, b"")):
+    for check in (files.check_writable, lambda path: files.write(path, b"")):
         with pytest.raises(UavDcError, match="/dev/fd/987 cannot be written: Bad file descriptor"):
             check(Path("/dev/fd/987"))
 
@@ -134,7 +134,7 @@ def test_what_cannot_be_written_is_said_and_nothing_is_left(tmp_path: Path) -> N
     (tmp_path / "file").touch()
     before = sorted(tmp_path.iterdir())
     for name, reason in (("", "Is a directory"), ("no/x", "No such file"), ("file/x", "Not a directory")):
-        for check in (files.refuse_unwritable, lambda path: files.write(path, b"")):
+        for check in (files.check_writable, lambda path: files.write(path, b"")):
             with pytest.raises(UavDcError, match=rf"cannot be written: {reason}"):
                 check(tmp_path / name)
     with pytest.raises(UavDcError, match="/dev/full cannot be written: No space left on device"):
@@ -180,7 +180,7 @@ def test_content_is_on_the_disk_before_its_name_and_the_name_before_it_returns(
     monkeypatch.setattr(Path, "replace", replaced)
     (tmp_path / "made").mkdir()
     (tmp_path / "made" / "a").touch()
-    files.place(tmp_path / "made", tmp_path / "folder")
+    files.move(tmp_path / "made", tmp_path / "folder")
     assert happened == ["sync a", "sync made", "name folder", f"sync {tmp_path.name}"]
     happened.clear()
     files.write(tmp_path / "x", b"content")

@@ -1,7 +1,7 @@
-"""Output files: whole or not at all, durable, and never in place of a device or a link.
+"""Output files: written completely or not at all, durable, and never in place of a device or a link.
 
-A regular file is replaced in one move. Of a symbolic link, its target is replaced. A device, a FIFO and a
-descriptor of this process (`/dev/stdout`, `/dev/fd/3`) are written into; a FIFO must have its reader by then.
+A regular file is replaced by a rename. Of a symbolic link, the target is replaced. A device, a FIFO and a
+descriptor of this process (`/dev/stdout`, `/dev/fd/3`) are opened and written; a FIFO must have a reader.
 """
 
 import contextlib
@@ -17,18 +17,18 @@ from typing import BinaryIO
 
 from uav_dc_ros.errors import UavDcError
 
-LINKS_MAX = 40  # of a chain, as in Linux itself
-# Resolved: `colcon build --symlink-install` reaches the package, and nothing beside it, through a link.
+LINKS_MAX = 40  # of a chain, Linux's own limit
+# Resolved: `colcon build --symlink-install` links only the package, and nothing beside it.
 _PACKAGE = Path(__file__).resolve().parent
-# Some file systems cannot sync a folder, and some folders may be written, but not opened.
-_NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
+# Some file systems cannot sync a folder, and some folders can be written, but not opened.
+_FOLDER_SYNC_ERRORS = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
 
 def shipped_folder(name: str) -> Path:
     """The folder `policies`, `msgs_json` or one in `share`: inside the package, or beside it in a checkout.
 
     Raises:
-        FileNotFoundError: an installation without it.
+        FileNotFoundError: the installation lacks the folder.
     """
     candidates = (_PACKAGE / name, _PACKAGE.parent / name)
     for folder in candidates:
@@ -38,24 +38,24 @@ def shipped_folder(name: str) -> Path:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Writes a whole file.
+    """Write a whole file.
 
     Raises:
-        UavDcError: it cannot be written; a regular file that was there is as it was.
+        UavDcError: the file cannot be written; a regular file keeps its previous content.
     """
     try:
         if is_replaced(path):
             with replacing(path) as partial:
                 partial.write_bytes(content)
         else:
-            with _opened(path) as file:
+            with _open_special(path) as file:
                 file.write(content)
     except OSError as error:
         raise UavDcError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
 def is_replaced(path: Path) -> bool:
-    """Whether writing `path` replaces a regular file or makes a new one, and does not write into a device."""
+    """Whether `write` makes or replaces a regular file, instead of writing into a device."""
     if _descriptor(path) is not None:
         return False
     try:
@@ -64,11 +64,11 @@ def is_replaced(path: Path) -> bool:
         return True
 
 
-def refuse_unwritable(path: Path) -> None:
-    """Refuse what `write` cannot write: better before the work than after it.
+def check_writable(path: Path) -> None:
+    """Reject, before any work is done, what `write` cannot write.
 
     Raises:
-        UavDcError: why it cannot be written.
+        UavDcError: the file cannot be written.
     """
     try:
         descriptor = _descriptor(path)
@@ -87,24 +87,21 @@ def refuse_unwritable(path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """A file to write, which becomes `path` when the block ends without an error, and is gone otherwise.
+    """A temporary file that replaces `path` if the block succeeds, and is removed otherwise.
 
     Args:
-        path: the file to write. One that is there keeps its permissions.
-        durable: wait for the disk, so that a power cut leaves the old content or the new one.
-
-    Yields:
-        The file's path until then.
+        path: the file to write. An existing one keeps its permissions, and its content after an error.
+        durable: sync to disk, so that a power cut leaves the old content or the new one.
 
     Raises:
-        OSError: it cannot be written; a regular file that was there is as it was.
+        OSError: the file cannot be written.
     """
     if not is_replaced(path):
         with tempfile.TemporaryDirectory() as folder:
             partial = Path(folder, path.name)
             yield partial
-            with partial.open("rb") as made, _opened(path) as file:
-                shutil.copyfileobj(made, file)
+            with partial.open("rb") as source, _open_special(path) as file:
+                shutil.copyfileobj(source, file)
         return
     target = Path(os.path.realpath(path))
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
@@ -112,7 +109,7 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
         yield partial
         with contextlib.suppress(FileNotFoundError):
             partial.chmod(stat.S_IMODE(target.stat().st_mode))
-        place(partial, target, durable=durable)
+        move(partial, target, durable=durable)
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -120,35 +117,35 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def building(folder: Path) -> Iterator[Path]:
-    """A folder to fill, which becomes `folder` when the block ends without an error, and is gone otherwise.
+    """A temporary folder that becomes `folder` if the block succeeds, and is removed otherwise.
 
     Raises:
-        OSError: it cannot be made or renamed, or the disk failed.
+        OSError: the folder cannot be made or renamed, or the disk failed.
     """
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
         yield partial
-        place(partial, folder)
+        move(partial, folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def place(made: Path, path: Path, *, durable: bool = True) -> None:
-    """Gives a file, or a folder with all that is in it, the name `path` in the same file system.
+def move(source: Path, path: Path, *, durable: bool = True) -> None:
+    """Rename a file, or a folder, to `path` in the same file system; a file of that name is replaced.
 
     Args:
-        made: what was made, under its first name.
-        path: its new name; a file of that name is replaced.
-        durable: have the content on the disk before the name, and the name before this returns.
+        source: the current path.
+        path: the new path.
+        durable: sync the content to disk before the rename, and the rename before returning.
 
     Raises:
-        OSError: it cannot be renamed, or the disk failed.
+        OSError: the rename or the disk failed.
     """
     if durable:
-        for one in (*made.rglob("*"), made) if made.is_dir() else (made,):
-            _sync(one)
-    made.replace(path)
+        for entry in (*source.rglob("*"), source) if source.is_dir() else (source,):
+            _sync(entry)
+    source.replace(path)
     if durable:
         _sync(path.absolute().parent)
 
@@ -162,26 +159,26 @@ def _sync(path: Path) -> None:
         finally:
             os.close(descriptor)
     except OSError as error:
-        if not (is_folder and error.errno in _NOT_SYNCED):
+        if not (is_folder and error.errno in _FOLDER_SYNC_ERRORS):
             raise
 
 
-def _opened(path: Path) -> BinaryIO:
-    """What is no regular file, to write into."""
+def _open_special(path: Path) -> BinaryIO:
+    """A device, a FIFO or a descriptor, open for writing."""
     descriptor = _descriptor(path)
     if descriptor is None:
-        # With O_NONBLOCK a FIFO that nobody reads is an error (ENXIO), and not waited for without end.
+        # With O_NONBLOCK a FIFO without a reader is an error (ENXIO) instead of an endless wait.
         opened = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
         os.set_blocking(opened, True)
         return os.fdopen(opened, "wb")
-    sys.stdout.flush()  # what was printed before comes before
+    sys.stdout.flush()  # keeps the order of earlier prints
     return os.fdopen(os.dup(descriptor), "wb")
 
 
 def _descriptor(path: Path) -> int | None:
     """The descriptor of this process that a path such as /dev/stdout names.
 
-    Opening such a path would start a regular file anew, and fails for a socket (systemd's journal).
+    Opening such a path would truncate a regular file, and fails for a socket (systemd's journal).
     """
     own = f"/proc/{os.getpid()}/fd"
     for _ in range(LINKS_MAX):

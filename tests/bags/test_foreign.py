@@ -162,7 +162,7 @@ def test_payloads_that_cannot_be_decoded_are_told_when_they_are_recovered(tmp_pa
         b"\0\3\0\0": "encapsulation: parameter list (0x0003)",
         b"\x7b\x7d\0\0": "encapsulation: 0x7b7d",
         b"\0\1": "malformed: 2 bytes; expected a message with its encapsulation",
-        text("hello")[:-2]: "malformed: 4 bytes of text; expected 6, as it says",
+        text("hello")[:-2]: "malformed: 4 bytes of text; expected 6, its length field",
     }.items():
         path = rows(tmp_path / f"{expected[:25]}.mcap", *(("/a", data, i, STRING) for i in range(3)))
         lines = told(recover(path, tmp_path / f"out {path.stem}"))

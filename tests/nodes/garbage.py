@@ -150,7 +150,7 @@ class Maker:
             make = self.rng.choice(self._kinds)
             data, reason = make()
             if reason is None:  # damaged at random: a payload may have come out
-                text = cdr.text_in(data)
+                text = cdr.decode_string(data)
                 if self._reader.accepts(text):
                     continue
                 reason = self.told(text)
@@ -171,7 +171,7 @@ class Maker:
         return json.dumps(self.honest()).encode()
 
     def changed(self, **values: Any) -> bytes:
-        return cdr.of_text(json.dumps(self.honest() | values).encode())
+        return cdr.encode_string(json.dumps(self.honest() | values).encode())
 
     def field(self) -> str:
         return self.rng.choice(list(self.honest()))
@@ -180,13 +180,13 @@ class Maker:
 
     def truncated(self) -> tuple[bytes, str | None]:
         text = self.text()
-        return cdr.of_text(text[: self.rng.randrange(len(text))]), "malformed"
+        return cdr.encode_string(text[: self.rng.randrange(len(text))]), "malformed"
 
     def flipped(self) -> tuple[bytes, str | None]:
         text = bytearray(self.text())
         for _ in range(self.rng.choice((1, 1, 2, 8))):
             text[self.rng.randrange(len(text))] ^= 1 << self.rng.randrange(8)
-        return cdr.of_text(bytes(text)), None
+        return cdr.encode_string(bytes(text)), None
 
     def spliced(self) -> tuple[bytes, str | None]:
         one, other = self.text(), self.text()
@@ -194,29 +194,29 @@ class Maker:
         junk = self.rng.choice(
             (b"\0", b"\0" * 50, b"\n\x1b[2J", b"}", b"\\", b'"', b"/**/", b"\xef\xbb\xbf", b"")
         )
-        return cdr.of_text(one[:at] + junk + other[self.rng.randrange(len(other)) :]), None
+        return cdr.encode_string(one[:at] + junk + other[self.rng.randrange(len(other)) :]), None
 
     def not_utf8(self) -> tuple[bytes, str | None]:
         text = self.text()
         quotes = [i for i, byte in enumerate(text) if byte == ord('"')]
         at = self.rng.choice(quotes) + self.rng.choice((0, 1))
-        return cdr.of_text(text[:at] + self.rng.choice(NOT_UTF8) + text[at:]), None
+        return cdr.encode_string(text[:at] + self.rng.choice(NOT_UTF8) + text[at:]), None
 
     def not_a_number(self) -> tuple[bytes, str | None]:
         name = self.field()
         text = json.dumps(self.honest() | {name: "@"}).replace('"@"', self.rng.choice(NOT_JSON))
-        return cdr.of_text(text.encode()), None
+        return cdr.encode_string(text.encode()), None
 
     def surplus(self) -> tuple[bytes, str | None]:
         junk = self.rng.choice((b",", b"}", b"0", b"\0", b"{}", b'"', b"//", b" \x00"))
-        return cdr.of_text(self.text() + junk), "malformed"
+        return cdr.encode_string(self.text() + junk), "malformed"
 
     def other_bytes(self) -> tuple[bytes, str | None]:
         code = self.rng.choice(("utf-16", "utf-16-le", "utf-32", "utf-8-sig", "cp037"))
-        return cdr.of_text(self.text().decode().encode(code)), None
+        return cdr.encode_string(self.text().decode().encode(code)), None
 
     def noise(self) -> tuple[bytes, str | None]:
-        return cdr.of_text(self.rng.randbytes(self.rng.choice((0, 1, 3, 30, 300)))), None
+        return cdr.encode_string(self.rng.randbytes(self.rng.choice((0, 1, 3, 30, 300)))), None
 
     # JSON, but not the schema's.
 
@@ -225,7 +225,7 @@ class Maker:
         needed = [name for name in payload if name != "run"]  # which is missing in older bags
         for name in self.rng.sample(needed, self.rng.randint(1, len(needed))):
             del payload[name]
-        return cdr.of_text(json.dumps(payload).encode()), "invalid"
+        return cdr.encode_string(json.dumps(payload).encode()), "invalid"
 
     def unknown(self) -> tuple[bytes, str | None]:
         name = self.rng.choice(
@@ -243,14 +243,14 @@ class Maker:
         text = json.dumps(self.honest() | {self.field(): "@"}).replace(
             '"@"', self.rng.choice((number, f"[{number}]"))
         )
-        return cdr.of_text(text.encode()), None
+        return cdr.encode_string(text.encode()), None
 
     def nested(self) -> tuple[bytes, str | None]:
         depth = self.rng.choice((2, 100, 1000))
         start, end = self.rng.choice((("[", "]"), ('{"a":', "}"), ('{"mission":', "}")))
         deep = start * depth + "1" + end * self.rng.choice((depth, 0))
         text = json.dumps(self.honest() | {self.field(): "@"}).replace('"@"', deep)
-        return cdr.of_text(self.rng.choice((text, deep)).encode()), None
+        return cdr.encode_string(self.rng.choice((text, deep)).encode()), None
 
     def huge(self) -> tuple[bytes, str | None]:
         return self.changed(**{self.field(): self.rng.choice("x\u00e9\U0001f681") * 1500}), "invalid"
@@ -259,19 +259,19 @@ class Maker:
         """A field twice, the second time of another type."""
         name = self.field()
         text = json.dumps(self.honest())[:-1] + f', "{name}": {json.dumps(self.rng.choice(WRONG))}}}'
-        return cdr.of_text(text.encode()), None
+        return cdr.encode_string(text.encode()), None
 
     def other_top(self) -> tuple[bytes, str | None]:
         text = self.rng.choice(
             ("null", "true", "7", "-0.5", '"move"', "[]", "[{}]", json.dumps([self.honest()]))
         )
-        return cdr.of_text(text.encode()), "invalid"
+        return cdr.encode_string(text.encode()), "invalid"
 
     def uneven(self) -> tuple[bytes, str | None]:
         payload = self.honest()
         column = payload[self.rng.choice(COLUMNS[self.topic])]
         column += column[:1]
-        return cdr.of_text(json.dumps(payload).encode()), "invalid"
+        return cdr.encode_string(json.dumps(payload).encode()), "invalid"
 
     def unknown_action(self) -> tuple[bytes, str | None]:
         return self.changed(action=self.rng.choice(("up", "LEFT", "left ", "", "land", "hover\0"))), "invalid"
@@ -310,7 +310,7 @@ class Maker:
     def liar(self) -> tuple[bytes, str | None]:
         """A serialised text that is shorter or longer than it says."""
         text = self.text()
-        honest = cdr.of_text(text)
+        honest = cdr.encode_string(text)
         more = self.rng.choice((len(text) + 100, 2**31 - 1, 2**32 - 1, 2**24))
         return (
             self.rng.choice(
@@ -341,7 +341,7 @@ def garbage(topic: str, scenario: Scenario, seed: int) -> Iterator[Garbage]:
 
 def oversized(size: int = messages.MAX_BYTES + 1) -> Garbage:
     """A text longer than any payload may be."""
-    return Garbage("oversized", "oversized", cdr.of_text(b" " * size))
+    return Garbage("oversized", "oversized", cdr.encode_string(b" " * size))
 
 
 def _pose(rng: random.Random) -> Garbage:

@@ -29,7 +29,7 @@ SCENARIO = tiny()
 @example(b"\0\1\0\0\xff\xff\xff\xff")
 @example(b"\0\0\0\0\0\0\0\2a\0")
 def test_any_bytes_are_a_text_or_malformed(data: bytes) -> None:
-    came = outcome(lambda: cdr.text_in(data))
+    came = outcome(lambda: cdr.decode_string(data))
     if isinstance(came, MessageError):
         assert came.reason in ("malformed", "encapsulation")
     else:
@@ -38,8 +38,8 @@ def test_any_bytes_are_a_text_or_malformed(data: bytes) -> None:
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0")))
 def test_a_text_is_serialised_as_ros_does(text: str) -> None:
-    ours, theirs = cdr.of_text(text.encode()), serialize_message(String(data=text))
-    assert cdr.text_in(theirs) == text.encode()
+    ours, theirs = cdr.encode_string(text.encode()), serialize_message(String(data=text))
+    assert cdr.decode_string(theirs) == text.encode()
     assert deserialize_message(ours, String).data == text
 
 
@@ -82,18 +82,18 @@ def test_other_users_are_refused(convert_it: Callable[..., object], cluster: lis
 
 @given(st.binary(max_size=100), st.integers(0, 100))
 def test_any_bytes_are_a_pose_or_refused(junk: bytes, at: int) -> None:
-    honest = cdr.pose(np.asarray([1.0, 2.0, 3.0]), LATEST_NS)
+    honest = cdr.encode_pose(np.asarray([1.0, 2.0, 3.0]), LATEST_NS)
     for data in (junk, honest[:at], honest[:at] + junk, honest[:at] + junk + honest[at + len(junk) :]):
         came = outcome(lambda data=data: cdr.Pose(data))
         if isinstance(came, MessageError):
             assert came.reason in ("malformed", "encapsulation", "frame", "not_finite")
         else:
             assert all(map(math.isfinite, came.position_m))
-            assert len(came.record) == len(honest) - cdr.HEAD
+            assert len(came.body) == len(honest) - cdr.HEADER_BYTES
 
 
 @given(st.integers(0, LATEST_NS), st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3))
 def test_a_pose_is_serialised_as_ros_does(time_ns: int, position_m: tuple[float, float, float]) -> None:
     theirs = serialize_message(poses.pose(np.asarray(position_m), time_ns))
-    assert cdr.pose(np.asarray(position_m), time_ns) == theirs
+    assert cdr.encode_pose(np.asarray(position_m), time_ns) == theirs
     assert (cdr.Pose(theirs).stamp_ns, cdr.Pose(theirs).position_m) == (time_ns, position_m)

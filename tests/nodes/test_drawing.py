@@ -185,10 +185,10 @@ def test_a_path_holds_its_poses() -> None:
     given = [pose_message(np.array([1.5 * i, -2.0 * i, 100.0]), i * STEP_NS + i) for i in range(4)]
     for n in range(1, 5):
         poses = [cdr.Pose(serialize_message(pose)) for pose in given[:n]]
-        message = deserialize_message(cdr.path(poses), PathMessage)
+        message = deserialize_message(cdr.encode_path(poses), PathMessage)
         assert message.poses == given[:n]
         assert message.header == given[n - 1].header
-        assert rewritten(cdr.path(poses), "nav_msgs/msg/Path") == cdr.path(poses)
+        assert rewritten(cdr.encode_path(poses), "nav_msgs/msg/Path") == cdr.encode_path(poses)
 
 
 def test_a_pose_is_read_in_either_byte_order() -> None:
@@ -309,7 +309,7 @@ def real_poses(seconds: float, mps: float, *, from_s: float = 0.0) -> Any:
     """Twenty poses a second, straight to the east."""
     for i in range(round(seconds * 20)):
         at_s = from_s + i / 20
-        yield cdr.Pose(cdr.pose(np.array([i / 20 * mps, 0.0, 100.0]), round(at_s * 1e9)))
+        yield cdr.Pose(cdr.encode_pose(np.array([i / 20 * mps, 0.0, 100.0]), round(at_s * 1e9)))
 
 
 def test_the_way_of_a_real_vehicle_is_thinned() -> None:
@@ -322,7 +322,9 @@ def test_the_way_of_a_real_vehicle_is_thinned() -> None:
     assert np.diff(east_m) == pytest.approx(5.0, abs=0.51)
     assert (track.version, track.newest) == (len(east_m), poses[-1])
     version = track.version
-    standing = [cdr.Pose(cdr.pose(np.array([600.0, 0.0, 100.0]), round(t * 1e9))) for t in (60.0, 60.5, 61.0)]
+    standing = [
+        cdr.Pose(cdr.encode_pose(np.array([600.0, 0.0, 100.0]), round(t * 1e9))) for t in (60.0, 60.5, 61.0)
+    ]
     for i, pose in enumerate(standing):
         track.pose(pose, 10_000 + i)
     assert (track.version, track.newest) == (version + 1, standing[-1]), "the path need not be drawn again"
@@ -334,7 +336,7 @@ def test_a_way_of_any_length_stays_small() -> None:
     most = 0
     for i in range(36_000 * 2):
         place_m = np.array([i * 5.0, 0.0, 100.0])
-        track.pose(cdr.Pose(cdr.pose(place_m, i * 5 * 10**8)), i)
+        track.pose(cdr.Pose(cdr.encode_pose(place_m, i * 5 * 10**8)), i)
         most = max(most, len(track._poses))
     assert 500 < len(track.poses) <= most <= POSES_MAX
     assert track.poses[0].stamp_ns == 0

@@ -47,7 +47,7 @@ def test_a_client_is_told_every_topic_with_its_type(server: FoxgloveServer) -> N
 def test_bytes_and_time_arrive_as_they_were(server: FoxgloveServer) -> None:
     with client(server) as viewer:
         viewer.open("/mission")
-        server.send("/mission", cdr.of_text(b"now"), 1_700_000_000_123_456_789)
+        server.send("/mission", cdr.encode_string(b"now"), 1_700_000_000_123_456_789)
         (message,) = viewer.read_until(lambda heard: len(heard) == 1, 60.0)
     assert message.content.data == "now"
     assert message.time_ns == 1_700_000_000_123_456_789
@@ -56,7 +56,7 @@ def test_bytes_and_time_arrive_as_they_were(server: FoxgloveServer) -> None:
 def test_who_comes_late_gets_the_last_message_of_latched_topics_only(server: FoxgloveServer) -> None:
     for text in (b"old", b"newest"):
         for topic in ("/users", "/mission", "/move"):
-            server.send(topic, cdr.of_text(text), 7)
+            server.send(topic, cdr.encode_string(text), 7)
     with client(server) as first:
         first.open("/users", "/mission", "/move", "/rates")
         heard = [(m.topic, m.content.data, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 60.0)]
@@ -76,9 +76,9 @@ def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> 
         n = 0
         while not stop.is_set():
             n += 1
-            server.send("/mission", cdr.of_text(b"%d" % n), n)
+            server.send("/mission", cdr.encode_string(b"%d" % n), n)
             time.sleep(0.0005)
-        server.send("/mission", cdr.of_text(b"last"), n + 1)
+        server.send("/mission", cdr.encode_string(b"last"), n + 1)
 
     sender = threading.Thread(target=send, daemon=True)
     sender.start()

@@ -75,7 +75,7 @@ def said_by_nodes(bag: Path) -> dict[str, list[Any]]:
             if topic not in said:
                 continue
             try:
-                text = cdr.text_in(data)
+                text = cdr.decode_string(data)
                 payload = messages.decode(text, messages.PAYLOADS[topic])
             except MessageError:
                 continue

@@ -35,7 +35,7 @@ def pose(position_m: Sequence[float], stamp_ns: int, frame: str = "map") -> byte
 
 def said(topic: str, payload: messages.Payload | bytes, time_ns: int) -> BagMessage:
     """A message that was received when it was published; bytes are a pose."""
-    data = payload if isinstance(payload, bytes) else cdr.of_text(messages.encode(payload))
+    data = payload if isinstance(payload, bytes) else cdr.encode_string(messages.encode(payload))
     return BagMessage(f"/{topic}", topics.TOPICS[topic].type, data, time_ns, time_ns)
 
 
@@ -155,7 +155,7 @@ def changing(
     def apply(message: BagMessage) -> BagMessage | None:
         if message.topic != f"/{topic}":
             return message
-        payload = messages.decode(cdr.text_in(message.data), messages.PAYLOADS[topic])
+        payload = messages.decode(cdr.decode_string(message.data), messages.PAYLOADS[topic])
         if (payload.mission, payload.step) != (mission, step):
             return message
         made = change(payload)

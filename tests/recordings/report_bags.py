@@ -123,7 +123,7 @@ def step_messages(
         said["move"] = messages.Move(mission=mission, step=step, action=ACTION_LABELS[action])
     yield "pose", pose(stamp_ns, scenario.grid.centre_m(state.cell, like=state.users_m))
     for topic, payload in said.items():
-        yield topic, cdr.of_text(messages.encode(payload))
+        yield topic, cdr.encode_string(messages.encode(payload))
 
 
 def unpacked(page: Path) -> dict[str, Any]:

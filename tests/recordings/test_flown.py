@@ -74,7 +74,7 @@ def not_reached(tmp_path_factory):
     changed = []
     for message in told:
         if message.topic == "/mission":
-            payload = messages.decode(cdr.text_in(message.data), messages.Mission)
+            payload = messages.decode(cdr.decode_string(message.data), messages.Mission)
             late = payload.step == 2 and payload.phase is not Phase.READY
             n = (payload.step > 1) + (payload.step > 2 or late)
             payload = msgspec.structs.replace(payload, steps_not_reached=n)
@@ -104,7 +104,7 @@ def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
     """One that was told before it, for the same end, is not."""
     told = flights.Flight(TINY, seed=5).fly()
     last = max(i for i, message in enumerate(told) if message.topic == "/mission")
-    payload = messages.decode(cdr.text_in(told[last].data), messages.Mission)
+    payload = messages.decode(cdr.decode_string(told[last].data), messages.Mission)
     for i, reason in enumerate(("step 4: there", "the motors were stopped: by hand")):
         ended = msgspec.structs.replace(payload, phase=Phase.ABORTED, reason=reason)
         told.insert(last + i, said("mission", ended, told[last + i - 1].publish_time_ns + 1000))
@@ -187,7 +187,7 @@ def test_what_a_middleware_repeats_is_counted_and_told_once():
 def test_a_vehicle_that_waits_for_hours_fills_no_memory():
     told = flights.Flight(TINY, beat=flights.FAULTS["ground"][0]).fly()
     i, word = next((i, m) for i, m in enumerate(told) if m.topic == "/mission")
-    status = messages.decode(cdr.text_in(word.data), messages.Mission)
+    status = messages.decode(cdr.decode_string(word.data), messages.Mission)
     again = [
         said("mission", msgspec.structs.replace(status, reason=f"waits {n}"), word.log_time_ns + n)
         for n in range(1, TOLD_KEPT + 50)
@@ -299,7 +299,7 @@ def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
     moving = next(
         i
         for i in where
-        if (p := messages.decode(cdr.text_in(told[i].data), messages.Mission)).step == 3
+        if (p := messages.decode(cdr.decode_string(told[i].data), messages.Mission)).step == 3
         and p.phase is Phase.MOVING
     )
     ready = max(i for i in where if i < moving)
@@ -395,10 +395,10 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
 
 def as_version_0_1(message):
     """A word of the vehicle as it was once said: a fault had no field, and stood in the reason."""
-    payload = json.loads(cdr.text_in(message.data))
+    payload = json.loads(cdr.decode_string(message.data))
     held, _ = payload.pop("held"), payload.pop("fault")
     payload["reason"] = f"holds: {payload['reason']}" if held else payload["reason"]
-    return message._replace(data=cdr.of_text(json.dumps(payload).encode()))
+    return message._replace(data=cdr.encode_string(json.dumps(payload).encode()))
 
 
 def test_a_bag_of_version_0_1_is_read_as_before(bags, capsys, tmp_path):

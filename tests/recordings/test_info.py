@@ -53,7 +53,7 @@ def write_step(
             t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
         ),
     )
-    serialised = {name: cdr.of_text(messages.encode(payload)) for name, payload in said.items()}
+    serialised = {name: cdr.encode_string(messages.encode(payload)) for name, payload in said.items()}
     serialised["pose"] = bytes(TYPES.serialize_cdr(pose, topics.POSE))
     for i, (name, data) in enumerate(serialised.items()):
         if name not in without:

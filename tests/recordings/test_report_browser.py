@@ -263,7 +263,7 @@ def test_the_flight_of_a_real_vehicle(browser, tmp_path):
     """Its reason is told, its phases are listed, and its way is drawn as far as the slider stands."""
     scenario = tiny()
     flight = flights.Flight(scenario, beat=flights.FAULTS["battery"][0])
-    said = [cdr.text_in(m.data) for m in flight.fly() if m.topic == "/mission"]
+    said = [cdr.decode_string(m.data) for m in flight.fly() if m.topic == "/mission"]
     words = [messages.decode(text, messages.Mission) for text in said]
     told = [said_with(m, words[-1], HOSTILE) for m in flight.told]
     bag = flights.write(tmp_path / "bag", told, flights.flown_about(scenario))
@@ -293,10 +293,10 @@ def test_the_flight_of_a_real_vehicle(browser, tmp_path):
 
 def said_with(message: Any, last: messages.Mission, reason: str) -> Any:
     """The message, with another reason if it is the last word."""
-    if message.data != cdr.of_text(messages.encode(last)):
+    if message.data != cdr.encode_string(messages.encode(last)):
         return message
     other = msgspec.structs.replace(last, reason=reason)
-    return message._replace(data=cdr.of_text(messages.encode(other)))
+    return message._replace(data=cdr.encode_string(messages.encode(other)))
 
 
 def test_a_comparison_is_drawn_and_fits_a_phone_too(browser_3d, comparison_page):

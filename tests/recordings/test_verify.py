@@ -49,7 +49,7 @@ def payload(bag, topic, mission, step):
     """The first payload of a step on a topic."""
     with BagReader(bag) as reader:
         for message in reader.messages([f"/{topic}"]):
-            found = messages.decode(cdr.text_in(message.data), messages.PAYLOADS[topic])
+            found = messages.decode(cdr.decode_string(message.data), messages.PAYLOADS[topic])
             if (found.mission, found.step) == (mission, step):
                 return found
     raise AssertionError(f"no {topic} of mission {mission}, step {step}")
@@ -353,7 +353,7 @@ def without_step(told, scenario, number):
     uav_m = users_m = None
     for message in told:
         kind = messages.PAYLOADS.get(message.topic[1:])
-        one = messages.decode(cdr.text_in(message.data), kind) if kind else None
+        one = messages.decode(cdr.decode_string(message.data), kind) if kind else None
         if one is None:
             uav_m = np.frombuffer(message.data, "<f8", 3, offset=20)
         elif isinstance(one, messages.Users):

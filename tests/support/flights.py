@@ -330,7 +330,7 @@ def flown_about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, s
 def phases(told: list[BagMessage]) -> list[tuple[int, Phase, str]]:
     """Step, phase and reason of each word of the vehicle."""
     found = [
-        msgspec.json.decode(cdr.text_in(message.data), type=messages.Mission)
+        msgspec.json.decode(cdr.decode_string(message.data), type=messages.Mission)
         for message in told
         if message.topic == "/mission"
     ]

@@ -233,13 +233,13 @@ class AutopilotBridge(MissionNode):
         now_ns: int = self.get_clock().now().nanoseconds
         stamp_ns = max(now_ns - age_ns, self._last_stamp_ns + 1)
         self._last_stamp_ns = stamp_ns
-        self.publish("pose", cdr.pose(np.asarray(known.position), stamp_ns))
+        self.publish("pose", cdr.encode_pose(np.asarray(known.position), stamp_ns))
 
     def _publish_target(self) -> None:
         setpoint = self.bridge.setpoint
         if setpoint is not None and setpoint != self._setpoint:
             now_ns: int = self.get_clock().now().nanoseconds
-            self.publish("target", cdr.pose(np.asarray(setpoint), now_ns))
+            self.publish("target", cdr.encode_pose(np.asarray(setpoint), now_ns))
         self._setpoint = setpoint
 
     # Where the grid lies.

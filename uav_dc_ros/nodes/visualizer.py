@@ -81,7 +81,7 @@ class Visualizer(MissionNode):
 
     def _take_users(self, name: str, data: bytes, published_ns: int) -> None:
         try:
-            heading = msgspec.json.decode(cdr.text_in(data), type=_Heading)
+            heading = msgspec.json.decode(cdr.decode_string(data), type=_Heading)
         except (msgspec.DecodeError, RecursionError) as error:
             raise MessageError("malformed", str(error)) from None
         began_ns = self._track.users(
@@ -99,7 +99,7 @@ class Visualizer(MissionNode):
         if topic not in self._newest:
             return None
         try:
-            payload = messages.decode(cdr.text_in(self._newest[topic][1]), kind)
+            payload = messages.decode(cdr.decode_string(self._newest[topic][1]), kind)
             payloads.check(payload, self.scenario)
         except MessageError as error:
             self.reject(topic, error)
@@ -115,7 +115,7 @@ class Visualizer(MissionNode):
         if self._track.version != self._drawn:
             self._drawn, poses = self._track.version, self._track.poses
         if poses:  # it is latched: who comes later has it, too
-            self.publish("path", cdr.path(poses))
+            self.publish("path", cdr.encode_path(poses))
         self.publish("markers", markers.markers(self.scenario, self._scene(self._track.newest)))
 
     def _scene(self, pose: cdr.Pose | None) -> markers.Scene:

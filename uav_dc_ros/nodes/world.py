@@ -274,7 +274,7 @@ class World(MissionNode):
     def _tell(self) -> None:
         """Publish the state of this step. What the move waits for comes first."""
         position_m = self.scenario.grid.centre_m(self._cell, like=self._crowd.positions_m)
-        pose = cdr.pose(position_m, self.scenario.time_ns(self._mission, self._step))
+        pose = cdr.encode_pose(position_m, self.scenario.time_ns(self._mission, self._step))
         self.publish("pose", pose)
         if self._ahead is not None and self._ahead[:2] == (self._mission, self._step):
             self.say_encoded("users", self._ahead[2])

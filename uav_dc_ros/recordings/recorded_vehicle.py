@@ -24,7 +24,7 @@ def vehicle(reader: BagReader, namespace: str) -> str:
         return told
     for message in reader.messages([f"{namespace}/mission"]):
         try:
-            status = messages.decode(cdr.text_in(message.data), Mission)
+            status = messages.decode(cdr.decode_string(message.data), Mission)
         except MessageError:
             continue
         simulated = not status.reason and (status.phase is Phase.READY or status.phase.is_over)

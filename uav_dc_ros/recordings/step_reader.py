@@ -153,7 +153,7 @@ class Steps:
                 if topic == "pose":
                     self._hear_pose(read_pose(message)._replace(place=place))
                     continue
-                payload = messages.decode(cdr.text_in(message.data), messages.PAYLOADS[topic])
+                payload = messages.decode(cdr.decode_string(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
                 self.rejected.enter(topic, error)
                 continue

@@ -143,7 +143,7 @@ def check_writable(summary: Path, bag: Path | None) -> None:
     if summary.absolute() == bag:
         raise ParameterError(f"--summary {summary}: it is the folder of the bag; expected another path")
     try:
-        files.refuse_unwritable(summary)
+        files.check_writable(summary)
     except UavDcError as error:
         raise ParameterError(f"--summary {error}; expected a file in an existing folder") from None
 

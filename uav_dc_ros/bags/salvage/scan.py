@@ -332,7 +332,7 @@ class Scan:
         """Look whether a payload is CDR, as far as that can be told without its type; of a text, whole."""
         try:
             if self.part.topics[topic]["type"] == JSON:
-                cdr.text_in(data)
+                cdr.decode_string(data)
             else:
                 cdr.byte_order(data)
         except MessageError as error:

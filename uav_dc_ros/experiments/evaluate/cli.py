@@ -87,7 +87,7 @@ def main(argv: list[str] | None = None) -> None:
         if options.picture and len(flights) > 1:
             raise UavDcError(f"--picture of {len(flights)} flights; expected one policy in one scenario")
         for path in filter(None, (options.json, options.picture)):
-            files.refuse_unwritable(path)
+            files.check_writable(path)
         if options.picture:
             pilot, scenario = flights[0]
             save_mission_picture(pilot.steer(scenario), scenario, 0, options.picture)

@@ -166,7 +166,7 @@ class MissionNode(ManagedNode):
                 if payload is None:
                     handle(cdr.Pose(data))
                 else:
-                    decoded = messages.decode(cdr.text_in(data), payload)
+                    decoded = messages.decode(cdr.decode_string(data), payload)
                     self.check_run(topic.name, decoded.run)
                     handle(decoded)
             except MessageError as error:
@@ -228,7 +228,7 @@ class MissionNode(ManagedNode):
 
     def say_encoded(self, topic: str, text: bytes) -> None:
         """Publish a payload that was checked and encoded."""
-        self.publish(topic, cdr.of_text(text))
+        self.publish(topic, cdr.encode_string(text))
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish a message, or its serialised form, on any topic."""

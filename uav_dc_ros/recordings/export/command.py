@@ -138,7 +138,7 @@ def _new(path: Path) -> Iterator[Path]:
         (partial / "result").parent.mkdir(parents=True)
         yield partial
         _refuse_existing(path)
-        files.place(partial / "result", path)
+        files.move(partial / "result", path)
     except OSError as error:
         raise BagError(f"{path} cannot be written: {error.strerror or error}") from None
     finally:
