@@ -18,18 +18,18 @@ from std_msgs.msg import String
 
 import uav_dc_ros
 
-scenario = uav_dc_ros.load_scenario("five_clusters")
-cell_m = scenario.grid.cell_m
-clusters = sorted((round(x / cell_m), round(y / cell_m)) for x, y in scenario.users.cluster_centres_m)
-way = [cell for cell in clusters for _ in range(5)]  # a few steps over each cluster, from west to east
-way.append(scenario.dock_cell)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+scenario = uav_dc_ros.load_scenario("five_clusters")
+clusters = sorted(
+    (round(x / 100), round(y / 100)) for x, y in scenario.users.cluster_centres_m
+)  # cells: 100 m
+way = [cell for cell in clusters for _ in range(5)] + [scenario.dock_cell]  # five steps over each cluster
 
 rclpy.init()
 node = rclpy.create_node("policy")  # the name that the other nodes wait for
 moves = node.create_publisher(String, "move", 10)
 ready = node.create_publisher(String, "ready", LATCHED)
-node.create_publisher(DiagnosticArray, "diagnostics", 10)  # the recorder waits for it; may stay silent
+node.create_publisher(DiagnosticArray, "diagnostics", 10)  # the recorder waits for it
 
 
 def on_mission(message: String) -> None:
@@ -38,20 +38,16 @@ def on_mission(message: String) -> None:
     if mission["phase"] != "ready":
         print(f"mission over: {mission['phase']} after {mission['step']} steps")
         raise SystemExit
-    east, north, _ = mission["cell"]
-    if len(way) > 1 and (east, north) == way[0]:
+    if len(way) > 1 and tuple(mission["cell"][:2]) == tuple(way[0]):
         way.pop(0)
-    if east != way[0][0]:
-        action = "right" if east < way[0][0] else "left"
-    elif north != way[0][1]:
-        action = "forward" if north < way[0][1] else "backward"
-    else:
-        action = "hover"
-    answer = {"run": mission["run"], "mission": mission["mission"], "step": mission["step"], "action": action}
+    east, north = way[0][0] - mission["cell"][0], way[0][1] - mission["cell"][1]
+    along = ("left", "hover", "right")[(east > 0) - (east < 0) + 1]
+    across = ("backward", "hover", "forward")[(north > 0) - (north < 0) + 1]
+    answer = {key: mission[key] for key in ("run", "mission", "step")} | {"action": along if east else across}
     moves.publish(String(data=json.dumps(answer)))
 
 
 node.create_subscription(String, "mission", on_mission, LATCHED)
-node.create_subscription(String, "rates", lambda rates: None, LATCHED)  # what was collected; unused here
+node.create_subscription(String, "rates", lambda rates: None, LATCHED)  # what was collected, which it ignores
 ready.publish(String(data=json.dumps({"run": "", "node": "policy"})))
 rclpy.spin(node)
