@@ -94,7 +94,7 @@ def where(flown: Flown, rate_hz: float) -> None:
     """Print where the time of a step goes."""
     cpu_ms = {
         " + ".join(nodes): flown.cpu_percent(nodes[0], skip=1) * 10 / rate_hz
-        for nodes in flown.processes((*NODES, "observer"))
+        for nodes in flown.processes((*NODES, "mission_monitor"))
     }
     told = ", ".join(f"{name} {ms:.2f}" for name, ms in cpu_ms.items())
     print(f"CPU per step, ms: {told}; together {sum(cpu_ms.values()):.2f}, of {os.cpu_count()} cores' time")

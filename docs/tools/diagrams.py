@@ -263,8 +263,8 @@ def filled(path: Path, lines: list[str]) -> str:
     return "".join([before, begin, "\n", "\n".join(lines), "\n\n", end, after])
 
 
-SIMULATED = ("world", "channel_monitor", "policy", "recorder", "visualizer", "observer")
-BESIDE = ("bridge", "world", "channel_monitor", "policy", "recorder", "observer")
+SIMULATED = ("world", "channel_monitor", "policy", "recorder", "visualizer", "mission_monitor")
+BESIDE = ("bridge", "world", "channel_monitor", "policy", "recorder", "mission_monitor")
 
 
 def contents() -> dict[Path, str]:

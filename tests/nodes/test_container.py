@@ -120,7 +120,7 @@ def parameters(folder: Path, **of_nodes: dict[str, Any]) -> Path:
 
 def test_alone_it_flies_a_mission(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
     """Started by hand, with the recorder and run_all's own eyes elsewhere."""
-    world = {"scenario": str(small_scenario), "peers": [*COMPOSED, "recorder", "observer"]}
+    world = {"scenario": str(small_scenario), "peers": [*COMPOSED, "recorder", "mission_monitor"]}
     file = parameters(
         ros.folder,
         world={**world, "pace": "lockstep"},

@@ -18,7 +18,7 @@ from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.framework.node_table import NODES
 
-PEERS = ("world", "channel_monitor", "policy", "recorder", "observer")
+PEERS = ("world", "channel_monitor", "policy", "recorder", "mission_monitor")
 BY_HAND = ("world", "channel_monitor", "policy")
 # What a burst of garbage pushes off the wire is sent again, from as far back as the publisher keeps it.
 KEPT = 10_000

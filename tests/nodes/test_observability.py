@@ -82,7 +82,7 @@ def test_every_node_tells_of_itself_once_a_second(observed: Observed) -> None:
     assert float(world["step lateness p99 [ms]"]) >= 0.0
     assert {"step overruns", "hovered steps"} <= set(world)
     assert float(told["uav1/channel_monitor"][-1][1]["users heard [Hz]"]) > 0.0
-    assert told["uav1/observer"][-1][1]["restarts of policy"] == "0"
+    assert told["uav1/mission_monitor"][-1][1]["restarts of policy"] == "0"
 
 
 def test_the_clock_is_mission_time_and_the_nodes_go_by_it(observed: Observed) -> None:

@@ -30,11 +30,11 @@ class End:
 
 
 def is_ready(mission: list[str], move: list[str]) -> bool:
-    """Has a world with the peers policy and observer found them: who hears `mission`, and who says `move`."""
+    """Whether a world with the peers policy and mission_monitor is matched on `mission` and `move`."""
     ends = {"mission": End(mission), "move": End(move)}
     found: list[bool] = []
     world = SimpleNamespace(
-        peers=["policy", "observer"],
+        peers=["policy", "mission_monitor"],
         rows=NODES,
         publishers_of={"mission": ends["mission"]},
         subscriptions_of={"move": ends["move"]},
@@ -52,11 +52,11 @@ def is_ready(mission: list[str], move: list[str]) -> bool:
 @pytest.mark.parametrize(
     ("mission", "move", "ready"),
     [
-        (["/uav1/policy", "/uav1/observer"], ["/uav1/policy"], True),
-        (["/uav1/policy", "/uav1/observer", "/_ros2cli_71"], ["/uav1/policy"], True),
-        (["/uav1/observer", "/_ros2cli_71"], ["/uav1/policy"], False),  # `ros2 topic echo`
-        (["/uav1/policy", "/uav1/observer"], ["/_ros2cli_71"], False),  # `ros2 topic pub`
-        (["/uav1/policy", "/observer"], ["/uav1/policy"], False),  # of another namespace
+        (["/uav1/policy", "/uav1/mission_monitor"], ["/uav1/policy"], True),
+        (["/uav1/policy", "/uav1/mission_monitor", "/_ros2cli_71"], ["/uav1/policy"], True),
+        (["/uav1/mission_monitor", "/_ros2cli_71"], ["/uav1/policy"], False),  # `ros2 topic echo`
+        (["/uav1/policy", "/uav1/mission_monitor"], ["/_ros2cli_71"], False),  # `ros2 topic pub`
+        (["/uav1/policy", "/mission_monitor"], ["/uav1/policy"], False),  # of another namespace
         (["/uav1/policy"], ["/uav1/policy"], False),
         ([], [], False),
     ],

@@ -115,7 +115,7 @@ def test_poses_that_are_offered_best_effort_are_recorded_as_well(
     ros: Ros, small_scenario: Path, small_policy: Path
 ) -> None:
     """An autopilot's bridge offers no better; of our own nodes, which do, the recorder asks for it."""
-    peers = 'peers:=["world", "channel_monitor", "policy", "recorder", "observer"]'
+    peers = 'peers:=["world", "channel_monitor", "policy", "recorder", "mission_monitor"]'
     given = ("-p", f"scenario:={small_scenario}", "-p", peers, "-p", "pace:=100", "-r", "/clock:=clock")
     override = "qos_overrides./pose.publisher.reliability:=best_effort"
     world = ros.start("uav_dc_ros.nodes.world", "--ros-args", *given, "-p", override)

@@ -96,7 +96,7 @@ def flown(
             gone = without if (mission, step) == (1, 1) else ()
             write_step(bag, mission, step, last=3, log_ns=log_ns, without=gone)
     bag.write(
-        "/diagnostics", diagnostics("observer", {"restarts of policy": "2", "restarts of world": "0"}),
+        "/diagnostics", diagnostics("mission_monitor", {"restarts of policy": "2", "restarts of world": "0"}),
         log_time_ns=10**18 + 5, publish_time_ns=0,
     )  # fmt: skip
     if dropped is not None:

@@ -39,7 +39,7 @@ flight           one run: check everything, start, follow, stop, tell
 options          what of its options needs more than the command line to be checked
 supervisor       brings nodes up in order, starts dead ones again, takes them down in reverse
 launcher         a node, or several, as a child process; control is what both ends of its pipes agree on
-observer         run_all's own eyes: the mission so far, and its summary
+mission_monitor  follows the missions of a run_all, for its progress display and summary
 display          what the user sees of it
 output           standard output and error, which can neither delay a mission nor end it
 

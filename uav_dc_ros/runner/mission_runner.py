@@ -41,7 +41,7 @@ LEAVE_S = 3.0  # for the middleware to close, which was seen to hang
 
 
 class Network:
-    """The observer's way into ROS: a context, a node, an executor.
+    """Context, node and executor of the mission monitor.
 
     Args:
         namespace: of the mission.
@@ -229,7 +229,7 @@ class MissionRunner:
             return
         if node.mission is not None:
             raise NodeError(f"no step came within {patience_s:.0f} s")
-        elsewhere = [name for name in self._peers() if name not in (*self.nodes, "observer")]
+        elsewhere = [name for name in self._peers() if name not in (*self.nodes, "mission_monitor")]
         if not elsewhere:
             raise NodeError(f"the nodes did not find each other within {patience_s:.0f} s")
         self.display.note(f"still waiting for {', '.join(elsewhere)} of another run of run_all")

@@ -125,7 +125,7 @@ class MissionMonitor(MissionNode):
     ) -> None:
         given = {"peers": peers, "run": run}
         overrides = [rclpy.Parameter(name, value=value) for name, value in given.items()]
-        super().__init__("observer", overrides, context)
+        super().__init__("mission_monitor", overrides, context)
         self.scenario = scenario
         self.seed = seed
         self.mission: MissionProgress | None = None

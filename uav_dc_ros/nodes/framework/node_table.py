@@ -126,7 +126,7 @@ NODES: dict[str, NodeRow] = {
             on_request=True,
         ),
         NodeRow(
-            name="observer",
+            name="mission_monitor",
             publishes=("ready", "diagnostics"),
             subscribes=("mission", "rates"),
             hears_all=True,

@@ -67,7 +67,7 @@ class Bench:
         patch.setattr(monitor.time, "monotonic", lambda: self.now_s)
         patch.setattr(other_publishers, "publishers", lambda node: self.publishers)
 
-    def observer(self, run: str = RUN) -> MissionMonitor:
+    def monitor(self, run: str = RUN) -> MissionMonitor:
         """One of run_all's, with a vehicle of its own if it was given a run."""
         node = MissionMonitor(
             *(self.scenario, 0 if run else None, run, ["world", "policy"]),
@@ -104,8 +104,8 @@ def bench(ros: Ros, small_scenario: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 @pytest.mark.parametrize("heard", [STEPS + 1, 2, 0])
 def test_the_end_is_heard_before_the_rates(bench: Bench, heard: int) -> None:
-    """An observer hears topic by topic, and a lockstep may fly a mission before it looks again."""
-    node = bench.observer()
+    """A monitor hears topic by topic, and a lockstep may fly a mission before it looks again."""
+    node = bench.monitor()
     for step in range(STEPS + 1):
         node.on_mission(mission(bench.scenario, step))
     for step in range(heard):
@@ -119,7 +119,7 @@ def test_the_end_is_heard_before_the_rates(bench: Bench, heard: int) -> None:
 
 
 def test_nodes_begin_once_nobody_else_was_found_for_a_while(bench: Bench) -> None:
-    node = bench.observer()
+    node = bench.monitor()
     bench.looks(node, ALONE_S / 2)
     assert not node.is_alone
     bench.looks(node, ALONE_S)
@@ -128,7 +128,7 @@ def test_nodes_begin_once_nobody_else_was_found_for_a_while(bench: Bench) -> Non
 
 def test_nodes_that_start_slowly_are_waited_for(bench: Bench) -> None:
     """Where they take long, others are found late, too."""
-    node = bench.observer()
+    node = bench.monitor()
     bench.looks(node, 10 * ALONE_S, have_started=False)
     assert not node.is_alone
     bench.looks(node, STARTED_S / 2)
@@ -138,7 +138,7 @@ def test_nodes_that_start_slowly_are_waited_for(bench: Bench) -> None:
 
 
 def test_another_mission_is_refused_by_the_names_of_its_nodes_and_its_run(bench: Bench) -> None:
-    node = bench.observer()
+    node = bench.monitor()
     bench.publishers = {"mission": ["/world"], "move": ["/policy"]}
     bench.looks(node, TELL_S / 2)
     with pytest.raises(MessageError, match="belongs to run"):
@@ -149,7 +149,7 @@ def test_another_mission_is_refused_by_the_names_of_its_nodes_and_its_run(bench:
 
 @pytest.mark.parametrize("silent", [True, False])
 def test_another_mission_is_refused_when_only_half_of_that_is_known(bench: Bench, silent: bool) -> None:
-    node = bench.observer()
+    node = bench.monitor()
     if silent:
         bench.publishers = {"mission": ["/world"]}
     else:
@@ -161,7 +161,7 @@ def test_another_mission_is_refused_when_only_half_of_that_is_known(bench: Bench
 
 
 def test_a_mission_that_has_begun_is_not_ended_by_a_player(bench: Bench) -> None:
-    node = bench.observer()
+    node = bench.monitor()
     bench.looks(node, ALONE_S + 0.1)
     node.on_mission(mission(bench.scenario, 0))
     bench.publishers = {"mission": ["/world", "/player"], "pose": ["/world", "/player"]}
@@ -173,7 +173,7 @@ def test_a_mission_that_has_begun_is_not_ended_by_a_player(bench: Bench) -> None
 
 
 def test_a_host_without_the_vehicle_adopts_its_run(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    node = bench.observer(run="")
+    node = bench.monitor(run="")
     monkeypatch.setattr(node, "count_publishers", lambda topic: 1)
     node.check_run("mission", RUN)
     assert node.run == RUN
@@ -186,7 +186,7 @@ def test_a_host_without_the_vehicle_adopts_its_run(bench: Bench, monkeypatch: py
 
 
 def test_a_host_without_the_vehicle_adopts_no_player_s(bench: Bench) -> None:
-    node = bench.observer(run="")
+    node = bench.monitor(run="")
     node.check_run("mission", OTHER)
     bench.publishers = {"mission": ["/player"]}
     with pytest.raises(AnotherMissionError, match="/player publishes mission here, and is no node of"):
@@ -195,7 +195,7 @@ def test_a_host_without_the_vehicle_adopts_no_player_s(bench: Bench) -> None:
 
 def test_who_keeps_messages_as_bytes_knows_those_of_another_run(bench: Bench) -> None:
     """What is no payload is not another run's: who decodes it refuses it, and a recorder keeps it."""
-    node = bench.observer()
+    node = bench.monitor()
     ours = json.loads(messages.encode(mission(bench.scenario, 0)))
     reordered = dict(reversed(ours.items()))
     for text, expected in (
@@ -212,6 +212,6 @@ def test_who_keeps_messages_as_bytes_knows_those_of_another_run(bench: Bench) ->
 
 
 def test_a_lie_about_the_seed_ends_no_mission(bench: Bench) -> None:
-    node = bench.observer()
+    node = bench.monitor()
     with pytest.raises(MessageError, match="mission 0 has seed 7; expected 0"):
         node.on_mission(msgspec.structs.replace(mission(bench.scenario, 1), seed=7))
