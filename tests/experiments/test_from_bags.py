@@ -15,7 +15,7 @@ from uav_dc_ros.agents import policy
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import BagError, TrainingError
 from uav_dc_ros.experiments.train.cli import main
-from uav_dc_ros.experiments.train.replay_from_bags import remember
+from uav_dc_ros.experiments.train.replay_from_bags import prefill_replay
 from uav_dc_ros.experiments.train.training import Training
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -30,8 +30,8 @@ def act(mission, step):
 
 
 def recorded(folder, scenario=TINY, missions=3, seed=0, **values):
-    told = flight(scenario, act=act, missions=missions, seed=seed)
-    return write(folder, told, about(scenario, seed), **values)
+    messages = flight(scenario, act=act, missions=missions, seed=seed)
+    return write(folder, messages, about(scenario, seed), **values)
 
 
 def rows(training):
@@ -55,12 +55,12 @@ def in_environment(scenario, seeds, observation):
 @pytest.mark.parametrize("observation", ["position", "mission", "map"])
 @pytest.mark.parametrize("form", ["immediate", "episode"])
 def test_the_buffer_holds_what_the_environment_gives(tmp_path, observation, form):
-    """Bit for bit, in every run, paid as the training pays: not as the scenario of the recording does."""
+    """Bit for bit, in every run, with the reward of the training, not that of the recorded scenario."""
     bags = [recorded(tmp_path / "a"), recorded(tmp_path / "b", seed=20, missions=2, namespace="/uav2")]
     paid = {"form": form, "beta": 3.0, "zeta": 0.5, "r_plus": "binary"}
     runs = [run(TINY, seed, **paid) for seed in (0, 1)]
     training = Training(population(TINY, *runs, observation=observation), CPU)
-    found = remember(training, bags)
+    found = prefill_replay(training, bags)
     assert (found.missions, found.transitions, found.held) == (5, 5 * STEPS, 5 * STEPS)
     world = tiny(reward=paid)
     expected = [in_environment(world, range(s, s + n), observation) for s, n in ((0, 3), (20, 2))]
@@ -72,7 +72,7 @@ def test_the_buffer_holds_what_the_environment_gives(tmp_path, observation, form
 
 def test_a_buffer_that_is_too_small_keeps_the_latest(tmp_path):
     training = Training(population(TINY, run(TINY, buffer_size=10)), CPU)
-    found = remember(training, [recorded(tmp_path / "a")])
+    found = prefill_replay(training, [recorded(tmp_path / "a")])
     assert (found.transitions, found.held) == (24, 10)
     assert str(found) == "24 transitions of 3 recorded missions (a), of which the latest 10 fit into it"
     expected = in_environment(TINY, range(3), "mission")[-10:]
@@ -85,7 +85,7 @@ def test_it_learns_from_them_and_equal_commands_learn_the_same(tmp_path):
     def learnt(bags):
         training = Training(population(TINY, run(TINY, 3)), CPU)
         if bags:
-            remember(training, bags)
+            prefill_replay(training, bags)
         training.fly_episode()
         return training.learner.state()["theta"].numpy().tobytes()
 
@@ -97,18 +97,18 @@ def test_flights_in_another_world_are_refused(tmp_path):
     other = recorded(tmp_path / "a", tiny(users={"v_max_mps": 2.0}))
     training = Training(population(TINY, run(TINY)), CPU)
     with pytest.raises(TrainingError, match=r"mission 0, step 0 is flown in 'tiny' \(\w{12}\); expected the"):
-        remember(training, [other])
+        prefill_replay(training, [other])
     with pytest.raises(BagError, match="no such folder"):
-        remember(training, [tmp_path / "nowhere"])
+        prefill_replay(training, [tmp_path / "nowhere"])
     moves = [message for message in flight(TINY) if message.topic == "/move"]
     with pytest.raises(TrainingError, match="holds no transition; expected missions"):
-        remember(training, [write(tmp_path / "moves", moves)])
+        prefill_replay(training, [write(tmp_path / "moves", moves)])
 
 
-def test_runs_that_are_paid_in_two_ways_are_refused(tmp_path):
+def test_runs_with_different_rewards_are_refused(tmp_path):
     training = Training(population(TINY, run(TINY), run(TINY, 1, beta=2.0)), CPU)
-    with pytest.raises(TrainingError, match="paid in 2 ways; expected one"):
-        remember(training, [recorded(tmp_path / "a")])
+    with pytest.raises(TrainingError, match="have 2 rewards; expected one"):
+        prefill_replay(training, [recorded(tmp_path / "a")])
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def write_toml(folder):
     return path
 
 
-def test_resume_goes_on_with_what_it_remembers(tmp_path, train, monkeypatch):
+def test_resume_keeps_the_prefilled_replay(tmp_path, train, monkeypatch):
     """The buffer is in the checkpoint: bags are not read again, and may be gone."""
     field = scenarios.load(write_toml(tmp_path))
     bag = recorded(tmp_path / "a", field)
@@ -186,8 +186,11 @@ def test_a_mistake_is_one_line_and_leaves_nothing_in_the_way(tmp_path, train):
     recorded(tmp_path / "a", TINY)
     other = msgspec.structs.replace(TINY.users, v_max_mps=3.0)
     bag = recorded(tmp_path / "b", msgspec.structs.replace(TINY, users=other))
-    for given, told in ((bag, "expected the training's 'tiny'"), (tmp_path / "c", "no such folder or file")):
+    for given, complaint in (
+        (bag, "expected the training's 'tiny'"),
+        (tmp_path / "c", "no such folder or file"),
+    ):
         status, out = train("made", "--from-bags", given)
         assert (status, len(out.splitlines())) == (2, 1), out
-        assert told in out
+        assert complaint in out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "tiny.toml"]

@@ -1,4 +1,4 @@
-"""Training: it repeats, no run depends on the others, its books are right, no device waits, and it learns."""
+"""Training repeats, runs are independent, statistics are right, no device waits, and agents learn."""
 
 import collections
 import math
@@ -20,7 +20,7 @@ from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.experiments.train import validation
 from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
 from uav_dc_ros.experiments.train.population import architecture
-from uav_dc_ros.experiments.train.progress import ProgressReport
+from uav_dc_ros.experiments.train.progress import latest_means
 from uav_dc_ros.experiments.train.training import Training
 from uav_dc_ros.experiments.train.validation import VALIDATION_SEEDS, roll_out_greedily, validate
 
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def trained(made, n=None, worlds_in=None):
-    """A training after n episodes; after all of them unless told."""
+    """A training after n episodes; after all of them by default."""
     training = Training(made, CPU, worlds_in)
     for _ in range(made.n_episodes if n is None else n):
         training.fly_episode()
@@ -171,12 +171,12 @@ def crossings(end, n_steps, worlds_in="torch"):
 def test_the_number_of_waits_of_a_device_does_not_grow_with_the_steps(end):
     crossings(end, 8)  # constants are made once, the first time they are met
     few, many = crossings(end, 8), crossings(end, 32)
-    assert few["cpu"] > 0, "the end of an episode is told to the host"
-    assert few["from_numpy"] > 0, "the start of an episode is told to the device"
+    assert few["cpu"] > 0, "the end of an episode is sent to the host"
+    assert few["from_numpy"] > 0, "the start of an episode is sent to the device"
     assert many == few
 
 
-def test_so_it_would_be_noticed():
+def test_the_count_notices_a_crossing():
     """With worlds on the host, as beside a CPU, every step crosses over: the count is not blind."""
     few, many = crossings("at_time_limit", 8, None), crossings("at_time_limit", 32, None)
     assert many["numpy"] - few["numpy"] >= 24
@@ -238,15 +238,15 @@ def test_a_fixed_environment_is_the_layout_of_the_mission_with_its_seed(end, wor
             assert len({users_m.tobytes() for users_m in own}) == len(own), "each is another"
         else:
             assert {users_m.tobytes() for users_m in own} == {own[0].tobytes()}
-            _, told = DataCollectionEnv(scenario).reset(seed=one.environment)
-            np.testing.assert_allclose(own[0], told["users_m"], rtol=1e-5, atol=1e-3)
+            _, info = DataCollectionEnv(scenario).reset(seed=one.environment)
+            np.testing.assert_allclose(own[0], info["users_m"], rtol=1e-5, atol=1e-3)
     assert not np.allclose(found[1][0], found[2][0])
 
 
 def flown_by_hand(scenario, one, actions):
     """The transitions, and the figures of every episode's missions, of a run's actions `[T]`.
 
-    As the Gymnasium environment tells them.
+    As the Gymnasium environment returns them.
     """
     values = msgspec.structs.replace(scenario, reward=one.reward)
     env, limit = DataCollectionEnv(values), scenario.mission.max_steps
@@ -254,24 +254,24 @@ def flown_by_hand(scenario, one, actions):
     before, _ = env.reset(seed=one.environment)
     paid, rates, arrival, step = 0.0, [], None, 0
     for t, action in enumerate(actions, start=1):
-        after, reward, terminated, truncated, told = env.step(np.int64(action))
+        after, reward, terminated, truncated, info = env.step(np.int64(action))
         transitions.append(np.concatenate([before, after, [action, reward, terminated]]))
         before = after
         step += 1
         paid += reward
-        rates.append(float(told["sum_rate_bps"]))
-        away = math.dist(told["cell"][:2], scenario.dock_cell)
+        rates.append(float(info["sum_rate_bps"]))
+        away = math.dist(info["cell"][:2], scenario.dock_cell)
         arrival = None if away else arrival or step
         if terminated or truncated:
             r_plus = float(not away) if one.reward.r_plus == "binary" else math.exp(-away)
-            data = float(told["data_bits"].mean()) / one.reward.data_scale_bits
-            landed = bool(told["landed"])
+            data = float(info["data_bits"].mean()) / one.reward.data_scale_bits
+            landed = bool(info["landed"])
             missions.append(
                 {
                     "reward": one.reward.beta * data + one.reward.zeta * r_plus,
                     "episode_return": paid,
                     "throughput_bps": np.mean(rates),
-                    "users_collected": told["collected"].sum(),
+                    "users_collected": info["collected"].sum(),
                     "landing_rate": landed,
                     "arrival_step": arrival if landed else limit,
                 }
@@ -286,8 +286,8 @@ def flown_by_hand(scenario, one, actions):
 
 @pytest.mark.parametrize("worlds_in", ["numpy", "torch"])
 @pytest.mark.parametrize("end", ENDS)
-def test_what_is_learnt_from_and_booked_is_what_the_environment_says_of_the_same_actions(end, worlds_in):
-    # Nobody walks, so that a run's environment and its actions decide everything.
+def test_transitions_and_statistics_are_those_of_the_environment_for_the_same_actions(end, worlds_in):
+    # No user walks, so that a run's environment and its actions decide everything.
     scenario = tiny(mission={"episode_end": end, "start_m": [100.0, 200.0, 100.0]}, users={"v_max_mps": 0.0})
     paid = [
         {"form": "immediate", "beta": 2.0, "zeta": 3.0, "r_plus": "exponential"},
@@ -302,12 +302,12 @@ def test_what_is_learnt_from_and_booked_is_what_the_environment_says_of_the_same
     training = trained(made, worlds_in=worlds_in)
     rows = training.state()[0]["buffer.rows"]
     actions = rows[..., 2 * observations.size("mission", scenario)].to(torch.int64).numpy()
-    most = 0
+    max_missions = 0
     for i, one in enumerate(runs):
         transitions, episodes = flown_by_hand(scenario, one, actions[i])
         np.testing.assert_allclose(rows[i], transitions, rtol=1e-4, atol=1e-5)
         assert len(episodes) == 8
-        most = max(most, *map(len, episodes))
+        max_missions = max(max_missions, *map(len, episodes))
         for name, values in training.curves.items():
             if name == "loss":
                 assert np.isfinite(values).all()
@@ -315,7 +315,7 @@ def test_what_is_learnt_from_and_booked_is_what_the_environment_says_of_the_same
             expected = [np.mean([mission[name] for mission in missions]) for missions in episodes]
             np.testing.assert_allclose(values[:, i], expected, rtol=2e-4, atol=1e-4, err_msg=f"{i} {name}")
     assert rows[..., -1].any(), "a mission has terminated"
-    assert most == 1 if end == "at_time_limit" else most > 1, "several missions in an episode"
+    assert max_missions == 1 if end == "at_time_limit" else max_missions > 1, "several missions in an episode"
     assert len(set(training.curves["landing_rate"].ravel())) > 1, "some landed, some did not"
 
 
@@ -340,15 +340,15 @@ def test_the_loss_is_the_mean_over_the_iterations(monkeypatch):
 def test_an_episode_in_which_no_mission_ended_has_no_figures(library):
     scenario = tiny()
     worlds = BatchWorld(scenario, library.zeros((2, scenario.n_users, 2)))
-    books = EpisodeStats(scenario, worlds.state.total_reward)
+    stats = EpisodeStats(scenario, worlds.state.total_reward)
     outcome = worlds.step(library.zeros((2,), dtype=library.int64), library.zeros((2, scenario.n_users, 2)))
-    books.add(worlds.state, outcome)
+    stats.add_step(worlds.state, outcome)
     second = library.asarray([False, True])
-    books.close(second, worlds.state, outcome)
-    for name, values in zip(CURVES, books.take(), strict=False):
+    stats.end_missions(second, worlds.state, outcome)
+    for name, values in zip(CURVES, stats.take(), strict=False):
         assert np.isnan(values[0]), name
         assert np.isfinite(values[1]), name
-    assert np.isnan(books.take()).all(), "what was taken is gone"
+    assert np.isnan(stats.take()).all(), "what was taken is gone"
 
 
 @pytest.mark.parametrize("algorithm", ["dqn", "dueling_dqn"])
@@ -427,24 +427,19 @@ def test_policies_are_chosen_for_users_and_for_battery(monkeypatch):
     monkeypatch.setattr(validation, "roll_out_greedily", lambda training, seeds: missions)
     found = validate(Training(population(scenario, *[run(scenario, i) for i in range(4)]), CPU))
     np.testing.assert_allclose(found.brought_home, [3.0, 3.01, 3.1, 0.0])
-    assert np.argsort(-found.merit).tolist() == [2, 0, 1, 3]
+    assert np.argsort(-found.selection_score).tolist() == [2, 0, 1, 3]
 
 
 def test_nothing_is_chosen_on_the_missions_that_judge():
     assert not set(VALIDATION_SEEDS) & set(TEST_SEEDS)
 
 
-def test_a_report_looks_back_on_the_latest_episodes():
+def test_progress_is_of_the_latest_episodes():
     scenario = tiny()
     training = trained(population(scenario, run(scenario, 0, episodes=23), run(scenario, 1, episodes=23)))
-    report = ProgressReport.of(training, 1.5)
-    assert (report.episode, report.score) == (23, 1.5)
-    for name, value in {
-        "episode_return": report.mean_return,
-        "users_collected": report.users_collected,
-        "landing_rate": report.landing_rate,
-    }.items():
-        assert value == pytest.approx(training.curves[name][3:].mean(), rel=1e-5), name
+    means = latest_means(training)
+    for name in ("episode_return", "users_collected", "landing_rate"):
+        assert means[name] == pytest.approx(training.curves[name][3:].mean(), rel=1e-5), name
     assert training.curves["episode_return"][3:].mean() != training.curves["episode_return"].mean()
 
 
@@ -455,6 +450,6 @@ def test_runs_that_cannot_share_a_batch_are_refused(key):
         population(scenario, run(scenario, **{key: 9}), run(scenario, **{key: 7}))
 
 
-def test_a_population_of_nobody_is_refused():
+def test_a_population_without_runs_is_refused():
     with pytest.raises(TrainingError, match="0 runs"):
         population(tiny())

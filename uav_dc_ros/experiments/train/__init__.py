@@ -1,1 +1,1 @@
-"""Training: the learner's loop, and what is kept and shown of it."""
+"""Training: the loop, its checkpoints, validation, plots and policy card."""

@@ -1,5 +1,6 @@
-"""The state of a training on disk: one file, which is there in full or not at all."""
+"""Checkpoints: the state of a training as one file, which is complete or absent."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,15 @@ from uav_dc_ros.experiments.train.population import Population
 from uav_dc_ros.experiments.train.training import Training
 
 _FORMAT = 1
-# What reading bytes that are no state can end in.
-_DAMAGED = (OSError, SafetensorError, msgspec.DecodeError, KeyError, TypeError, RuntimeError, ValueError)
+# Every error that reading a damaged or foreign file can raise.
+_UNREADABLE = (OSError, SafetensorError, msgspec.DecodeError, KeyError, TypeError, RuntimeError, ValueError)
 
 
-def save(path: Path, training: Training, progress: dict[str, Any]) -> None:
-    """Writes the state, under another name first, in place of an older one.
-
-    Args:
-        path: the file.
-        training: between two episodes.
-        progress: what its owner wants back; values that JSON can hold.
+def save(path: Path, training: Training, progress: Any) -> None:
+    """Writes the state between two episodes, and `progress`, which JSON can hold, in place of an older file.
 
     Raises:
-        TrainingError: it cannot be written.
+        TrainingError: the file cannot be written.
     """
     arrays, values = training.state()
     values |= {"format": _FORMAT, "population": _plain(training.population), "progress": progress}
@@ -42,10 +38,10 @@ def save(path: Path, training: Training, progress: dict[str, Any]) -> None:
 
 
 def restore(path: Path, training: Training) -> dict[str, Any]:
-    """Takes a training to where `path` was written, and gives back the `progress` written with it.
+    """Sets a training to the saved state, and returns the `progress` saved with it.
 
     Raises:
-        TrainingError: no such file, damaged, or of another population.
+        TrainingError: the file is missing, damaged, or of another population.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -53,31 +49,38 @@ def restore(path: Path, training: Training) -> dict[str, Any]:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a dict
         if values["format"] != _FORMAT:
             raise TrainingError(f"{path}: format is {values['format']}; expected {_FORMAT}")
-        _check(values["population"], _plain(training.population), path)
+        saved, expected = dict(_flat(values["population"])), dict(_flat(_plain(training.population)))
+        for key in expected | saved:
+            refuse_other(path, key, saved.get(key, "absent"), expected.get(key, "absent"))
         training.restore(arrays, values)
-    except _DAMAGED as error:
+    except _UNREADABLE as error:
         raise TrainingError(
             f"{path}: cannot be read, or not the state of a training: {error}; delete it to start anew"
         ) from None
     return dict(values["progress"])
 
 
+def refuse_other(path: Path, key: str, saved: object, expected: object) -> None:
+    """Raises TrainingError if a saved value is not that of this command."""
+    if saved != expected:
+        raise TrainingError(
+            f"{path} is the state of a training with {key} = {saved!r}; "
+            f"expected {expected!r}, as in this command"
+        )
+
+
 def _plain(population: Population) -> Any:
     return msgspec.json.decode(msgspec.json.encode(population))
 
 
-def _check(saved: Any, wanted: Any, path: Path, key: str = "") -> None:
-    """Raises TrainingError for the first value in which the two differ."""
-    if isinstance(saved, dict) and isinstance(wanted, dict) and saved.keys() == wanted.keys():
-        for name in saved:
-            _check(saved[name], wanted[name], path, f"{key}.{name}" if key else name)
-    elif isinstance(saved, list) and isinstance(wanted, list) and len(saved) == len(wanted):
-        for i, (one, other) in enumerate(zip(saved, wanted, strict=True)):
-            _check(one, other, path, f"{key}[{i}]")
-    elif isinstance(saved, list) and isinstance(wanted, list):
-        _check(len(saved), len(wanted), path, f"the number of {key}")
-    elif saved != wanted:
-        raise TrainingError(
-            f"{path} is the state of a training with {key} = {saved!r}; "
-            f"expected {wanted!r}, as in this command"
-        )
+def _flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Key and value of every leaf of nested dicts and lists; a list yields its length first."""
+    if isinstance(value, dict):
+        for name, entry in value.items():
+            yield from _flat(entry, f"{key}.{name}" if key else name)
+    elif isinstance(value, list):
+        yield f"the number of {key}", len(value)
+        for i, entry in enumerate(value):
+            yield from _flat(entry, f"{key}[{i}]")
+    else:
+        yield key, value

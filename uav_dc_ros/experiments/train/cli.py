@@ -1,4 +1,4 @@
-"""The command line of `python -m uav_dc_ros.train`: options, checkpoints, the result."""
+"""The command line of `python -m uav_dc_ros.train`: options, checkpoints, the resulting policy."""
 
 import argparse
 import contextlib
@@ -23,8 +23,8 @@ from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture, steer
 from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run
-from uav_dc_ros.experiments.train.progress import ProgressDisplay, ProgressReport
-from uav_dc_ros.experiments.train.replay_from_bags import Remembered, check_remembered, remember
+from uav_dc_ros.experiments.train.progress import ProgressDisplay
+from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay, prefill_replay
 
 if TYPE_CHECKING:
     import torch
@@ -42,8 +42,30 @@ _LEARNING_OPTIONS = {
     "target_every": "iterations between two copies to the target network",
     "buffer_size": "transitions that the replay buffer holds",
 }
-# Keys of a scenario's reward that an option may replace.
+# Options that replace a value of the scenario's reward, and its key.
 _REWARD_OPTIONS = {"beta": "beta", "zeta": "zeta", "r_plus": "r_plus", "reward_form": "form"}
+
+
+class _Progress(msgspec.Struct):
+    """What a checkpoint holds beside the training; the names in the file are older than those here.
+
+    Attributes:
+        every: episodes between checkpoints.
+        selection_score: highest until now.
+        score: users that the policy with that score brought home in validation.
+        run: index of its run.
+        best: its folder's name.
+        seconds: wall time.
+        prefilled: recorded flights that the replay buffers began with.
+    """
+
+    every: int
+    selection_score: float | None = msgspec.field(default=None, name="merit")
+    score: float | None = None
+    run: int = 0
+    best: str = ""
+    seconds: float = 0.0
+    prefilled: PrefilledReplay | None = msgspec.field(default=None, name="remembered")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -70,7 +92,7 @@ def options_parser() -> cli.Parser:
     add("--seed", default=0, type=int, metavar="N", help="of the first run; the next has N + 1")
     add("--runs", default=1, help="runs side by side, of which the best is kept", **count)
     add("--checkpoint-every", default=100, help="episodes between validations and checkpoints", **count)
-    add("--resume", action="store_true", help="go on from the last checkpoint of the same command, if any")
+    add("--resume", action="store_true", help="resume from the last checkpoint of the same command, if any")
     add("--from-bags", type=Path, nargs="+", metavar="BAG", help="recorded flights to start the replay with")
     add("--tensorboard", type=Path, metavar="DIR", help="write scalars of every run for TensorBoard")
     add("--threads", default=1, help="of torch: equal numbers give equal results", **count)
@@ -84,7 +106,7 @@ def options_parser() -> cli.Parser:
     reward.add_argument("--beta", metavar="X", type=float, help="weight of the data", **instead)
     reward.add_argument("--zeta", metavar="X", type=float, help="weight of R_plus", **instead)
     reward.add_argument("--r-plus", choices=get_args(RPlus), help="shape of R_plus", **instead)
-    reward.add_argument("--reward-form", choices=get_args(RewardForm), help="what a step pays", **instead)
+    reward.add_argument("--reward-form", choices=get_args(RewardForm), help="reward of a step", **instead)
     return parser
 
 
@@ -93,7 +115,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     config = _config(options, shipped)
     population = _population(config, shipped.name, options.runs)
     device = _device(options.device, options.threads)
-    # These need torch, which _device() has asked for.
+    # These need torch, which _device() has found.
     from uav_dc_ros.experiments.train import checkpoint
     from uav_dc_ros.experiments.train.tensorboard import TensorBoardLog
     from uav_dc_ros.experiments.train.training import Training
@@ -104,33 +126,22 @@ def _train(options: argparse.Namespace, command: str) -> int:
     policy.refuse_existing(options.out)
     try:
         training = Training(population, device)
-    except (MemoryError, RuntimeError) as error:  # torch says with the latter that memory is short
+    except (MemoryError, RuntimeError) as error:  # torch raises the latter when memory is short
         raise TrainingError(f"the training cannot be set up: {str(error).splitlines()[0]}") from None
     every = options.checkpoint_every
-    progress: dict[str, Any] = {
-        "every": every,
-        "merit": None,
-        "score": None,
-        "run": 0,
-        "best": None,
-        "seconds": 0.0,
-        "remembered": None,
-    }
+    progress = _Progress(every)
     if options.resume and saved.is_file():
-        progress = checkpoint.restore(saved, training)
-        if progress["every"] != every:
-            raise TrainingError(
-                f"{saved} is the state of a training with checkpoint_every = {progress['every']}; "
-                f"expected {every}, as in this command"
-            )
-        check_remembered(saved, progress.setdefault("remembered", None), options.from_bags)
-        policy.load(folder / progress["best"])  # the result of what follows, unless there is a better one
+        progress = msgspec.convert(checkpoint.restore(saved, training), _Progress)
+        checkpoint.refuse_other(saved, "checkpoint_every", progress.every, every)
+        bags = list(progress.prefilled.bags) if progress.prefilled else None
+        expected = list(map(str, options.from_bags)) if options.from_bags else None
+        checkpoint.refuse_other(saved, "from_bags", bags, expected)
+        policy.load(folder / progress.best)  # a damaged one is an error now, not after the training
     elif options.from_bags:
-        remembered = remember(training, options.from_bags)
-        print(f"replay starts with {remembered}")
-        progress["remembered"] = msgspec.to_builtins(remembered)
+        progress.prefilled = prefill_replay(training, options.from_bags)
+        print(f"replay starts with {progress.prefilled}")
     _reserve(folder, options.resume, training.n_flown)
-    started = time.monotonic() - progress["seconds"]
+    started = time.monotonic() - progress.seconds
     try:
         with ExitStack() as stack:
             stack.callback(_discard_empty, folder)
@@ -139,46 +150,38 @@ def _train(options: argparse.Namespace, command: str) -> int:
             while training.n_flown < population.n_episodes:
                 training.fly_episode()
                 scalars.add_episode()
-                last = training.n_flown == population.n_episodes
-                if training.n_flown % every == 0 or last:
+                if training.n_flown % every == 0 or training.n_flown == population.n_episodes:
                     found = validate(training)
-                    if progress["merit"] is None or found.merit.max() > progress["merit"]:
-                        run = int(found.merit.argmax())
-                        progress |= {"run": run, "merit": float(found.merit[run])}
-                        progress["score"] = float(found.brought_home[run])
-                        progress["best"] = _save_best(folder, config, training, progress, command)
-                    progress["seconds"] = time.monotonic() - started
+                    run = int(found.selection_score.argmax())
+                    highest = float(found.selection_score[run])
+                    if progress.selection_score is None or highest > progress.selection_score:
+                        progress.run, progress.selection_score = run, highest
+                        progress.score = float(found.brought_home[run])
+                        progress.best = _save_best(folder, config, training, progress, command)
+                    progress.seconds = time.monotonic() - started
                     scalars.add_scores(found.brought_home)
                     checkpoint.save(saved, training, progress)
-                score = math.nan if progress["score"] is None else progress["score"]
-                display.show(ProgressReport.of(training, score))
+                display.show(math.nan if progress.score is None else progress.score)
     except KeyboardInterrupt:
-        if not saved.is_file():
+        if saved.is_file():
+            kept = f"the best policy until now is {folder / progress.best}; --resume goes on"
+        else:
             shutil.rmtree(folder, ignore_errors=True)
             kept = "there is no checkpoint yet"
-        else:
-            kept = f"the best policy until now is {folder / progress['best']}; --resume goes on"
         print(f"{PROG}: stopped; {kept}", file=sys.stderr)
         return cli.INTERRUPTED
-    best = policy.load(folder / progress["best"])
+    best = policy.load(folder / progress.best)
+    assert progress.score is not None, "the last episode is validated"
+    text = (shipped, command, options.runs, progress.seconds, progress.score, progress.prefilled)
     policy.save(
         options.out,
         best.config,
         best.parameters,
-        lambda loaded: card(
-            loaded,
-            shipped,
-            command,
-            options.runs,
-            progress["seconds"],
-            progress["score"],
-            progress["remembered"] and msgspec.convert(progress["remembered"], Remembered),
-        ),
+        lambda loaded: card(loaded, *text),
         lambda loaded, made: _draw(made, loaded, shipped, training),
     )
     shutil.rmtree(folder)
-    brought = f"{progress['score']:.1f} of {shipped.n_users} users brought home in validation"
-    print(f"{options.out}: {brought}")
+    print(f"{options.out}: {progress.score:.1f} of {shipped.n_users} users brought home in validation")
     return 0
 
 
@@ -199,14 +202,9 @@ def _population(config: PolicyConfig, name: str, n_runs: int) -> Population:
 
 
 def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
-    """Makes the folder for checkpoints: an hour later is too late to find out that one cannot.
+    """Makes the folder of the checkpoints, or takes an existing one to resume.
 
-    One that is there already is taken only to resume. What a killed training had saved in it after the
-    state that it is resumed from, if any, is removed.
-
-    Raises:
-        PolicyError: it exists, and is not to be resumed.
-        TrainingError: it cannot be made.
+    Removes policies that a killed training saved after its last checkpoint.
     """
     if not resume:
         policy.refuse_existing(folder)
@@ -220,36 +218,33 @@ def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
 
 
 def _discard_empty(folder: Path) -> None:
-    """Removes a folder for checkpoints in which there is none: it would be in the next command's way."""
+    """Removes an empty folder, which the next command would refuse."""
     with contextlib.suppress(OSError):
         folder.rmdir()
 
 
 def _save_best(
-    folder: Path, config: PolicyConfig, training: "Training", progress: dict[str, Any], command: str
+    folder: Path, config: PolicyConfig, training: "Training", progress: _Progress, command: str
 ) -> str:
-    """Saves the best run's policy as it is now; gives back the name of its folder."""
-    run = progress["run"]
-    now = msgspec.structs.replace(config, seed=config.seed + run, episode=training.n_flown)
-    text = checkpoint_card(now, progress["score"], command)
+    """Saves the best run's policy, and returns the name of its folder."""
+    config = msgspec.structs.replace(config, seed=config.seed + progress.run, episode=training.n_flown)
+    text = checkpoint_card(config, progress.score or 0.0, command)
     name = f"episode_{training.n_flown:06d}"
-    policy.save(folder / name, now, training.learner.parameters(run), lambda _: text)
+    policy.save(folder / name, config, training.learner.parameters(progress.run), lambda _: text)
     return name
 
 
 def _draw(folder: Path, made: policy.Policy, scenario: Scenario, training: "Training") -> None:
-    """The pictures in a policy's folder: how it learnt, and a mission as it flies it."""
+    """Draws the plots in a policy's folder: its learning curve, and a mission."""
     try:
         from uav_dc_ros.experiments.train.learning_curve import save_learning_curve  # needs matplotlib
-    except ModuleNotFoundError:
-        # The policy is worth more than its pictures.
+    except ModuleNotFoundError:  # a policy without plots is better than none
         print(
             'no pictures without matplotlib; it comes with: pip install "uav_dc_ros[train]"', file=sys.stderr
         )
         return
-    save_learning_curve(
-        training, made.config.seed - training.population.runs[0].seed, folder / LEARNING_CURVE
-    )
+    chosen = made.config.seed - training.population.runs[0].seed
+    save_learning_curve(training, chosen, folder / LEARNING_CURVE)
     save_mission_picture(steer(made, scenario), scenario, TEST_SEEDS[0], folder / TRAJECTORY)
 
 
@@ -259,8 +254,7 @@ def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
     for option, key in _REWARD_OPTIONS.items():
         if option in options:
             values["reward"][key] = getattr(options, option)
-    from_values(values, shipped.name)  # refuses what an option may have broken
-    learning = {name: getattr(options, name) for name in _LEARNING_OPTIONS}
+    from_values(values, shipped.name)  # rejects an invalid value of an option
     try:
         return msgspec.convert(
             {
@@ -269,7 +263,7 @@ def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
                 "aggregation": options.aggregation,
                 "observation": options.observation,
                 "hidden": options.hidden,
-                "hyperparameters": learning,
+                "hyperparameters": {name: getattr(options, name) for name in _LEARNING_OPTIONS},
                 "seed": options.seed,
                 "episode": 0,
                 "version": __version__,
@@ -294,11 +288,7 @@ def _option(key: str) -> str:
 
 
 def _device(name: str, n_threads: int) -> "torch.device":
-    """The device to compute on.
-
-    Raises:
-        TrainingError: torch is not installed, or has no such device.
-    """
+    """The device to compute on; raises TrainingError without torch or the device."""
     try:
         import torch
     except ModuleNotFoundError:

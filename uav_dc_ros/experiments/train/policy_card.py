@@ -1,10 +1,10 @@
-"""The card of a policy: what it is, how it was made, how it does."""
+"""The card of a policy: its training, evaluation and limits."""
 
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate.evaluation import COLUMNS, TEST_SEEDS, evaluate, rows
-from uav_dc_ros.experiments.train.replay_from_bags import Remembered
+from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay
 
 _ALGORITHMS = {"dqn": "DQN", "dueling_dqn": "Dueling DQN"}
 _LIMITS = {
@@ -23,25 +23,25 @@ def card(
     n_runs: int,
     seconds: float,
     score: float,
-    remembered: Remembered | None = None,
+    prefilled: PrefilledReplay | None = None,
 ) -> str:
     """Text of a policy's README.md.
 
     Args:
-        policy: the policy, as read back.
-        scenario: the world to evaluate in: the one that the command names, without its overrides.
-        command: the exact command that made the policy.
+        policy: as loaded from its folder.
+        scenario: the one that the command names, without its overrides: evaluates the policy.
+        command: that made the policy.
         n_runs: runs that were trained side by side.
         seconds: wall time of the training.
-        score: its score on the validation missions.
-        remembered: recorded flights that its replay buffer began with.
+        score: users brought home in validation.
+        prefilled: recorded flights that the replay buffer began with.
     """
     config, values = policy.config, policy.config.hyperparameters
     hidden = " and ".join(map(str, config.hidden))
     first, last = TEST_SEEDS[0], TEST_SEEDS[-1]
     algorithm, n_users = _ALGORITHMS[config.algorithm], scenario.n_users
     lines = (COLUMNS, ["---"] * len(COLUMNS), *rows(evaluate(policy, scenario)))
-    began = "" if remembered is None else f"\n- the replay buffer began with {remembered}"
+    began = "" if prefilled is None else f"\n- the replay buffer began with {prefilled}"
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"""# {config.name}
 
@@ -80,7 +80,7 @@ met slowly walking users and a line-of-sight channel, in simulation only: no win
 
 
 def checkpoint_card(config: PolicyConfig, score: float, command: str) -> str:
-    """Text of the README.md of a policy that was saved on the way."""
+    """Text of the README.md of a policy saved during training."""
     return f"""# {config.name}, checkpoint
 
 The best policy until episode {config.episode}, from the run with seed {config.seed}. In validation it brought

@@ -1,4 +1,4 @@
-"""What a run of the learner is, and which runs can share one batch. Needs no torch."""
+"""Runs, and populations of runs that train in one batch. Needs no torch."""
 
 from typing import Annotated
 
@@ -16,16 +16,16 @@ from uav_dc_ros.errors import TrainingError
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One run: everything in which it may differ from the others of its population.
+    """All values in which runs of a population may differ.
 
     Attributes:
-        seed: of the run's own generator, which every random number of the run comes from.
-        environment: the users stand at the start of every mission as they do in the mission with this
-            seed; None for a fresh layout in every mission.
+        seed: of the run's own generator, the source of all its random numbers.
+        environment: seed of the mission whose initial users start every mission; None for a fresh layout
+            in every mission.
         algorithm: `dqn` or `dueling_dqn`.
-        aggregation: what the dueling network subtracts; without meaning for `dqn`.
-        reward: what it is paid.
-        hyperparameters: how it learns.
+        aggregation: what the dueling network subtracts; unused by `dqn`.
+        reward: parameters of its reward.
+        hyperparameters: of its learner.
     """
 
     seed: Annotated[int, Meta(ge=0)]
@@ -37,11 +37,11 @@ class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class Population(msgspec.Struct, frozen=True, kw_only=True):
-    """Runs that train side by side, in one batch: they share what gives the arrays their shapes.
+    """Runs that train in one batch: they share what gives the arrays their shapes.
 
     Attributes:
-        scenario: the world of every run; its `reward` is not used.
-        observation: what the agents see.
+        scenario: of every run; its `reward` is not used.
+        observation: input of the agents.
         hidden: units of each hidden layer.
         runs: the N runs.
     """
@@ -69,7 +69,7 @@ class Population(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def layout(environment: int, shape: tuple[int, int]) -> np.ndarray:
-    """Draws for where users start in an environment, float32 `[U, 2]`: as in the mission with that seed."""
+    """Draws for the initial users, float32 `[U, 2]`: those of the mission whose seed is `environment`."""
     return np.random.default_rng(environment).random(shape).astype(np.float32)
 
 

@@ -1,8 +1,6 @@
-"""The live display of a training: bars on a terminal, plain lines in a file."""
+"""The live progress of a training: bars on a terminal, plain lines in a file."""
 
 import time
-from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,56 +10,26 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.train.training import Training
 
-# Episodes of each run that the figures of a `ProgressReport` look back on.
-_LATEST = 20
+_LATEST = 20  # episodes of each run
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProgressReport:
-    """How training stands after an episode; means are over all runs and their latest episodes.
-
-    Attributes:
-        episode: episodes flown by each run.
-        mean_return: what the agents were paid in an episode; NaN while no mission has ended.
-        users_collected: users collected.
-        landing_rate: share of episodes that landed.
-        score: best validation score until now: mean number of users collected, where a mission that
-            did not land counts as none; NaN before the first validation.
-    """
-
-    episode: int
-    mean_return: float
-    users_collected: float
-    landing_rate: float
-    score: float
-
-    @classmethod
-    def of(cls, training: "Training", score: float) -> "ProgressReport":
-        """The report of a training after an episode."""
-        latest = {name: values[-_LATEST:] for name, values in training.curves.items()}
-        known = np.isfinite(latest["reward"])
-
-        def mean(name: str) -> float:
-            return float(latest[name][known].mean()) if known.any() else float("nan")
-
-        return cls(
-            episode=training.n_flown,
-            mean_return=mean("episode_return"),
-            users_collected=mean("users_collected"),
-            landing_rate=mean("landing_rate"),
-            score=score,
-        )
+def latest_means(training: "Training") -> dict[str, float]:
+    """Means of the curves over all runs and their latest 20 episodes; NaN before a mission has ended."""
+    latest = {name: values[-_LATEST:] for name, values in training.curves.items()}
+    ended = np.isfinite(latest["reward"])
+    return {
+        name: float(values[ended].mean()) if ended.any() else float("nan") for name, values in latest.items()
+    }
 
 
 class ProgressDisplay:
-    """Shows reports as they come; a context manager."""
+    """Shows the progress of a training; a context manager."""
 
     def __init__(self, training: "Training", line_every: int) -> None:
-        """For a training, begun or not; away from a terminal, one line every `line_every` episodes."""
+        """For a new or resumed training; without a terminal, one line every `line_every` episodes."""
+        self._training, self._line_every = training, line_every
         self._console = Console(stderr=True)
-        self._line_every = line_every
         self._started, self._first = time.monotonic(), training.n_flown
-        self._steps = len(training.population.runs) * training.population.scenario.mission.max_steps
         self._bars = Progress(
             # Together they fit into 80 columns.
             MofNCompleteColumn(),
@@ -79,18 +47,18 @@ class ProgressDisplay:
         self._bars.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bars.stop()
 
-    def show(self, report: ProgressReport) -> None:
-        """Shows one report; its rate is in agent-steps, each a step and a gradient step of one run."""
-        rate = self._steps * (report.episode - self._first) / (time.monotonic() - self._started)
+    def show(self, score: float) -> None:
+        """Shows the training after an episode, its rate in agent-steps, and its best validation score."""
+        population, episode = self._training.population, self._training.n_flown
+        steps = len(population.runs) * population.scenario.mission.max_steps * (episode - self._first)
+        means = latest_means(self._training)
         text = (
-            f"{rate:,.0f}/s return {report.mean_return:.1f} collected {report.users_collected:.1f} "
-            f"landed {report.landing_rate:.0%} best {report.score:.1f}"
+            f"{steps / (time.monotonic() - self._started):,.0f}/s return {means['episode_return']:.1f} "
+            f"collected {means['users_collected']:.1f} landed {means['landing_rate']:.0%} best {score:.1f}"
         )
-        self._bars.update(self._task, completed=report.episode, text=text)
-        if not self._console.is_terminal and report.episode % self._line_every == 0:
-            self._console.print(f"episode {report.episode} {text}", soft_wrap=True)
+        self._bars.update(self._task, completed=episode, text=text)
+        if not self._console.is_terminal and episode % self._line_every == 0:
+            self._console.print(f"episode {episode} {text}", soft_wrap=True)

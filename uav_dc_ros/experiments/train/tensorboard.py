@@ -1,8 +1,7 @@
-"""Scalars for TensorBoard. Needs torch; and tensorboard, when they are asked for."""
+"""TensorBoard scalars. Needs torch, and tensorboard if a folder is given."""
 
 import math
 from pathlib import Path
-from types import TracebackType
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import TrainingError
@@ -13,7 +12,7 @@ class TensorBoardLog:
     """Writes the curves of every run under `DIR/NAME/seed_S`; writes nothing without a folder."""
 
     def __init__(self, folder: Path | None, name: str, training: Training) -> None:
-        """Scalars of a training, from its next episode on.
+        """Scalars of a training from its next episode on.
 
         Raises:
             TrainingError: tensorboard is not installed, or the folder cannot be written.
@@ -31,7 +30,7 @@ class TensorBoardLog:
             ) from None
         try:
             self._writers = [
-                # What was written after the checkpoint that a training goes on from is taken back.
+                # The purge removes scalars written after the checkpoint that the training resumes from.
                 SummaryWriter(str(folder / name / f"seed_{run.seed}"), purge_step=training.n_flown + 1)
                 for run in training.population.runs
             ]
@@ -41,25 +40,24 @@ class TensorBoardLog:
     def __enter__(self) -> "TensorBoardLog":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for writer in self._writers:
             writer.close()
 
     def add_episode(self) -> None:
-        """Writes the figures of the episode just flown."""
+        """Writes the curves of the last episode."""
         if self._writers:
             for name, values in self._training.curves.items():
                 self._add(f"training/{name}", values[-1])
 
     def add_scores(self, scores: Array) -> None:
-        """Writes what a validation found, `[N]`, and puts everything until now on the disk."""
-        self._add("validation/users_brought_home", scores)
+        """Writes the scores of a validation, `[N]`, and flushes all scalars to the disk."""
+        if self._writers:
+            self._add("validation/users_brought_home", scores)
         for writer in self._writers:
             writer.flush()
 
     def _add(self, name: str, values: Array) -> None:
-        for writer, value in zip(self._writers, values.tolist() if self._writers else [], strict=True):
+        for writer, value in zip(self._writers, values.tolist(), strict=True):
             if not math.isnan(value):
                 writer.add_scalar(name, value, self._training.n_flown)

@@ -1,9 +1,9 @@
-"""Training: N runs side by side, an episode at a time, read from top to bottom.
+"""The training loop: N runs side by side, one episode at a time. Needs torch.
 
-Needs torch. Every random number of a run comes from the run's own numpy generator, drawn for a whole
-episode at once: a run learns the same alone and among others, starts the same on every device, and a GPU
-is not made to wait for the host at every step. Worlds live where it is fastest: in numpy beside a
-learner on the CPU, in torch on any other device. They are the same functions.
+Every random number of a run comes from the run's own numpy generator and is drawn for a whole episode at
+once. So a run learns the same alone and among others, it starts the same on every device, and a GPU does not
+wait for the host at every step. The worlds are in numpy beside a learner on the CPU, and in torch on any
+other device; they are the same functions.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,14 +24,14 @@ from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
 from uav_dc_ros.experiments.train.population import Population, Run, architecture, layout
 from uav_dc_ros.recordings.transitions import Transition
 
-# Makes a run's stream another one than that of the mission with the same seed.
+# Separates a run's stream from that of the mission with the same seed.
 _TRAINING_STREAM = 1
 
 
 def prepare_torch(n_threads: int) -> None:
-    """What every process that trains does first: equal settings give equal results."""
+    """Sets up torch in a process that trains: equal settings give equal results."""
     torch.set_num_threads(n_threads)
-    # Adam's moments of a unit that died fade for ever; as denormal numbers they would slow every step.
+    # Adam's moments of a dead unit decay for ever; as denormal numbers they would slow every step.
     torch.set_flush_denormal(True)
 
 
@@ -39,8 +39,8 @@ class Training:
     """A population between two episodes.
 
     Attributes:
-        population: what is trained.
-        device: where the learner computes.
+        population: the runs.
+        device: of the learner.
         learner: the networks.
         n_flown: episodes flown by each run.
     """
@@ -51,13 +51,7 @@ class Training:
         device: torch.device,
         worlds_in: Literal["numpy", "torch"] | None = None,
     ) -> None:
-        """Runs before their first episode.
-
-        Args:
-            population: the runs.
-            device: where to compute.
-            worlds_in: which library the worlds use; numpy on the CPU, torch elsewhere, unless told.
-        """
+        """Runs before their first episode; the worlds are in numpy on the CPU, else in torch, by default."""
         self.population, self.device = population, device
         self._on_host = (worlds_in or ("numpy" if device.type == "cpu" else "torch")) == "numpy"
         self._rngs = [
@@ -69,9 +63,9 @@ class Training:
         self.learner = Learner([Member(a, run.hyperparameters, rng) for a, run, rng in members], device)
         capacity = population.runs[0].hyperparameters.buffer_size
         self._buffer = ReplayBuffer(len(population.runs), capacity, architectures[0].n_inputs, device)
-        paid = rewards(population.runs, self._world_array)
-        self._worlds = BatchWorld(population.scenario, self._layouts(1)[0], paid)
-        self._books = EpisodeStats(population.scenario, self._worlds.state.total_reward)
+        reward = rewards(population.runs, self._world_array)
+        self._worlds = BatchWorld(population.scenario, self._layouts(1)[0], reward)
+        self._stats = EpisodeStats(population.scenario, self._worlds.state.total_reward)
         self._curves = np.full(
             (population.n_episodes, len(CURVES), len(population.runs)), np.nan, dtype=np.float32
         )
@@ -79,34 +73,30 @@ class Training:
 
     @property
     def curves(self) -> dict[str, Array]:
-        """Figures of every episode flown, float32 `[n_flown, N]` each; see `books.CURVES`."""
+        """Statistics of every episode flown, float32 `[n_flown, N]` each; see `episode_stats.CURVES`."""
         return {name: self._curves[: self.n_flown, i] for i, name in enumerate(CURVES)}
 
     @property
-    def n_remembered(self) -> int:
+    def replay_size(self) -> int:
         """Transitions in the replay buffer of each run."""
         return len(self._buffer)
 
-    def remember(self, transition: Transition) -> None:
+    def add_recorded(self, transition: Transition) -> None:
         """Puts a recorded transition into the replay buffer of every run."""
         n_runs = len(self.population.runs)
         numbers = torch.tensor([transition.action, transition.reward, transition.terminated])
         action, reward, terminated = numbers.to(self.device)[:, None].expand(-1, n_runs)
-
-        def seen(observation: np.ndarray) -> Tensor:
-            return torch.from_numpy(observation).to(self.device).expand(n_runs, -1)
-
-        self._buffer.add(
-            Transitions(
-                seen(transition.observation), action, reward, seen(transition.next_observation), terminated
-            )
+        observation, next_observation = (
+            torch.from_numpy(values).to(self.device).expand(n_runs, -1)
+            for values in (transition.observation, transition.next_observation)
         )
+        self._buffer.add(Transitions(observation, action, reward, next_observation, terminated))
 
-    @torch.inference_mode()  # the gradient is written out, so torch need not keep books for its own
+    @torch.inference_mode()  # the learner computes its own gradient, so autograd need not record
     def fly_episode(self) -> None:
         """T_cons iterations of every run, each one step and one gradient step (algorithms 1 and 2).
 
-        Under `on_arrival` several missions may fit into them.
+        Under `on_arrival` an episode may hold several missions.
         """
         scenario, worlds, kind = self.population.scenario, self._worlds, self.population.observation
         n_steps, on_arrival = scenario.mission.max_steps, scenario.mission.episode_end == "on_arrival"
@@ -121,16 +111,16 @@ class Training:
             reward, terminated = self._tensor(outcome.reward), self._tensor(outcome.terminated)
             self._buffer.add(Transitions(observation, action, reward, next_observation, terminated))
             loss += self.learner.update(self._buffer.sample(replay[t]))
-            self._books.add(worlds.state, outcome)
-            # The device is not asked whether a mission is over: under `at_time_limit` only the last step
-            # ends one, under `on_arrival` every step can.
+            self._stats.add_step(worlds.state, outcome)
+            # Reading from the device which missions ended would make the host wait: under `at_time_limit`
+            # only the last step ends one, under `on_arrival` every step can.
             if on_arrival or t == n_steps - 1:
-                over = outcome.terminated | outcome.truncated
-                self._books.close(over, worlds.state, outcome)
-                worlds.restart(over, starts[t - n_steps])
+                ended = outcome.terminated | outcome.truncated
+                self._stats.end_missions(ended, worlds.state, outcome)
+                worlds.restart(ended, starts[t - n_steps])
                 next_observation = self._tensor(worlds.observe(kind))
             observation = next_observation
-        self._curves[self.n_flown] = [*self._books.take(), (loss / n_steps).cpu().numpy()]
+        self._curves[self.n_flown] = [*self._stats.take(), (loss / n_steps).cpu().numpy()]
         self.n_flown += 1
 
     def _draws(self, n_steps: int) -> tuple[Array, Tensor, Tensor, Tensor]:
@@ -147,19 +137,19 @@ class Training:
         return walks, picks[..., 0], picks[..., 1], picks[..., 2:]
 
     def _layouts(self, n: int) -> Array:
-        """Draws for where users start n times, in each run's environment or anew, `[n, N, U, 2]`."""
+        """Draws for the initial users of n missions, `[n, N, U, 2]`."""
         shape = (self.population.scenario.n_users, 2)
         starts = np.empty((n, len(self.population.runs), *shape), np.float32)
         for i, (rng, run) in enumerate(zip(self._rngs, self.population.runs, strict=True)):
-            own = None if run.environment is None else layout(run.environment, shape)
-            starts[:, i] = rng.random((n, *shape), np.float32) if own is None else own
+            fixed = None if run.environment is None else layout(run.environment, shape)
+            starts[:, i] = rng.random((n, *shape), np.float32) if fixed is None else fixed
         return self._world_array(starts)
 
     def _world_array(self, values: np.ndarray) -> Array:
         return values if self._on_host else torch.from_numpy(values).to(self.device)
 
     def _tensor(self, values: Array) -> Tensor:
-        """What a world says, for the learner; without a copy."""
+        """An array of the worlds for the learner, without a copy."""
         return torch.from_numpy(values) if self._on_host else values
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -168,14 +158,14 @@ class Training:
             "learner": self.learner.state(),
             "buffer": self._buffer.state(),
             "world": {name: torch.as_tensor(v) for name, v in asdict(self._worlds.state).items()},
-            "books": {name: torch.as_tensor(v) for name, v in self._books.state().items()},
+            "books": {name: torch.as_tensor(v) for name, v in self._stats.state().items()},
         }
         arrays = {f"{part}.{name}": v for part, values in parts.items() for name, v in values.items()}
         arrays["curves"] = torch.from_numpy(self._curves[: self.n_flown])
         return arrays, {"n_flown": self.n_flown, "rngs": [rng.bit_generator.state for rng in self._rngs]}
 
     def restore(self, arrays: dict[str, Tensor], values: dict[str, Any]) -> None:
-        """Becomes what gave the state, which had the same population, device and library of worlds."""
+        """Sets what `state` returned for the same population, device and library of worlds."""
 
         def part(name: str) -> dict[str, Tensor]:
             return {key.partition(".")[2]: v for key, v in arrays.items() if key.startswith(f"{name}.")}
@@ -186,7 +176,7 @@ class Training:
         self.learner.restore(part("learner"))
         self._buffer.restore(part("buffer"))
         self._worlds.state = world.State(**in_worlds("world"))
-        self._books.restore(in_worlds("books"))
+        self._stats.restore(in_worlds("books"))
         self.n_flown = values["n_flown"]
         self._curves[: self.n_flown] = arrays["curves"].numpy()
         for rng, state in zip(self._rngs, values["rngs"], strict=True):
@@ -194,14 +184,14 @@ class Training:
 
 
 def rewards(runs: Sequence[Run], array: Callable[[np.ndarray], Array]) -> Rewards:
-    """How each run's world pays, `[N]`."""
+    """The reward parameters of each run's world, `[N]`, converted by `array`."""
     terms = [run.reward for run in runs]
     weights = {
-        name: array(np.array([getattr(one, name) for one in terms], np.float32))
+        name: array(np.array([getattr(term, name) for term in terms], np.float32))
         for name in ("beta", "zeta", "data_scale_bits")
     }
     return Rewards(
         **weights,
-        r_plus=array(np.array([one.r_plus == "exponential" for one in terms])),
-        form=array(np.array([one.form == "episode" for one in terms])),
+        r_plus=array(np.array([term.r_plus == "exponential" for term in terms])),
+        form=array(np.array([term.form == "episode" for term in terms])),
     )
