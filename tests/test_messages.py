@@ -169,7 +169,7 @@ def check_decode(topic: str, text: str | bytes) -> None:
     if isinstance(came, MessageError):
         assert came.reason in ("malformed", "invalid", "oversized")
         assert str(came).isprintable()
-        assert len(str(came)) <= 10 * messages.TOLD_MAX
+        assert len(str(came)) <= 10 * messages.TEXT_MAX
     else:
         assert SCHEMAS[topic].is_valid(json.loads(text))
         assert messages.decode(messages.encode(came), PAYLOADS[topic]) == came
@@ -223,7 +223,7 @@ def test_the_largest_junk_is_refused_at_once(made: Callable[[], bytes]) -> None:
             messages.decode(text, kind)
         assert time.process_time() - began_s < 5.0  # a second or two, for millions of numbers
         assert (
-            len(str(refused.value)) <= 10 * messages.TOLD_MAX
+            len(str(refused.value)) <= 10 * messages.TEXT_MAX
         )  # escapes are longer than what they stand for
 
 

@@ -10,28 +10,30 @@ from tests.support.worlds import tiny
 from uav_dc_ros.errors import PhaseError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.mission.controller import MissionController
-from uav_dc_ros.phases import RESTART, STEERED, TRANSITIONS, Transition, following, impossible
+from uav_dc_ros.phases import OFFBOARD, RESTART, TRANSITIONS, PhaseTransition, next_phases, transition_error
 
 OVER = {phase for phase in Phase if phase.is_over}
 
 
 def test_every_transition_is_there_once_with_its_reason() -> None:
     assert len({edge[:3] for edge in TRANSITIONS}) == len(TRANSITIONS)
-    assert all(isinstance(edge, Transition) and edge.why and edge.steps in (0, 1) for edge in TRANSITIONS)
+    assert all(
+        isinstance(edge, PhaseTransition) and edge.reason and edge.steps in (0, 1) for edge in TRANSITIONS
+    )
     assert {edge.before for edge in TRANSITIONS} == set(Phase) - OVER, "and nothing follows an end"
     assert {edge.after for edge in TRANSITIONS} == set(Phase) - {Phase.IDLE}
 
 
 def test_a_mission_can_be_given_up_in_any_phase() -> None:
     """Else the bridge would find no way out where its phases went wrong, or a pilot took over."""
-    assert all(Phase.ABORTED in following(phase) for phase in set(Phase) - OVER)
-    assert all(Phase.LANDING in following(phase) for phase in STEERED)
+    assert all(Phase.ABORTED in next_phases(phase) for phase in set(Phase) - OVER)
+    assert all(Phase.LANDING in next_phases(phase) for phase in OFFBOARD)
 
 
 def test_another_bridge_may_begin_after_any_phase() -> None:
     for phase in Phase:
-        assert all(set(RESTART) <= set(following(phase, steps, restarts=True)) for steps in (0, 1))
-    assert impossible(Phase.READY, Phase.CONNECTING, 0) is not None, "but not the same one"
+        assert all(set(RESTART) <= set(next_phases(phase, steps, restarts=True)) for steps in (0, 1))
+    assert transition_error(Phase.READY, Phase.CONNECTING, 0) is not None, "but not the same one"
 
 
 @pytest.mark.parametrize("fault", flights.FAULTS)
@@ -39,7 +41,7 @@ def test_flights_keep_to_the_table(fault: str) -> None:
     told = flights.phases(flights.Flight(tiny(), beat=flights.FAULTS[fault][0]).fly())
     for (step, phase, _), (next_step, next_phase, _) in itertools.pairwise(told):
         if (step, phase) != (next_step, next_phase):
-            assert next_phase in following(phase, next_step - step, restarts=fault == "restart")
+            assert next_phase in next_phases(phase, next_step - step, restarts=fault == "restart")
 
 
 def test_what_cannot_follow_is_an_error_in_tests() -> None:

@@ -1,7 +1,7 @@
 """A UAV collects data from IoT users on the ground, steered by a dueling DQN, on ROS 2.
 
-What stands in `__all__` is what users may rely on. Each name is imported when it is first asked for, so that
-flying needs no torch, learning no ROS, and `import uav_dc_ros` next to nothing.
+`__all__` is the public API. Each name is imported on first access: flying needs no torch, and learning no
+ROS.
 """
 
 import importlib
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-# Where each public name is defined; a test holds it equal to the imports for type checkers above.
+# Where each public name is defined; a test compares it with the imports for type checkers above.
 _PUBLIC = {
     "Action": "uav_dc_ros.core.grid:Action",
     "DataCollectionEnv": "uav_dc_ros.env.gym_env:DataCollectionEnv",
@@ -80,32 +80,28 @@ __all__ = [  # noqa: PLE0604, RUF100
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name."""
+    """Import a public name on first access."""
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, attribute = _PUBLIC[name].partition(":")
-    found = getattr(importlib.import_module(module), attribute)
-    globals()[name] = found
-    return found
+    value = getattr(importlib.import_module(module), attribute)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:
-    """Public names first come into being when they are asked for."""
+    """All names, including the public ones that are not imported yet."""
     return sorted({*globals(), *__all__})
 
 
 _REGISTRATION = "uav_dc_ros.env.registration"
 
 
-class _AfterGymnasium(importlib.abc.MetaPathFinder):
-    """Makes the environment known as soon as Gymnasium is imported.
-
-    Gymnasium looks for no plug-ins since its 1.0, and this package does not import it: what flies does not
-    need it.
-    """
+class _RegisterAfterGymnasium(importlib.abc.MetaPathFinder):
+    """Registers the environment when Gymnasium is imported, which has no plug-ins since its 1.0."""
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
-        """Find Gymnasium as the others do, once, and register when it has been imported."""
+        """The spec of Gymnasium, extended by the registration."""
         if name != "gymnasium":
             return None
         sys.meta_path.remove(self)
@@ -125,4 +121,4 @@ class _AfterGymnasium(importlib.abc.MetaPathFinder):
 if sys.modules.get("gymnasium"):
     importlib.import_module(_REGISTRATION)
 else:
-    sys.meta_path.insert(0, _AfterGymnasium())
+    sys.meta_path.insert(0, _RegisterAfterGymnasium())

@@ -1,19 +1,19 @@
-"""The project's exceptions: one small tree, so that a caller can catch all of it with one name."""
+"""The project's exceptions: one small tree with one base class."""
 
 
 class UavDcError(Exception):
-    """Something the user can mend. The message says what was wrong, the value, and what was expected."""
+    """An error that the user can fix. The message states what was wrong, the value, and what was expected."""
 
 
 class ScenarioError(UavDcError):
-    """A scenario that cannot be found, read or believed."""
+    """A scenario that cannot be found or read, or is invalid."""
 
 
 class MessageError(UavDcError):
-    """A payload that is not what its schema says.
+    """A payload that does not match its schema.
 
     Attributes:
-        reason: short, stable name of what was wrong (`malformed`, `invalid`, ...), fit for counting.
+        reason: short, stable name of the error (`malformed`, `invalid`, ...), for counters.
     """
 
     def __init__(self, reason: str, message: str) -> None:
@@ -30,24 +30,24 @@ class BagError(UavDcError):
 
 
 class BagDamagedError(BagError):
-    """A bag that is damaged, or whose recorder was killed: `recover` makes a whole one of the rest."""
+    """A bag that is damaged, or whose recorder was killed; `bag recover` makes a whole one of it."""
 
 
 class ParameterError(UavDcError):
-    """A ROS parameter of a node, or an option of a command, that makes no sense."""
+    """An invalid ROS parameter or command-line option."""
 
 
 class NodeError(UavDcError):
-    """A node that failed, or never appeared, while a mission needed it."""
+    """A node that failed, or did not start, while a mission needed it."""
 
 
 class VehicleError(UavDcError):
-    """A vehicle, or a way to it, that cannot be used."""
+    """A vehicle, or a connection to it, that cannot be used."""
 
 
 class PhaseError(UavDcError):
-    """A phase of a mission that cannot follow the one before: an error of the bridge itself."""
+    """A phase of a mission that cannot follow the one before: a bug in the bridge."""
 
 
 class TrainingError(UavDcError):
-    """A training run that cannot start or go on."""
+    """A training run that cannot start or continue."""

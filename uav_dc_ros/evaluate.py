@@ -1,4 +1,4 @@
-"""`python -m uav_dc_ros.evaluate`: how trained policies do, over many missions."""
+"""`python -m uav_dc_ros.evaluate`: evaluate policies over many missions."""
 
 from uav_dc_ros.experiments.evaluate.cli import main
 

@@ -1,4 +1,4 @@
-"""Payloads to and from the core's arrays. Knows no ROS."""
+"""Conversion between payloads and the core's arrays, and checks of payloads against the scenario."""
 
 import numpy as np
 
@@ -25,11 +25,7 @@ def users(
 
 
 def users_m(payload: messages.Users, scenario: Scenario) -> Array:
-    """Users' positions, metres, `[U, 2]`.
-
-    Raises:
-        MessageError: other users than the scenario's.
-    """
+    """Users' positions, metres, `[U, 2]`; raises MessageError as `check` does."""
     check(payload, scenario)
     return np.asarray([payload.x_m, payload.y_m], dtype=np.float64).T
 
@@ -52,25 +48,33 @@ def rates(
 
 
 def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Array]:
-    """`data_bits` and `collected`, `[U]` each.
-
-    Raises:
-        MessageError: another number of users than the scenario's.
-    """
+    """`data_bits` and `collected`, `[U]` each; raises MessageError as `check` does."""
     check(payload, scenario)
     return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
 
 
 def check(payload: messages.Payload, scenario: Scenario) -> None:
-    """Refuse a payload of another world.
+    """Reject a payload of another world.
 
     Raises:
         MessageError: a mission with another fingerprint, a cell outside the grid, or more steps than the
-            battery allows; users, or rates of them, that are not the scenario's.
+            battery allows; users, or rates of users, other than the scenario's.
     """
     match payload:
+        case messages.Mission() if payload.fingerprint != scenario.fingerprint:
+            raise MessageError(
+                "scenario",
+                f"the mission flies {payload.scenario!r} ({payload.fingerprint}); expected "
+                f"{scenario.name!r} ({scenario.fingerprint}): start this node with the mission's scenario",
+            )
         case messages.Mission():
-            _check_mission(payload, scenario)
+            outside = any(i > last for i, last in zip(payload.cell, scenario.grid.last_cell, strict=True))
+            if outside or payload.remaining_steps > scenario.mission.max_steps:
+                raise MessageError(
+                    "layout",
+                    f"cell {payload.cell}, {payload.remaining_steps} remaining steps; expected a cell up to "
+                    f"{scenario.grid.last_cell} and at most {scenario.mission.max_steps} steps",
+                )
         case messages.Users() if payload.cluster != scenario.user_cluster.tolist():
             raise MessageError(
                 "layout",
@@ -82,19 +86,3 @@ def check(payload: messages.Payload, scenario: Scenario) -> None:
                 "layout",
                 f"{len(payload.data_bits)} users; expected the {scenario.n_users} of {scenario.name!r}",
             )
-
-
-def _check_mission(payload: messages.Mission, scenario: Scenario) -> None:
-    if payload.fingerprint != scenario.fingerprint:
-        raise MessageError(
-            "scenario",
-            f"the mission flies {payload.scenario!r} ({payload.fingerprint}); expected "
-            f"{scenario.name!r} ({scenario.fingerprint}): start this node with the mission's scenario",
-        )
-    beyond = any(index > last for index, last in zip(payload.cell, scenario.grid.last_cell, strict=True))
-    if beyond or payload.remaining_steps > scenario.mission.max_steps:
-        raise MessageError(
-            "layout",
-            f"cell {payload.cell}, {payload.remaining_steps} remaining steps; expected a cell up to "
-            f"{scenario.grid.last_cell} and at most {scenario.mission.max_steps} steps",
-        )

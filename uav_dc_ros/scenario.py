@@ -20,14 +20,12 @@ def parser() -> cli.Parser:
     options = cli.Parser(prog=PROG, description="List, show and check scenarios.")
     verbs = options.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("list", help="the shipped scenarios", description="The shipped scenarios.")
-    show = verbs.add_parser(
-        "show", help="a scenario as TOML, to begin one of your own with", description="A scenario as TOML."
-    )
+    show = verbs.add_parser("show", help="a scenario as TOML", description="A scenario as TOML.")
     show.add_argument("scenario", metavar="NAME|FILE")
-    check = verbs.add_parser(
-        "check", help="tell whether a file can be flown", description="Tell whether a file can be flown."
+    check = "check that a scenario is valid, and list the policies that fit"
+    verbs.add_parser("check", help=check, description=f"{check.capitalize()}.").add_argument(
+        "scenario", metavar="FILE|NAME"
     )
-    check.add_argument("scenario", metavar="FILE|NAME")
     return options
 
 
@@ -42,7 +40,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
         if options.verb == "list":
             for name in scenarios.names():
-                print(f"{name}: {_told(scenarios.load(name))}")
+                print(f"{name}: {_description(scenarios.load(name))}")
             return 0
         scenario = scenarios.load(options.scenario)
         if options.verb == "show":
@@ -50,7 +48,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             text = files(scenarios) / f"{options.scenario}.toml" if shipped else Path(options.scenario)
             print(text.read_text("utf-8"), end="")
             return 0
-        print(f"{options.scenario}: {_told(scenario)}")
+        print(f"{options.scenario}: {_description(scenario)}")
         fitting = []
         for name in policies.names():
             try:
@@ -64,8 +62,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     cli.run(command, PROG)
 
 
-def _told(scenario: "Scenario") -> str:
-    """A scenario in a line."""
+def _description(scenario: "Scenario") -> str:
     grid, mission = scenario.grid, scenario.mission
     return (
         f"{scenario.n_users} users in {scenario.n_clusters} clusters, "

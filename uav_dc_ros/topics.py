@@ -1,20 +1,19 @@
-"""The topics, one row each: the only list. Names are relative, so a namespace carries a whole mission.
+"""The topics, one row each: the only list. Names are relative: a namespace contains a whole mission.
 
-Quality of service, with reasons:
+Quality of service:
 
-- *Offered reliable*: a lost message would leave a hole in a bag and make a lockstep wait. Only `clock` is
-  offered best effort, as everywhere in ROS: the next one is worth more than a lost one.
-- *Asked best effort*: poses and the clock. An autopilot's bridge publishes its pose best effort, and a
-  subscription that asks for more than is offered hears nothing. (The recorder asks for what is offered.)
-- *Latched* (transient local): what describes the state, so that whoever joins late, or again, learns it at
-  once. A pose is not latched, since an autopilot's is not; a move is not, since an old one is worth nothing.
-- *Depth*: publishers keep as much as a node that was restarted, or a reader that fell behind, may want to
-  catch up on. Payloads with an entry per user can be large: of those no more are kept than 64 MiB hold, and
-  at least ten. Who acts on messages keeps the newest hundred; who must miss nothing keeps all: see
-  `hears_all` in the node table.
+- *Reliable* publishers: a lost message leaves a hole in a bag and blocks a lockstep. Only `clock` is best
+  effort.
+- *Best-effort* subscriptions: poses and the clock. An autopilot publishes its pose best effort, which a
+  reliable subscription does not match. (The recorder requests what is offered.)
+- *Latched* (transient local): state that a late or restarted subscriber needs. Not a pose, since an
+  autopilot's is not; not a move, since an old one is useless.
+- *Depth*: publishers keep messages for restarted and slow subscribers. Payloads with an entry per user can be
+  large: publishers keep at least ten, and at most as many as 64 MiB hold. Subscriptions keep the newest
+  hundred, or all (`hears_all` in the node table).
 
-Every policy can be overridden for each node, the ROS way: parameters `qos_overrides./TOPIC.publisher.*` and
-`qos_overrides./TOPIC.subscription.*` with `history`, `depth`, `reliability`, `durability`.
+ROS parameters `qos_overrides./TOPIC.publisher.*` and `qos_overrides./TOPIC.subscription.*` override
+`history`, `depth`, `reliability` and `durability` for each node.
 """
 
 from dataclasses import dataclass
@@ -27,21 +26,20 @@ class Topic:
     Attributes:
         name: relative name.
         type: ROS 2 message type; `std_msgs/msg/String` holds a JSON payload, see messages.PAYLOADS.
-        reliable: reliability offered by publishers.
-        asks_reliable: reliability asked for by subscriptions.
-        latched: durability transient local instead of volatile, offered and asked for.
+        reliable: reliability that publishers offer.
+        requests_reliable: reliability that subscriptions request.
+        latched: durability transient local, offered and requested; otherwise volatile.
         depth: messages that a publisher keeps.
-        lease_s: liveliness lease that publishers offer, seconds: they assert their liveliness within it, for
-            who asks for that (see `nodes.ros.liveliness`); None: none is offered, and one that was killed is
-            missed after tens of seconds.
-        recorded: does the recorder write it?
-        exclusive: does a mission have one publisher of it, and none beside it?
+        lease_s: liveliness lease duration that publishers offer, seconds; see `nodes.ros.liveliness`. Without
+            one, a killed publisher is detected after tens of seconds.
+        recorded: whether the recorder writes it.
+        exclusive: whether a mission has exactly one publisher of it.
     """
 
     name: str
     type: str
     reliable: bool = True
-    asks_reliable: bool = True
+    requests_reliable: bool = True
     latched: bool = False
     depth: int = 1000
     lease_s: float | None = None
@@ -49,10 +47,10 @@ class Topic:
     exclusive: bool = False
 
 
-# What flies: the world node's own vehicle, or the way to a real one.
+# The world node's simulated vehicle, and the interfaces to a real one.
 SIMULATED = "simulated"
 VEHICLES = ("mavlink", "mavros", "px4")
-SYSTEM_MAX = 255  # the highest number that a vehicle has on MAVLink
+SYSTEM_MAX = 255  # highest MAVLink system number
 
 JSON = "std_msgs/msg/String"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -64,7 +62,7 @@ CLOCK = "rosgraph_msgs/msg/Clock"
 TOPICS: dict[str, Topic] = {
     topic.name: topic
     for topic in (
-        Topic(name="pose", type=POSE, asks_reliable=False, exclusive=True),
+        Topic(name="pose", type=POSE, requests_reliable=False, exclusive=True),
         Topic(name="users", type=JSON, latched=True, depth=500, exclusive=True),
         Topic(name="rates", type=JSON, latched=True, depth=500, exclusive=True),
         Topic(name="mission", type=JSON, latched=True, exclusive=True),
@@ -78,7 +76,7 @@ TOPICS: dict[str, Topic] = {
             name="clock",
             type=CLOCK,
             reliable=False,
-            asks_reliable=False,
+            requests_reliable=False,
             depth=1,
             recorded=False,
             exclusive=True,

@@ -295,7 +295,7 @@ class AutopilotBridge(MissionNode):
             mission=0,
             step=bridge.step,
             phase=bridge.phase,
-            reason=messages.told(waits or bridge.reason),
+            reason=messages.one_line(waits or bridge.reason),
             held=bridge.fault_kind is not None,
             fault=bridge.fault_kind,
             cell=bridge.cell,

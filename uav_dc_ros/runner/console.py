@@ -14,7 +14,7 @@ from uav_dc_ros.cli import Output
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
-from uav_dc_ros.phases import DECIDED
+from uav_dc_ros.phases import POLICY_CONTROLLED
 from uav_dc_ros.runner.monitor import MissionProgress
 
 REFRESH_S = 0.05
@@ -74,8 +74,8 @@ class MissionConsole:
         if not status.reason or (before is not None and told == (before.state, before.reason)):
             return
         self._told = status
-        goes_on = before is not None and before.phase in DECIDED and not before.held
-        if status.phase in DECIDED and not status.held and goes_on:
+        goes_on = before is not None and before.phase in POLICY_CONTROLLED and not before.held
+        if status.phase in POLICY_CONTROLLED and not status.held and goes_on:
             return
         self._bar.update(self._task, description=status.phase.value)
         self.console.print(f"{status.state}: {status.reason}", markup=False)

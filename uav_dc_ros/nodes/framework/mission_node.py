@@ -198,7 +198,7 @@ class MissionNode(ManagedNode):
             return False
         if data.startswith(self._given_run, CDR_HEAD):
             return False
-        other = messages.run_of(data[CDR_HEAD:].rstrip(b"\0"))
+        other = messages.read_run(data[CDR_HEAD:].rstrip(b"\0"))
         if other is None:
             return False  # whoever decodes it refuses it
         try:

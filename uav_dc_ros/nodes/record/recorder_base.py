@@ -151,9 +151,9 @@ class RecorderBase(MissionNode):
         hearing = AdaptiveSubscription(self, name, topic.type, self._hear(name, topic.name, topic))
         override = f"qos_overrides.{name}.subscription."
         overridden = any(given.startswith(override) for given in rclpy_private.overrides(self))
-        all_of_it = replace(topic, asks_reliable=topic.reliable)
+        all_of_it = replace(topic, requests_reliable=topic.reliable)
         subscription = self.create_raw_subscription(all_of_it, hearing.callback)
-        hearing.add(subscription, adapts=not (topic.asks_reliable or overridden))
+        hearing.add(subscription, adapts=not (topic.requests_reliable or overridden))
         self._hearings[name] = hearing
         return hearing.subscription
 

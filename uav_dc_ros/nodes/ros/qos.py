@@ -72,7 +72,7 @@ def requested(topic: Topic, *, all: bool) -> QoSProfile:
     """The QoS that a subscription asks for; `all` as in the node table's `hears_all`."""
     profile = offered(replace(topic, lease_s=None))  # who wants a lease is deaf to those without
     profile.depth = NEWEST
-    if not topic.asks_reliable:
+    if not topic.requests_reliable:
         profile.reliability = ReliabilityPolicy.BEST_EFFORT
     if all:
         profile.history = HistoryPolicy.KEEP_ALL

@@ -31,7 +31,7 @@ from uav_dc_ros.offboard.mission.preflight import Preflight, rival
 from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, Dwell, MissionProgress
 from uav_dc_ros.offboard.mission.stall_detector import StallDetector
 from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, TakeOff, Telemetry
-from uav_dc_ros.phases import DECIDED, FLYING, GROUND, STEERED, impossible
+from uav_dc_ros.phases import FLYING, GROUND, OFFBOARD, POLICY_CONTROLLED, transition_error
 
 POLICY_IS_GONE = "the policy is gone"
 
@@ -115,7 +115,7 @@ class MissionController:
     @property
     def fault_kind(self) -> FaultKind | None:
         """The kind of the fault that holds the vehicle; None: nothing holds it."""
-        if self.phase not in STEERED:
+        if self.phase not in OFFBOARD:
             return None
         if self._hold.fault is not None:
             return self._hold.fault.kind
@@ -183,7 +183,7 @@ class MissionController:
             known: of the vehicle, if no tick has told of it yet.
         """
         known = known or self._known
-        if self.phase in STEERED:
+        if self.phase in OFFBOARD:
             self._give_up(why)
         elif self.phase in GROUND and self._is_to_come_down(known):
             self._known = known
@@ -227,9 +227,9 @@ class MissionController:
             self._taken = True
             self._end(Phase.ABORTED, why)
             return []
-        if self._hold.fault is not None and self.phase in STEERED:
+        if self._hold.fault is not None and self.phase in OFFBOARD:
             return []  # hold: the setpoint stays
-        if self.phase in DECIDED and not self._policy_lives(known):
+        if self.phase in POLICY_CONTROLLED and not self._policy_lives(known):
             return []
         commands = {
             Phase.CONNECTING: self._connect,
@@ -294,7 +294,7 @@ class MissionController:
             self._give_up(f"the vehicle is outside the fence: {breach}")
             return
         fault = self._watched.fault(now_s, known)
-        if fault is None and self.phase in DECIDED:
+        if fault is None and self.phase in POLICY_CONTROLLED:
             fault = self._tracking.fault(known, self.phase is Phase.MOVING and not self.policy_is_gone)
         match self._hold.look(now_s, known, fault):
             case "begins" | "turns":
@@ -434,13 +434,13 @@ class MissionController:
             self.setpoint = before
 
     def _enter(self, phase: Phase, why: str) -> None:
-        if (error := impossible(self.phase, phase, self.step - self._entered_step)) is not None:
+        if (error := transition_error(self.phase, phase, self.step - self._entered_step)) is not None:
             self._refuse(error)
             return
         self.phase, self._since_s, self._entered_step = phase, self._now_s, self.step
         self._dwell.begin()
         self._tracking.begin()
-        self._crash.begin(flies=phase in DECIDED)
+        self._crash.begin(flies=phase in POLICY_CONTROLLED)
         self._patience.gone_since = None
         self._since_steady_s = self._steady_s
         self._asked.begin()
@@ -452,7 +452,7 @@ class MissionController:
         if self.is_strict:
             raise error
         self._entered_step = self.step  # within a step, each phase may come down or end
-        if self.phase in STEERED:
+        if self.phase in OFFBOARD:
             self._give_up(f"an error of the bridge: {error}")
         elif self.phase in GROUND:
             self._end(Phase.ABORTED, f"an error of the bridge: {error}")

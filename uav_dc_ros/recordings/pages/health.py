@@ -8,7 +8,7 @@ import numpy as np
 from uav_dc_ros import topics
 from uav_dc_ros.bags.message_definitions import TYPESTORE
 from uav_dc_ros.bags.read import BagMessage, BagReader
-from uav_dc_ros.messages import TOLD_MAX, Phase
+from uav_dc_ros.messages import TEXT_MAX, Phase
 from uav_dc_ros.recordings.mission_totals import UNFINISHED
 from uav_dc_ros.recordings.pages.diagnostics import Node, Report
 from uav_dc_ros.recordings.pages.missions import Flown
@@ -185,4 +185,4 @@ class Health:
     def _fault(self, at_ns: int, who: str, what: str) -> None:
         self._n_faults += 1
         if len(self._faults) < FAULTS_MAX:
-            self._faults.append((at_ns, who[:TOLD_MAX], what[:TOLD_MAX]))
+            self._faults.append((at_ns, who[:TEXT_MAX], what[:TEXT_MAX]))

@@ -12,7 +12,7 @@ import numpy as np
 
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.phases import following
+from uav_dc_ros.phases import next_phases
 from uav_dc_ros.recordings.recorded_step import RecordedStep, Told
 from uav_dc_ros.recordings.verify.differences import Book, Difference, difference
 
@@ -116,12 +116,12 @@ class Flights(Book):
         found = []
         may_come: tuple[Phase, ...] | None = None
         if before is not None:
-            may_come = following(before.phase, steps=1, restarts=True)
+            may_come = next_phases(before.phase, steps=1, restarts=True)
         for told in step.phases:
             if may_come is not None and told.phase not in may_come:
                 expected = ", ".join(may_come)
                 found.append(difference(step, "mission", "phase", told.phase.value, f"one of {expected}"))
-            may_come = following(told.phase, restarts=True)
+            may_come = next_phases(told.phase, restarts=True)
         return found
 
     def _time(self, step: RecordedStep) -> list[Difference]:
