@@ -20,7 +20,7 @@ from uav_dc_ros import files, run_all, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.ros import liveliness
-from uav_dc_ros.offboard import datums, send_timer
+from uav_dc_ros.offboard import datums, setpoint_stream
 from uav_dc_ros.offboard.mavlink import systems
 from uav_dc_ros.offboard.mavlink.connection import Address
 from uav_dc_ros.offboard.mission import geofence
@@ -167,7 +167,11 @@ def test_every_parameter_in_the_text_is_the_bridge_s() -> None:
 
 def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert f"system {systems.SYSTEM}, component {systems.COMPONENT}" in GUIDE
-    assert (send_timer.STREAM_S, send_timer.HEARTBEAT_S, send_timer.LIFE_S) == (1 / 20, 1.0, 1.0)
+    assert (setpoint_stream.STREAM_S, setpoint_stream.HEARTBEAT_S, setpoint_stream.STREAM_TIMEOUT_S) == (
+        1 / 20,
+        1.0,
+        1.0,
+    )
     assert "streams the setpoint 20 times a second" in GUIDE
     assert "end a second after its last decision" in GUIDE
     assert geofence.MARGIN_M == 20.0

@@ -116,7 +116,7 @@ def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) 
     assert status == 0, output
     assert "Traceback" not in output
     kept = json.loads(next((ros.folder / "state").rglob("*.json")).read_text())
-    assert f"the grid's corner lies at {kept['datum']}, from where the vehicle stands; no earlier" in output
+    assert f"the grid's corner lies at {kept['datum']}, from the vehicle's position; no earlier" in output
     told = json.loads(summary.read_text())
     assert (told["outcome"], told["steps"], told["seed"]) == ("landed", steps, 3)
     assert told["reason"].startswith(f"step {steps}: at the dock")

@@ -96,7 +96,7 @@ def made(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> Iterator[Made]:
     """A bridge that waits for a lifecycle manager, with nobody else to wait for."""
     vehicle = Stub()
     monkeypatch.setattr(vehicles, "make", lambda *_: vehicle)
-    monkeypatch.setattr(bridge, "run_when_due", lambda: None)
+    monkeypatch.setattr(bridge, "use_realtime_priority", lambda: None)
     monkeypatch.setenv("XDG_STATE_HOME", str(ros.folder / "state"))
     with node_in(ros, "-p", "connect:=tcp:127.0.0.1:1", "-p", "peers:=[bridge]") as (_, executor):
         node = AutopilotBridge()

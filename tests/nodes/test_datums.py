@@ -40,7 +40,7 @@ def test_who_arms_says_where_the_grid_lies() -> None:
     expected = r"arm: without a datum; expected one with it: here \(.*\), last \(.*\) or LAT,LON,ALT"
     with pytest.raises(ParameterError, match=f"{expected}$"):
         check("--arm")
-    datums.keep(FIVE, DATUM, "mavlink")
+    datums.save(FIVE, DATUM, "mavlink")
     with pytest.raises(ParameterError, match=f"{expected}; the last flight's: {FLIGHT}$"):
         check("--arm")
     for given in ((), ("--arm", "--datum", "here"), ("--arm", "--datum", "last")):
@@ -51,10 +51,10 @@ def test_who_arms_says_where_the_grid_lies() -> None:
 
 def test_the_last_flight_s_is_that_of_the_same_world() -> None:
     assert datums.last(FIVE) is None
-    with pytest.raises(ParameterError, match=r"'last'; no flight in this world .* is kept in .*datums"):
+    with pytest.raises(ParameterError, match=r"'last'; .*datums has no flight in this world .*"):
         check("--datum", "last")
-    datums.keep(FIVE, DATUM, "mavlink")
-    datums.keep(THREE, DATUM.at(Enu(10.0, 0.0, 0.0)), "px4")
+    datums.save(FIVE, DATUM, "mavlink")
+    datums.save(THREE, DATUM.at(Enu(10.0, 0.0, 0.0)), "px4")
     assert datums.parse("last", FIVE, "px4") == DATUM
     assert datums.parse("last", THREE, "mavlink") != DATUM
     for here in ("here", ""):
@@ -62,36 +62,35 @@ def test_the_last_flight_s_is_that_of_the_same_world() -> None:
 
 
 def test_a_flight_through_mavros_has_no_altitude_for_the_others() -> None:
-    datums.keep(FIVE, DATUM, "mavros")
+    datums.save(FIVE, DATUM, "mavros")
     assert datums.parse("last", FIVE, "mavros") == DATUM
     with pytest.raises(ParameterError, match=f"reports no altitude above mean sea level: {FLIGHT}; expected"):
         datums.parse("last", FIVE, "mavlink")
 
 
 def test_a_grid_that_moves_is_seen() -> None:
-    told, moved = datums.described(DATUM, "here", FIVE)
+    told, moved = datums.describe(DATUM, "here", FIVE)
     assert (moved, told) == (
         False,
-        f"the grid's corner lies at {DATUM}, from where the vehicle stands; no earlier flight in this world "
-        "is kept",
+        f"the grid's corner lies at {DATUM}, from the vehicle's position; no earlier flight in this world",
     )
-    datums.keep(FIVE, DATUM, "mavlink")
-    told, moved = datums.described(DATUM.at(Enu(200.0, -200.0, 0.0)), "here", FIVE)
+    datums.save(FIVE, DATUM, "mavlink")
+    told, moved = datums.describe(DATUM.at(Enu(200.0, -200.0, 0.0)), "here", FIVE)
     assert moved
     assert re.search(r"; 200\.0 m east and 200\.0 m south of that of the last flight \(20", told)
-    told, moved = datums.described(DATUM, "last", FIVE)
+    told, moved = datums.describe(DATUM, "last", FIVE)
     assert not moved
     assert ", as in the last flight; 0.0 m east and 0.0 m north of that" in told
 
 
 def test_a_broken_file_is_told_and_stops_nobody_who_names_the_place(state: Path) -> None:
-    datums.keep(FIVE, DATUM, "mavlink")
+    datums.save(FIVE, DATUM, "mavlink")
     (file,) = state.rglob("*.json")
     for broken in (b"", b"{}", b'{"scenario": "x", "datum": "x", "vehicle": "x", "time": "x"}', b"\xff"):
         file.write_bytes(broken)
         with pytest.raises(ParameterError, match=f"datum of the last flight, {file}: .*; expected it whole"):
             check("--datum", "last")
-        assert datums.described(DATUM, "here", FIVE)[1], "it may have moved"
+        assert datums.describe(DATUM, "here", FIVE)[1], "it may have moved"
         check("--arm", "--datum", "here")
         with pytest.raises(ParameterError, match="arm: without a datum"):
             check("--arm")
@@ -108,4 +107,4 @@ def test_where_it_is_kept(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (state / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(state / "file"))
     with pytest.raises(NodeError, match="cannot be made: Not a directory"):
-        datums.keep(FIVE, DATUM, "mavlink")
+        datums.save(FIVE, DATUM, "mavlink")

@@ -26,7 +26,7 @@ from uav_dc_ros.offboard.mavros.diagnostics import OTHERS_S
 from uav_dc_ros.offboard.mavros.telemetry import MavrosTelemetry
 from uav_dc_ros.offboard.mavros.vehicle_time import PATIENCE_S, VehicleTime
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
-from uav_dc_ros.offboard.setpoint_stream import LIFE_S, SetpointStream
+from uav_dc_ros.offboard.setpoint_stream import STREAM_TIMEOUT_S, SetpointStream
 from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, TakeOff
 
 PLACE = Enu(20.0, 0.0, 0.0)
@@ -134,7 +134,7 @@ def test_without_a_datum_the_fix_says_where_the_grid_came_to_lie() -> None:
     hearing.on_fix(True, stands.latitude_deg, stands.longitude_deg, 1.2)
     hearing.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 100.2, 1.3)
     assert hearing.corner is not None
-    assert hearing.corner.seen_from(corner) == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
+    assert hearing.corner.enu_from(corner) == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
     assert hearing.position == PLACE
 
 
@@ -585,12 +585,12 @@ def test_the_stream_keeps_its_pace_sends_news_at_once_and_ends_with_those_who_de
     before_s = time.monotonic()
     stream.set_setpoint("b")
     after_s = time.monotonic()
-    time.sleep(LIFE_S + 2.0)
+    time.sleep(STREAM_TIMEOUT_S + 2.0)
     of_a = [at_s for at_s, target in sent if target == "a"]
     of_b = [at_s for at_s, target in sent if target == "b"]
     assert np.median(np.diff(of_b)) == pytest.approx(0.05, abs=0.02)
     assert 1 <= len(of_a) <= (before_s - began_s) / 0.05 + 3
-    assert before_s + LIFE_S - 1.0 < of_b[-1] < after_s + LIFE_S + 1.5
+    assert before_s + STREAM_TIMEOUT_S - 1.0 < of_b[-1] < after_s + STREAM_TIMEOUT_S + 1.5
     stream.set_setpoint(None)
     time.sleep(0.05)
     count = len(sent)

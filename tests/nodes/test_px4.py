@@ -33,7 +33,7 @@ from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.px4 import telemetry
 from uav_dc_ros.offboard.px4.telemetry import Px4Telemetry
-from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S
+from uav_dc_ros.offboard.setpoint_stream import STREAM_S, STREAM_TIMEOUT_S
 from uav_dc_ros.offboard.vehicle import Arm, Mode, SetMode, TakeOff, Telemetry
 
 # One worker builds the messages, once.
@@ -311,7 +311,7 @@ def test_the_grid_has_a_datum_once_px4_knows_the_earth(msg: Any) -> None:
     hearing.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
     datum = Geodetic.parse(hearing.grid_origin)
     # PX4 counts from a point 3 m south and 2 m east of where the vehicle stands, half a metre above it.
-    assert ZURICH.seen_from(datum) == pytest.approx((2.0, -3.0, 0.5), abs=1e-5)
+    assert ZURICH.enu_from(datum) == pytest.approx((2.0, -3.0, 0.5), abs=1e-5)
     known = hearing.telemetry().position
     assert known == pytest.approx(PLACE, abs=1e-5)
     # PX4 moves its origin 40 m to the east in flight: the same place has other numbers from then on.
@@ -391,7 +391,7 @@ def test_the_stream_ends_a_second_after_those_who_decide(
     last_ns = time.time_ns()
     spun.pass_time(3.5, hand.say)
     for heard in (hand.heartbeats, hand.setpoints):  # best effort: the last ones may be lost on their way
-        assert 0.5 * LIFE_S <= (heard[-1][0] - last_ns) / 1e9 <= LIFE_S + 0.2
+        assert 0.5 * STREAM_TIMEOUT_S <= (heard[-1][0] - last_ns) / 1e9 <= STREAM_TIMEOUT_S + 0.2
     before = len(hand.heartbeats)
     spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.set_setpoint(goal)))
 
@@ -814,7 +814,7 @@ def test_when_nobody_decides_any_more_px4_takes_it_home(flight: Flight) -> None:
     flight.until(lambda: flight.bridge.step == 2)
     before_s = time.monotonic()
     flight.spun.until(lambda: flight.fake.all("mode")[-1]["mode"] == 5)
-    assert LIFE_S <= time.monotonic() - before_s + 0.2 < LIFE_S + 3.0
+    assert STREAM_TIMEOUT_S <= time.monotonic() - before_s + 0.2 < STREAM_TIMEOUT_S + 3.0
     assert flight.fake.all("mode")[-1]["why"] == "failsafe"
     flight.finish()
     phase, _, why = flight.log[-1]

@@ -79,7 +79,7 @@ def test_of_two_autopilots_on_a_link_none_is_taken_unless_one_is_named() -> None
     assert "waiting for its heartbeats, and for those of others" in str(other.heartbeat(PX4_STACK).missing)
     two = "2 autopilots on this link: system 2, PX4; system 1, ArduCopter; expected --system N, one of them"
     known = ours.heartbeat()
-    assert (known.missing, known.is_meant) == (two, False)
+    assert (known.missing, known.is_selected) == (two, False)
     other.now_s = ours.now_s = 5.0
     ours.heartbeat()
     assert other.heartbeat(PX4_STACK).missing == two
@@ -87,7 +87,7 @@ def test_of_two_autopilots_on_a_link_none_is_taken_unless_one_is_named() -> None
     other.now_s = 16.0
     for _ in range(4):
         known = other.heartbeat(PX4_STACK)
-    assert known.is_meant
+    assert known.is_selected
     assert "has not sent" in str(known.missing), "the other one is gone"
 
 

@@ -20,7 +20,7 @@ from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address, ConnectionLost
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
-from uav_dc_ros.offboard.send_timer import LIFE_S, Heartbeat
+from uav_dc_ros.offboard.setpoint_stream import STREAM_TIMEOUT_S, Heartbeat
 from uav_dc_ros.offboard.vehicle import Arm, Limits, Mode, SetMode, TakeOff, Telemetry
 
 HOME = Geodetic(latitude_deg=47.397742, longitude_deg=8.545594, altitude_m=488.0)
@@ -107,14 +107,14 @@ def test_nothing_here_imports_pymavlink_unless_it_is_used() -> None:
 
 @pytest.mark.parametrize("dialect", [ARDUCOPTER, PX4], ids=lambda dialect: dialect.name)
 def test_a_mode_that_is_asked_for_is_the_one_that_is_understood(dialect: Any) -> None:
-    for mode, custom_mode in dialect.asked.items():
+    for mode, custom_mode in dialect.custom_modes.items():
         assert dialect.mode(custom_mode) is mode
         main, sub = dialect.mode_parameters(mode)
         assert custom_mode in (int(main), int(main) << 16 | int(sub) << 24)
         assert not dialect.mode_name(custom_mode).startswith("0x")
     names = {value: entry.name for value, entry in mav.enums["COPTER_MODE"].items()}
     if dialect is ARDUCOPTER:
-        for number, name in dialect.names.items():
+        for number, name in dialect.mode_names.items():
             assert names[number] == f"COPTER_MODE_{name}"
 
 
@@ -169,7 +169,7 @@ def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told
         # Not exactly: the plane at the grid's corner is no longer level half a kilometre away (0.02 m).
         assert known.position == pytest.approx(place, abs=0.05)
         assert vehicle.grid_origin
-        assert HOME.seen_from(Geodetic.parse(vehicle.grid_origin)) == pytest.approx(place, abs=0.05)
+        assert HOME.enu_from(Geodetic.parse(vehicle.grid_origin)) == pytest.approx(place, abs=0.05)
         assert vehicle.kind == "PX4"
 
 
@@ -182,7 +182,7 @@ def test_the_stream_ends_with_those_who_decide() -> None:
         assert known.position is not None
         before = autopilot.report()["setpoints"]
         until(vehicle, lambda known: autopilot.report()["setpoints"] > before, known.position)
-        ends_s = time.monotonic() + LIFE_S + 60.0
+        ends_s = time.monotonic() + STREAM_TIMEOUT_S + 60.0
         last, still_s = -1, 0.0
         while still_s < 0.5:  # ten setpoints long
             assert time.monotonic() < ends_s, "nobody decides any more"
@@ -234,7 +234,7 @@ def test_a_simulated_vehicle_that_is_faster_than_the_clock_misses_no_heartbeat()
         target = hover(autopilot, vehicle)
         begun_s = vehicle.telemetry().vehicle_s
         known = until(vehicle, lambda known: known.vehicle_s > begun_s + 40.0, target)
-        assert known.mode_name == "GUIDED", known.said
+        assert known.mode_name == "GUIDED", known.status_text
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])

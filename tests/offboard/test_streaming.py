@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.fake_autopilot.streaming import off_beat_ms
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
-from uav_dc_ros.offboard.realtime import run_when_due
+from uav_dc_ros.offboard.realtime import use_realtime_priority
 
 AIM_MS = 10.0
 
@@ -17,7 +17,7 @@ AIM_MS = 10.0
 def _may() -> bool:
     """Does this machine let a thread run when it is due; asked in a thread that ends then."""
     answers: list[bool] = []
-    thread = threading.Thread(target=lambda: answers.append(run_when_due()))
+    thread = threading.Thread(target=lambda: answers.append(use_realtime_priority()))
     thread.start()
     thread.join()
     return answers[0]
@@ -53,7 +53,7 @@ def test_what_is_started_from_a_thread_that_runs_when_due_is_ordinary() -> None:
     seen: dict[str, int] = {}
 
     def look() -> None:
-        run_when_due()
+        use_realtime_priority()
         seen["asked"] = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
         child = threading.Thread(target=lambda: seen.update(thread=os.sched_getscheduler(0)))
         child.start()

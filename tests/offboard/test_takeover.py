@@ -249,7 +249,7 @@ def test_a_bridge_that_is_stopped_lets_one_of_several_vehicles_alone() -> None:
     vehicle.pass_time(0.1, None)
     flight = Flight(vehicle=vehicle)
     for _ in range(20):
-        flight.tick(known=dataclasses.replace(vehicle.told, is_meant=False))
+        flight.tick(known=dataclasses.replace(vehicle.told, is_selected=False))
     flight.bridge.stop("the bridge was stopped")
     flight.run(1.0)
     assert (vehicle.asked, flight.bridge.phase) == ([], Phase.ABORTED)

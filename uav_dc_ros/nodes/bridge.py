@@ -29,7 +29,7 @@ from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.plausibility import Plausibility
 from uav_dc_ros.offboard.mission.progress import Checkpoint
-from uav_dc_ros.offboard.realtime import run_when_due
+from uav_dc_ros.offboard.realtime import use_realtime_priority
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.topics import TOPICS
 
@@ -104,7 +104,7 @@ class AutopilotBridge(MissionNode):
         self._policy = LivelinessMonitor(self, TOPICS["move"])
         for close in (self._policy.close, self.journal.close, self.vehicle.close):
             self._open.callback(close)
-        run_when_due()  # this thread; those of the middleware stay as they are
+        use_realtime_priority()  # this thread; those of the middleware stay as they are
         self.vehicle.open()
         self._timer = self.timer(TICK_S, self._tick)
         if self._begun:
@@ -254,7 +254,7 @@ class AutopilotBridge(MissionNode):
         told = f"the grid lies at {anchor} of the vehicle's own frame; not compared with the last flight"
         if datum is not None:
             source = "" if self._is_restarted else self.values["datum"] or datums.HERE
-            told, moved = datums.described(datum, source, self.scenario)
+            told, moved = datums.describe(datum, source, self.scenario)
         (self.get_logger().warning if moved else self.get_logger().info)(told)
 
     def _keep_grid(self) -> None:
@@ -264,7 +264,7 @@ class AutopilotBridge(MissionNode):
             return
         self._grid_is_kept = True
         try:
-            datums.keep(self.scenario, datum, self.values["vehicle"])
+            datums.save(self.scenario, datum, self.values["vehicle"])
         except UavDcError as error:  # no reason not to fly
             self.get_logger().warning(f"the next flight will not know where the grid lay ({datum}): {error}")
 

@@ -1,7 +1,6 @@
-"""Where the grid lay in the last flight, so that the next one does not move it unseen. Knows no ROS.
+"""The grid's datum: the option that gives it, and the datum of the last flight in each scenario's world.
 
-A file for each scenario's world, in the state folder of the user who flies (`STATE_DIRECTORY` of systemd,
-`XDG_STATE_HOME`, or `~/.local/state`).
+Files are in the user's state folder (systemd's `STATE_DIRECTORY`, `XDG_STATE_HOME`, or `~/.local/state`).
 """
 
 import math
@@ -16,22 +15,22 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError, ParameterError, UavDcError, VehicleError
 from uav_dc_ros.offboard.frames import Geodetic
 
-HERE, LAST = "here", "last"  # in place of a datum
+HERE, LAST = "here", "last"
 EXPECTED = (
     f"{HERE} (the vehicle stands at the scenario's start), {LAST} (as in the last flight) or LAT,LON,ALT"
 )
 MOVED_M = 5.0  # two fixes of one place differ by less
-NO_ALTITUDE = "mavros"  # the vehicle's ground level takes the place of the datum's altitude
+NO_ALTITUDE = "mavros"  # altitude 0 of the datum is the ground under the vehicle
 
 
 class SavedDatum(msgspec.Struct, frozen=True, kw_only=True):
-    """The grid of the last flight in one world.
+    """Datum of the last flight in one world.
 
     Attributes:
         scenario: its name.
-        datum: of the grid, as `Geodetic.parse` reads it.
-        vehicle: the way to the autopilot.
-        time: when the vehicle took off, UTC, ISO 8601.
+        datum: as `Geodetic.parse` reads it.
+        vehicle: transport to the autopilot.
+        time: take-off, UTC, ISO 8601.
     """
 
     scenario: str
@@ -40,124 +39,122 @@ class SavedDatum(msgspec.Struct, frozen=True, kw_only=True):
     time: str
 
     def __str__(self) -> str:
-        """As an error or a log line tells it."""
+        """Text for errors and log lines."""
         return f"{self.datum} (flight of {self.scenario}, {self.time})"
 
 
 def folder() -> Path:
-    """The folder of the files.
+    """Folder of the saved datums.
 
     Raises:
-        ParameterError: the user has no home, and no other place is named.
+        ParameterError: the user has no home folder, and the environment names no other.
     """
-    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0] or os.environ.get("XDG_STATE_HOME", "")
-    if not Path(given).is_absolute():
+    path = os.environ.get("STATE_DIRECTORY", "").split(":")[0] or os.environ.get("XDG_STATE_HOME", "")
+    if not Path(path).is_absolute():
         try:
-            given = str(Path.home() / ".local" / "state")
+            path = str(Path.home() / ".local" / "state")
         except RuntimeError:
             raise ParameterError(
-                "the datum of a flight has no place: no home folder; expected XDG_STATE_HOME to be set"
+                "the datum of a flight cannot be saved: no home folder; expected XDG_STATE_HOME to be set"
             ) from None
-    return Path(given) / "uav_dc_ros" / "datums"
+    return Path(path) / "uav_dc_ros" / "datums"
 
 
 def last(scenario: Scenario) -> SavedDatum | None:
-    """The last flight in a scenario's world; None: there was none.
+    """Datum of the last flight in a scenario's world; None: there was no flight.
 
     Raises:
         ParameterError: its file cannot be read.
     """
     path = folder() / f"{scenario.fingerprint}.json"
     try:
-        kept = msgspec.json.decode(path.read_bytes(), type=SavedDatum)
-        Geodetic.parse(kept.datum)
+        saved = msgspec.json.decode(path.read_bytes(), type=SavedDatum)
+        Geodetic.parse(saved.datum)
     except FileNotFoundError:
         return None
     except (OSError, msgspec.DecodeError, VehicleError) as error:
         raise ParameterError(
             f"datum of the last flight, {path}: {error}; expected it whole, or removed"
         ) from None
-    return kept
+    return saved
 
 
-def keep(scenario: Scenario, datum: Geodetic, vehicle: str) -> None:
-    """Keep the grid of the flight that begins.
+def save(scenario: Scenario, datum: Geodetic, vehicle: str) -> None:
+    """Save the datum of the flight that begins.
 
     Raises:
-        UavDcError: it cannot be written.
+        UavDcError: the file cannot be written.
     """
     time = datetime.now(UTC).isoformat(timespec="seconds")
-    kept = SavedDatum(scenario=scenario.name, datum=str(datum), vehicle=vehicle, time=time)
+    saved = SavedDatum(scenario=scenario.name, datum=str(datum), vehicle=vehicle, time=time)
     path = folder() / f"{scenario.fingerprint}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise NodeError(f"{path.parent} cannot be made: {error.strerror}") from None
-    files.write(path, msgspec.json.encode(kept))
+    files.write(path, msgspec.json.encode(saved))
 
 
 def parse(text: str, scenario: Scenario, vehicle: str, *, arm: bool = False) -> Geodetic | None:
-    """The datum that an option or parameter names; None: the vehicle's place on the ground gives it.
+    """Datum given by an option or parameter; None: the position of the vehicle on the ground gives it.
 
     Args:
-        text: `here`, `last` or LAT,LON,ALT; empty: not named, the same as `here`.
-        scenario: the world that is flown.
-        vehicle: the way to the autopilot.
-        arm: is the vehicle to be armed? Then the place of the grid is to be named.
+        text: `here`, `last` or LAT,LON,ALT; empty: as `here`, but not with `arm`.
+        vehicle: transport to the autopilot.
 
     Raises:
-        ParameterError: there is no last flight, or none that fits; it is to arm, and nothing is named.
-        VehicleError: no datum.
+        ParameterError: there is no last flight, or none that fits; `arm` without a datum.
+        VehicleError: the text is not a datum.
     """
-    if text == HERE:
-        return None
-    if not text:
-        if arm:
-            raise ParameterError(f"arm: without a datum; expected one with it: {offer(scenario)}")
+    if arm and not text:
+        raise ParameterError(f"arm: without a datum; expected one with it: {_offer(scenario)}")
+    if text in ("", HERE):
         return None
     if text != LAST:
         return Geodetic.parse(text)
-    kept = last(scenario)
-    if kept is None:
+    saved = last(scenario)
+    if saved is None:
         raise ParameterError(
-            f"datum: {LAST!r}; no flight in this world ({scenario.name} {scenario.fingerprint}) is kept in "
-            f"{folder()}; expected {HERE} or LAT,LON,ALT"
+            f"datum: {LAST!r}; {folder()} has no flight in this world ({scenario.name} "
+            f"{scenario.fingerprint}); expected {HERE} or LAT,LON,ALT"
         )
-    if kept.vehicle == NO_ALTITUDE != vehicle:
+    if saved.vehicle == NO_ALTITUDE != vehicle:
         raise ParameterError(
             f"datum: {LAST!r}; the last flight was through MAVROS, which reports no altitude above mean sea "
-            f"level: {kept}; expected LAT,LON,ALT"
+            f"level: {saved}; expected LAT,LON,ALT"
         )
-    return Geodetic.parse(kept.datum)
+    return Geodetic.parse(saved.datum)
 
 
-def described(datum: Geodetic, text: str, scenario: Scenario) -> tuple[str, bool]:
-    """Where a grid lies, where that comes from, and how far from the last flight's; and whether it moved.
+def describe(datum: Geodetic, source: str, scenario: Scenario) -> tuple[str, bool]:
+    """Position of the grid, its source and its distance from the last flight's; and whether it has moved.
 
     Args:
-        datum: of the grid.
-        text: what `parse` was given; empty: an earlier start of the bridge in this flight.
-        scenario: the world that is flown.
+        source: text of the option, see `parse`; empty: an earlier start of the bridge in this flight.
     """
-    sources = {HERE: "from where the vehicle stands", LAST: "as in the last flight", "": "as before"}
-    told = f"the grid's corner lies at {datum}, {sources.get(text, 'as given')}"
+    sources = {
+        HERE: "from the vehicle's position",
+        LAST: "as in the last flight",
+        "": "as before the restart",
+    }
+    text = f"the grid's corner lies at {datum}, {sources.get(source, 'as given')}"
     try:
-        kept = last(scenario)
-        if kept is None:
-            return f"{told}; no earlier flight in this world is kept", False
-        east_m, north_m, _ = datum.seen_from(Geodetic.parse(kept.datum))
+        saved = last(scenario)
+        if saved is None:
+            return f"{text}; no earlier flight in this world", False
+        east_m, north_m, _ = datum.enu_from(Geodetic.parse(saved.datum))
     except UavDcError as error:
-        return f"{told}; not compared with the last flight: {error}", True
-    away = f"{abs(east_m):.1f} m {'east' if east_m >= 0 else 'west'} and "
-    away += f"{abs(north_m):.1f} m {'north' if north_m >= 0 else 'south'}"
+        return f"{text}; not compared with the last flight: {error}", True
+    east = f"{abs(east_m):.1f} m {'east' if east_m >= 0 else 'west'}"
+    north = f"{abs(north_m):.1f} m {'north' if north_m >= 0 else 'south'}"
     moved = math.hypot(east_m, north_m) > MOVED_M
-    return f"{told}; {away} of that of the last flight ({kept.time})", moved
+    return f"{text}; {east} and {north} of that of the last flight ({saved.time})", moved
 
 
-def offer(scenario: Scenario) -> str:
-    """What may be given as a datum, in words, with the last flight's."""
+def _offer(scenario: Scenario) -> str:
+    """Permitted values, with the last flight's datum."""
     try:
-        kept = last(scenario)
+        saved = last(scenario)
     except ParameterError:
-        kept = None
-    return EXPECTED if kept is None else f"{EXPECTED}; the last flight's: {kept}"
+        saved = None
+    return EXPECTED if saved is None else f"{EXPECTED}; the last flight's: {saved}"

@@ -1,4 +1,4 @@
-"""An autopilot's own limits: which parameters hold them, how they are asked for, what they mean."""
+"""Parameters that hold an autopilot's own limits: names, requests, values."""
 
 import math
 import struct
@@ -7,12 +7,13 @@ from typing import Any
 
 from uav_dc_ros.offboard.vehicle import Limits
 
-ASKED, AGAIN_S = 3, 0.7  # times that a parameter is asked for, and the pause, steady clock
+MAX_REQUESTS = 3  # of one parameter
+REQUEST_PERIOD_S = 0.7  # steady clock
 INTEGERS = frozenset(range(1, 9))  # MAV_PARAM_TYPE
 CEILING, CIRCLE, POLYGON, FLOOR = 1, 2, 4, 8  # bits of FENCE_TYPE
-ACTS = 2  # GF_ACTION: hold; below it only warns
+GF_ACTION_HOLD = 2  # lower values of GF_ACTION only warn
 
-# A parameter may have another name in another version: the first that is answered counts.
+# Names of one parameter in different versions of the autopilot: the first one answered counts.
 Names = tuple[tuple[str, ...], ...]
 ARDUCOPTER: Names = (
     *[("FENCE_ENABLE",), ("FENCE_AUTOENABLE",), ("FENCE_TYPE",), ("FENCE_RADIUS",)],
@@ -25,52 +26,46 @@ PX4: Names = (
 )
 
 
-class Parameters:
-    """Parameters that are asked for by name, a few times, and no longer than that.
+class ParameterReader:
+    """Reads parameters by name, each with `MAX_REQUESTS` requests at most.
 
     Attributes:
-        values: those that were answered.
+        values: received values.
     """
 
     def __init__(self) -> None:
         self.values: dict[str, float] = {}
-        self._asked: dict[str, tuple[int, float]] = {}  # how often, and when last
+        self._requests: dict[str, tuple[int, float]] = {}  # number of requests, time of the last one
 
-    def take(self, name: str, value: float) -> None:
-        """Take in an answer."""
+    def receive(self, name: str, value: float) -> None:
+        """Store a received value; one that is not finite is ignored."""
         if math.isfinite(value):
             self.values[name] = value
 
     def due(self, names: Names, now_s: float) -> list[str]:
-        """Those to ask for now, at a steady time; they count as asked for."""
+        """Parameters to request now, at a steady time; they count as requested."""
         due = []
-        for name in self._open(names):
-            times, last_s = self._asked.get(name, (0, -math.inf))
-            if times < ASKED and now_s - last_s >= AGAIN_S:
-                self._asked[name] = times + 1, now_s
+        for name in self._unanswered(names):
+            times, last_s = self._requests.get(name, (0, -math.inf))
+            if times < MAX_REQUESTS and now_s - last_s >= REQUEST_PERIOD_S:
+                self._requests[name] = times + 1, now_s
                 due.append(name)
         return due
 
-    def are_waited_for(self, names: Names, now_s: float) -> bool:
-        """May one of them still be answered."""
-        for name in self._open(names):
-            times, last_s = self._asked.get(name, (0, -math.inf))
-            if times < ASKED or now_s - last_s < AGAIN_S:
+    def are_pending(self, names: Names, now_s: float) -> bool:
+        """Whether an answer may still arrive."""
+        for name in self._unanswered(names):
+            times, last_s = self._requests.get(name, (0, -math.inf))
+            if times < MAX_REQUESTS or now_s - last_s < REQUEST_PERIOD_S:
                 return True
         return False
 
-    def _open(self, names: Names) -> list[str]:
-        """Those that have no answer, under any of their names."""
+    def _unanswered(self, names: Names) -> list[str]:
         return [name for same in names if not self.values.keys() & set(same) for name in same]
 
 
-def number(message: Any, *, bytewise: bool) -> float:
-    """The value of a PARAM_VALUE.
-
-    Args:
-        message: of pymavlink's.
-        bytewise: has an integer its own bytes in the place of a float's, as with PX4?
-    """
+def decode(message: Any, *, bytewise: bool) -> float:
+    """Value of a PARAM_VALUE; `bytewise`: the float field holds an integer's bytes, as PX4 sends it."""
     if bytewise and message.param_type in INTEGERS:
         (value,) = struct.unpack("<i", struct.pack("<f", message.param_value))
         return float(value)
@@ -78,13 +73,13 @@ def number(message: Any, *, bytewise: bool) -> float:
 
 
 def of_arducopter(values: Mapping[str, float]) -> Limits:
-    """What ArduCopter enforces. It takes targets up to the fence: FENCE_MARGIN does not count there."""
+    """ArduCopter's limits. It accepts targets up to the fence itself, without FENCE_MARGIN."""
     enabled = values.get("FENCE_ENABLE", 0) or values.get("FENCE_AUTOENABLE", 0)
     fences = int(values.get("FENCE_TYPE", 0)) if enabled else 0
 
-    def speed_mps(name: str) -> float | None:
-        cmps = values.get(f"WPNAV_SPEED{name}")
-        return values.get(f"WP_SPD{name}") if cmps is None else cmps / 100
+    def speed_mps(suffix: str) -> float | None:
+        cmps = values.get(f"WPNAV_SPEED{suffix}")
+        return values.get(f"WP_SPD{suffix}") if cmps is None else cmps / 100
 
     return Limits(
         fence_radius_m=values.get("FENCE_RADIUS") if fences & CIRCLE else None,
@@ -98,12 +93,12 @@ def of_arducopter(values: Mapping[str, float]) -> Limits:
 
 
 def of_px4(values: Mapping[str, float]) -> Limits:
-    """What PX4 enforces in OFFBOARD; MPC_XY_CRUISE and MPC_Z_V_AUTO_UP are those of its own missions."""
-    acts = values.get("GF_ACTION", 0) >= ACTS
+    """PX4's limits in OFFBOARD. MPC_XY_CRUISE and MPC_Z_V_AUTO_UP apply to its own missions only."""
+    enforced = values.get("GF_ACTION", 0) >= GF_ACTION_HOLD
     radius_m, ceiling_m = values.get("GF_MAX_HOR_DIST", 0.0), values.get("GF_MAX_VER_DIST", 0.0)
     return Limits(
-        fence_radius_m=radius_m if acts and radius_m > 0 else None,
-        fence_ceiling_m=ceiling_m if acts and ceiling_m > 0 else None,
+        fence_radius_m=radius_m if enforced and radius_m > 0 else None,
+        fence_ceiling_m=ceiling_m if enforced and ceiling_m > 0 else None,
         speed_mps=values.get("MPC_XY_VEL_MAX"),
         climb_mps=values.get("MPC_Z_VEL_MAX_UP"),
         descent_mps=values.get("MPC_Z_VEL_MAX_DN"),

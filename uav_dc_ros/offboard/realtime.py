@@ -1,16 +1,14 @@
-"""Running when it is due, whatever else wants the processor."""
+"""Real-time priority of a thread, so that setpoints keep their rate on a busy computer."""
 
 import os
 import sys
 
 
-def run_when_due() -> bool:
-    """Have the calling thread run before all ordinary ones, if this process may; did it work.
+def use_realtime_priority() -> bool:
+    """Set the calling thread to SCHED_RR at the lowest real-time priority; whether the system permits it.
 
-    A setpoint every 50 ms costs next to nothing, but on a busy computer an ordinary thread gets the processor
-    tens of milliseconds late. Round robin at the lowest real-time priority is enough. It takes the right to
-    do so: CAP_SYS_NICE, or a limit on real-time priority of 1 or more (`LimitRTPRIO=1` of systemd). Threads
-    and processes that are started from this one are ordinary again.
+    On a busy computer an ordinary thread runs tens of milliseconds late. The permission is CAP_SYS_NICE or
+    RLIMIT_RTPRIO of 1 or more (systemd: `LimitRTPRIO=1`). Child threads and processes have normal priority.
     """
     if sys.platform != "linux":
         return False

@@ -1,21 +1,57 @@
-"""A stream of setpoints that keeps its pace whatever the node's executor does, and ends with who decides."""
+"""Send times of heartbeats and setpoints, the same for every transport, and a thread that streams setpoints.
 
+A simulated vehicle's time may run faster than the steady clock, and its failsafes count vehicle time:
+heartbeats and setpoints follow the faster of the two.
+"""
+
+import math
 import threading
 import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from uav_dc_ros.offboard.realtime import run_when_due
-from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S, following
+from uav_dc_ros.offboard.realtime import use_realtime_priority
+
+STREAM_S = 0.05  # steady clock
+STREAM_VEHICLE_S = 0.2  # vehicle time; PX4 requires more than 2 Hz of it
+HEARTBEAT_S = 1.0  # of either time
+MIN_HEARTBEAT_S = 0.02  # steady clock
+STREAM_TIMEOUT_S = 1.0  # age of the last decision at which the stream ends
 
 Target = TypeVar("Target")
 
 
+def next_due_s(due_s: float, period_s: float, now_s: float) -> float:
+    """Next send time of a periodic message; missed periods are skipped."""
+    return due_s + period_s if now_s < due_s + period_s else now_s + period_s
+
+
+class Heartbeat:
+    """Send times of heartbeats: at once on a new link, then every second of either clock."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Start on a new link."""
+        self._due_s = self._sent_s = self._sent_vehicle_s = -math.inf
+
+    def is_due(self, now_s: float, vehicle_s: float) -> bool:
+        """Whether a heartbeat is due at a steady time and a vehicle time."""
+        ahead = vehicle_s - self._sent_vehicle_s >= HEARTBEAT_S
+        return now_s >= self._due_s or (ahead and now_s - self._sent_s >= MIN_HEARTBEAT_S)
+
+    def sent(self, now_s: float, vehicle_s: float) -> None:
+        """Note that a heartbeat was sent."""
+        self._due_s = next_due_s(self._due_s, HEARTBEAT_S, now_s)
+        self._sent_s, self._sent_vehicle_s = now_s, vehicle_s
+
+
 class SetpointStream(Generic[Target]):
-    """Calls `send` every `STREAM_S` in a thread of its own, and at once when there is another target.
+    """Thread that calls `send` with the target every `STREAM_S`, and at once when the target changes.
 
     Args:
-        send: what to do with the target; must be safe to call in any thread.
+        send: sends one setpoint; called in the thread.
         name: of the thread.
     """
 
@@ -23,37 +59,37 @@ class SetpointStream(Generic[Target]):
         self._send = send
         self._changed = threading.Condition()
         self._target: Target | None = None
-        self._alive_s = 0.0
+        self._updated_s = 0.0
         self._urgent = self._ended = False
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin; nothing is sent before there is a target."""
+        """Start the thread; it sends nothing before there is a target."""
         self._thread.start()
 
     def set_setpoint(self, target: Target | None) -> None:
-        """Send this from now on, or nothing; it counts as a sign of life.
+        """Send this target from now on, or none, for at most `STREAM_TIMEOUT_S`.
 
         Raises:
-            Exception: what `send` raised last: who decides must not believe that somebody listens.
+            Exception: the last error of `send`, so that the caller does not rely on a stream that has ended.
         """
         with self._changed:
             if self._failure is not None:
                 raise self._failure
             changed = target != self._target
-            self._target, self._alive_s = target, time.monotonic()
+            self._target, self._updated_s = target, time.monotonic()
             if changed:
                 self._changed.notify()
 
     def hurry(self) -> None:
-        """Send before the next beat, too: a simulated vehicle's time may be faster than the clock."""
+        """Send once before the next period: a simulated vehicle's time may be faster than the clock."""
         with self._changed:
             self._urgent = True
             self._changed.notify()
 
     def stop(self) -> None:
-        """End it; more than once is as good as once. Nothing is sent any more when this returns."""
+        """End the stream; nothing is sent after the return. Further calls have no effect."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -61,7 +97,7 @@ class SetpointStream(Generic[Target]):
             self._thread.join()
 
     def _run(self) -> None:
-        run_when_due()
+        use_realtime_priority()
         due_s, sent = time.monotonic(), None
         while True:
             with self._changed:
@@ -74,14 +110,14 @@ class SetpointStream(Generic[Target]):
                 if self._ended:
                     return
                 now_s = time.monotonic()
-                alive = now_s - self._alive_s <= LIFE_S
+                is_current = now_s - self._updated_s <= STREAM_TIMEOUT_S
                 sent, self._urgent = self._target, False
             if now_s >= due_s:
-                due_s = following(due_s, STREAM_S, now_s)
-            if alive and sent is not None:
+                due_s = next_due_s(due_s, STREAM_S, now_s)
+            if is_current and sent is not None:
                 try:
                     self._send(sent)
-                except Exception as error:  # told to who decides next
+                except Exception as error:  # raised by the next call of set_setpoint
                     with self._changed:
                         self._failure = error
                     return

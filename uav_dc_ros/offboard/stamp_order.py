@@ -1,36 +1,32 @@
-"""Which messages of a stream are news, by the stamps that their sender gave them. No input or output."""
+"""Order of the messages of one stream, by the sender's stamps."""
 
 import math
 
-LEAP_S = 1.0  # further ahead than its pace explains
-FASTEST = 100.0  # a simulated vehicle's time, times as fast as the clock
-RESYNC_S = 1.0  # without news, after which another order is believed: clocks are set, and vehicles boot
+LEAP_S = 1.0  # advance of the stamp beyond that of the clock
+FASTEST = 100.0  # maximum speed of a simulated vehicle's time, times the clock
+RESYNC_S = 1.0  # time without an accepted message after which any stamp is accepted: reboot, clock change
 
 
 class StampOrder:
-    """The order of one stream: a message that is late, repeated or of an impossible time is to be ignored.
-
-    A sender that never stamps is taken as it comes.
-    """
+    """Rejects messages that are late, repeated or of an impossible time. Unstamped streams are accepted."""
 
     def __init__(self) -> None:
-        self._stamp_s, self._news_s = 0.0, -math.inf  # of the last news: its stamp, and when it came
+        self._stamp_s, self._accepted_s = 0.0, -math.inf  # stamp and arrival of the last accepted message
 
     def refusal(self, stamp_s: float, now_s: float) -> str | None:
-        """Why a message with a stamp, that came at a steady time, is to be ignored; None: it is news."""
+        """Why a message that arrived at a steady time is to be ignored; None: it is accepted."""
         why = None
         if self._stamp_s:
-            passed_s, advance_s = now_s - self._news_s, stamp_s - self._stamp_s
+            passed_s, advance_s = now_s - self._accepted_s, stamp_s - self._stamp_s
             if not advance_s:
                 return "repeated"
-            if not stamp_s:
-                why = "zeroed"
-            elif advance_s < 0:
-                why = "late"
-            elif advance_s > LEAP_S + FASTEST * passed_s:
-                why = "impossible"
-            if passed_s > RESYNC_S:
-                why = None
+            if passed_s <= RESYNC_S:
+                if not stamp_s:
+                    why = "zeroed"
+                elif advance_s < 0:
+                    why = "late"
+                elif advance_s > LEAP_S + FASTEST * passed_s:
+                    why = "impossible"
         if why is None:
-            self._stamp_s, self._news_s = stamp_s, now_s
+            self._stamp_s, self._accepted_s = stamp_s, now_s
         return why

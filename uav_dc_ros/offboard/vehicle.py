@@ -1,4 +1,4 @@
-"""What passes between the bridge and a transport: telemetry one way, commands the other."""
+"""The interface between bridge and transport: telemetry one way, commands and setpoints the other."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,13 +9,13 @@ from uav_dc_ros.offboard.frames import Enu, Geodetic
 
 
 class Mode(StrEnum):
-    """What an autopilot may be asked to do; each calls it by a name of its own."""
+    """Flight modes that the bridge distinguishes."""
 
-    COMMANDED = "commanded"  # follow setpoints: GUIDED of ArduPilot, OFFBOARD of PX4
-    HOLD = "hold"  # stay where it is: BRAKE or LOITER, AUTO.LOITER
+    COMMANDED = "commanded"  # follows setpoints: ArduPilot's GUIDED, PX4's OFFBOARD
+    HOLD = "hold"  # keeps its position: BRAKE or LOITER, AUTO.LOITER
     RETURN = "return"  # RTL, AUTO.RTL
-    LAND = "land"  # here: LAND, AUTO.LAND
-    OTHER = "other"  # any other: somebody else flies
+    LAND = "land"  # lands where it is: LAND, AUTO.LAND
+    OTHER = "other"  # any other mode: another pilot or system flies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +25,7 @@ class Limits:
     Attributes:
         fence_radius_m: of its circular fence, horizontal distance from home, metres.
         fence_ceiling_m, fence_floor_m: of its altitude fence, metres above home.
-        polygon_fence: does it enforce a fence of another shape, which this system does not read?
+        polygon_fence: whether it enforces a fence of another shape, which the bridge does not read.
         speed_mps: horizontal speed towards a position target, m/s.
         climb_mps, descent_mps: vertical speeds towards a position target, m/s, both positive.
     """
@@ -41,34 +41,32 @@ class Limits:
 
 @dataclass(frozen=True, kw_only=True)
 class Telemetry:
-    """What is known of the vehicle; times are of the bridge's steady clock, seconds.
+    """Last reported state of the vehicle. Times: the bridge's steady clock, seconds. None: not reported.
 
     Attributes:
-        heartbeat_s: when its last heartbeat came; None: never.
-        mode, mode_name: what it does, and what the autopilot calls that.
-        armed: do its motors turn, or may they at any moment?
-        on_ground: does it stand on the ground? None: it does not tell.
-        position: in the grid's ENU frame; None: not known yet.
-        position_s: when that came.
-        estimate_ok: does the autopilot trust its position enough to fly by it?
-        estimate_s: when the last report on that came; None: not known, then `estimate_ok` is of now.
-        battery: charge that is left, 0 to 1; None: it does not tell.
-        battery_v: its voltage, volts; None: it does not tell.
-        battery_fails: does the autopilot itself find the battery too low, or broken?
-        vehicle_s: the vehicle's own time, seconds: a simulated one may be faster than any clock here.
-        missing: what has not come yet, though nobody flies without; None: all of it has.
-        refusal: what the vehicle last refused, and why; None: nothing, or it did it after all.
-        said: what it warned of in the last seconds, in its own words; empty: nothing.
-        home: where it returns to, in the grid's ENU frame; None: not reported.
-        target: position target that the autopilot reports, in the grid's ENU frame; None: not reported.
-        target_s: when that came; None: not known, then nothing is concluded from it.
-        tilt_rad: angle between the vehicle's vertical axis and the vertical, 0 to pi; None: not reported.
-        limits: of the autopilot's own parameters; None: not reported.
-        other_controller: another system that commands this vehicle, with the evidence; None: none was seen.
+        heartbeat_s: arrival of the last heartbeat; None: none received.
+        mode, mode_name: flight mode, and the autopilot's name of it.
+        armed: whether the motors turn, or may turn at any moment.
+        on_ground: whether the vehicle stands on the ground.
+        position, position_s: in the grid's ENU frame, and its arrival.
+        estimate_ok: whether the autopilot trusts its position estimate enough to fly by it.
+        estimate_s: arrival of the last report on the estimate; None: `estimate_ok` is current.
+        battery: remaining charge, 0 to 1.
+        battery_v: battery voltage, volts.
+        battery_fails: whether the autopilot reports the battery as low or broken.
+        vehicle_s: the vehicle's own time, seconds; in simulation it may run faster than the steady clock.
+        missing: what the bridge still needs before it can fly, in words; None: nothing.
+        refusal: last refused command and the reason; None: none, or it was executed since.
+        status_text: the autopilot's own warnings of the last seconds; empty: none.
+        home: where a return leads to, in the grid's ENU frame.
+        target, target_s: the autopilot's position target in the grid's ENU frame, and its arrival.
+        tilt_rad: angle between the vehicle's vertical axis and the vertical, 0 to pi.
+        limits: of the autopilot's own parameters.
+        other_controller: evidence of another system that commands this vehicle; None: none.
         system: the vehicle's identity on its link, such as `system 1`; empty: not known.
-        system_id: its number there, for a transport that is opened again; None: not known.
-        is_meant: is it surely the vehicle that is meant? No, while there are several, and none is named.
-        discarded: messages that were counted and ignored, by reason (late, repeated, impossible, ...).
+        system_id: its number on the link, for a transport that is opened again.
+        is_selected: whether the vehicle is identified; False while several are on the link and none is named.
+        discarded: number of ignored messages by reason (late, repeated, impossible, ...).
     """
 
     heartbeat_s: float | None = None
@@ -86,7 +84,7 @@ class Telemetry:
     vehicle_s: float = 0.0
     missing: str | None = None
     refusal: str | None = None
-    said: str = ""
+    status_text: str = ""
     home: Enu | None = None
     target: Enu | None = None
     target_s: float | None = None
@@ -95,25 +93,35 @@ class Telemetry:
     other_controller: str | None = None
     system: str = ""
     system_id: int | None = None
-    is_meant: bool = True
+    is_selected: bool = True
     discarded: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def mode_text(self) -> str:
+        """The autopilot's name of the mode, or else the bridge's."""
+        return self.mode_name or self.mode.value
+
+    @property
+    def in_the_air(self) -> bool:
+        """Whether the vehicle is armed and reports that it flies."""
+        return self.armed and self.on_ground is False
 
 
 @dataclass(frozen=True)
 class SetMode:
-    """A command: change to a mode."""
+    """Command: change the flight mode."""
 
     mode: Mode
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A command: arm. Only ever sent when the user asked for it."""
+    """Command: arm. Sent only with `SafetySettings.arm`."""
 
 
 @dataclass(frozen=True)
 class TakeOff:
-    """A command: climb from the ground to an altitude in the grid's frame, metres."""
+    """Command: climb from the ground to an altitude in the grid's frame, metres."""
 
     altitude_m: float
 
@@ -122,14 +130,14 @@ Command = SetMode | Arm | TakeOff
 
 
 class Vehicle(Protocol):
-    """A way to one vehicle. It receives, sends commands and streams setpoints. It decides nothing.
+    """Transport to one vehicle, from `open` to `close`. It makes no decisions.
 
-    It works from `open` to `close`. Its stream is a sign of life of those who decide: it ends a second
-    after the last call of `set_setpoint`, and then the autopilot's own failsafes take over.
+    The setpoint stream ends `STREAM_TIMEOUT_S` after the last call of `set_setpoint`: then the autopilot's
+    own failsafes act.
     """
 
     def open(self) -> None:
-        """Begin to listen."""
+        """Start to receive."""
 
     @property
     def kind(self) -> str:
@@ -137,24 +145,24 @@ class Vehicle(Protocol):
 
     @property
     def grid_origin(self) -> str:
-        """Where the grid lies, for a transport that is opened again in the air; empty until it is known."""
+        """Position of the grid, for a transport that is opened again in the air; empty until it is known."""
 
     @property
     def datum(self) -> Geodetic | None:
-        """Where on the Earth the grid's corner lies; None: not known."""
+        """Position of the grid's corner on the Earth; None: not known."""
 
     def telemetry(self) -> Telemetry:
-        """What is known of the vehicle now, times as of `time.monotonic`.
+        """Current state of the vehicle; times as of `time.monotonic`.
 
         Raises:
-            VehicleError: this machine cannot reach it at all.
+            VehicleError: this machine cannot reach the vehicle at all.
         """
 
     def set_setpoint(self, setpoint: Enu | None) -> None:
-        """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
+        """Stream a setpoint, in the grid's ENU frame, or none. To be called at 2 Hz or more."""
 
     def send_command(self, command: Command) -> None:
-        """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
+        """Send a command once; `telemetry` reports its execution."""
 
     def close(self) -> None:
-        """End the stream, and the link; more than once is as good as once."""
+        """End the setpoint stream and the link. Further calls have no effect."""

@@ -20,7 +20,7 @@ from tests.support.fake_autopilot.flight import ROOT, SCENARIO, Flight, fake
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.offboard.realtime import run_when_due
+from uav_dc_ros.offboard.realtime import use_realtime_priority
 
 SPEED = 100.0
 AT_ONCE = 4
@@ -220,7 +220,7 @@ def check(name: str, told: dict[str, Any]) -> None:
 
 def main() -> None:
     """Fly, and tell. Without a fault, in the whole world."""
-    run_when_due()  # as the bridge's node should
+    use_realtime_priority()  # as the bridge's node should
     for case in sys.argv[1:]:
         kind, wire, name, at_s, *_ = (*case.split(","), *[""] * 3)
         name = name or "none"

@@ -136,7 +136,7 @@ class Vehicle:
             battery_v=self.battery_v,
             vehicle_s=self.now_s,
             missing="the grid has no datum" if self.unplaced else self.missing,
-            said=self.said,
+            status_text=self.said,
             home=self.home if self.reports_home else None,
             target=self.target if self.reports_target else None,
             target_s=self.now_s,

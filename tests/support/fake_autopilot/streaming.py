@@ -21,8 +21,8 @@ from pymavlink import mavutil
 from tests.support.fake_autopilot.flight import ROOT, Fake, fake
 from uav_dc_ros.offboard.mavlink.session import POSITION_ONLY
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
-from uav_dc_ros.offboard.realtime import run_when_due
-from uav_dc_ros.offboard.send_timer import STREAM_S
+from uav_dc_ros.offboard.realtime import use_realtime_priority
+from uav_dc_ros.offboard.setpoint_stream import STREAM_S
 
 BURN = "while True: pass"
 LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_dueling')"
@@ -30,7 +30,7 @@ LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_dueling
 
 def transport(address: str) -> None:
     """Stream with the transport."""
-    run_when_due()
+    use_realtime_priority()
     with MavlinkVehicle(address) as vehicle:
         while True:
             vehicle.set_setpoint(vehicle.telemetry().position)

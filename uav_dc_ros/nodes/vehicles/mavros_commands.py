@@ -67,7 +67,7 @@ class Commands:
         package = self._package
         match command:
             case SetMode(mode):
-                name = dialect.names[dialect.asked[Mode(mode)]]
+                name = dialect.mode_names[dialect.custom_modes[Mode(mode)]]
                 if package is None:
                     self._cannot(f"the change of mode to {name}", f"a pilot has to set {name}")
                     return
@@ -79,7 +79,7 @@ class Commands:
                     return
                 request = package.command_bool.Request(value=True)
                 self._call(ARM, request, "arming", lambda answer: answer.success)
-            case TakeOff(altitude_m) if not dialect.climbs_by_setpoint:
+            case TakeOff(altitude_m) if not dialect.takes_off_by_setpoint:
                 if package is None:
                     self._cannot("taking off", "a pilot has to take off, and set the mode in the air")
                     return

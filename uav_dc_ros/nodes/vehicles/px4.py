@@ -23,8 +23,7 @@ from uav_dc_ros.nodes.vehicles.other_setpoints import OtherSetpointPublishers
 from uav_dc_ros.offboard import flight_stacks
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
 from uav_dc_ros.offboard.px4.telemetry import COMPANION, Px4Telemetry
-from uav_dc_ros.offboard.send_timer import STREAM_VEHICLE_S
-from uav_dc_ros.offboard.setpoint_stream import SetpointStream
+from uav_dc_ros.offboard.setpoint_stream import STREAM_VEHICLE_S, SetpointStream
 from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, Telemetry
 
 POSE_S = 0.5

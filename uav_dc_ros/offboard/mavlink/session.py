@@ -2,7 +2,7 @@
 
 It decides nothing: it passes commands on, streams setpoints, and asks for what the vehicle does not send. It
     is
-a sign of life of those who decide: heartbeats and setpoints end `LIFE_S` after the last call of
+a sign of life of those who decide: heartbeats and setpoints end `STREAM_TIMEOUT_S` after the last call of
     `set_setpoint`, and
 then the autopilot's own failsafes take over, as they do when the process is gone.
 """
@@ -14,7 +14,13 @@ from typing import Any
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM
 from uav_dc_ros.offboard.mavlink.telemetry import ACCEPTED, HELPFUL_HZ, IN_PROGRESS, ONCE, MavlinkTelemetry
-from uav_dc_ros.offboard.send_timer import LIFE_S, STREAM_S, STREAM_VEHICLE_S, Heartbeat, following
+from uav_dc_ros.offboard.setpoint_stream import (
+    STREAM_S,
+    STREAM_TIMEOUT_S,
+    STREAM_VEHICLE_S,
+    Heartbeat,
+    next_due_s,
+)
 from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, TakeOff
 
 ONBOARD_CONTROLLER, NO_AUTOPILOT, ACTIVE = 18, 8, 4  # MAV_TYPE, MAV_AUTOPILOT, MAV_STATE of this end
@@ -65,7 +71,7 @@ class Session:
 
     def set_setpoint(self, setpoint: Enu | None, now_s: float) -> bool:
         """Stream a setpoint from now on, or none, and be alive; is there something to send at once."""
-        news = setpoint != self._setpoint or now_s - self._alive_s > LIFE_S
+        news = setpoint != self._setpoint or now_s - self._alive_s > STREAM_TIMEOUT_S
         self._setpoint, self._alive_s = setpoint, now_s
         return news
 
@@ -85,11 +91,11 @@ class Session:
     def send(self, now_s: float) -> None:
         """Send what is due."""
         hearing = self.hearing
-        vehicle_s, alive = hearing.vehicle_s, now_s - self._alive_s <= LIFE_S
+        vehicle_s, alive = hearing.vehicle_s, now_s - self._alive_s <= STREAM_TIMEOUT_S
         if alive and self._heartbeat.is_due(now_s, vehicle_s):
             self._send_heartbeat(now_s, vehicle_s)
         if now_s >= self._ask_s or hearing.wanted().keys() - self._asked_s.keys():
-            self._ask_s = following(self._ask_s, ASK_S, now_s)
+            self._ask_s = next_due_s(self._ask_s, ASK_S, now_s)
             self._ask_for_messages(now_s)
         commands, self._commands = self._commands, []
         if not hearing.doubts_mode(now_s):  # it may be a pilot; the bridge sends again what was not executed
@@ -99,7 +105,7 @@ class Session:
         due = now_s >= self.stream_s or self._setpoint != streamed
         if due or vehicle_s - streamed_vehicle_s >= STREAM_VEHICLE_S:
             if now_s >= self.stream_s:
-                self.stream_s = following(self.stream_s, STREAM_S, now_s)
+                self.stream_s = next_due_s(self.stream_s, STREAM_S, now_s)
             self._streamed = self._setpoint, vehicle_s
             if alive and self._setpoint is not None:
                 self._send_setpoint(self._setpoint, vehicle_s)
@@ -173,7 +179,7 @@ class Session:
                 self._send_command_long(SET_MODE, CUSTOM_MODE, *dialect.mode_parameters(Mode(mode)))
             case Arm():
                 self._send_command_long(ARM, 1.0)
-            case TakeOff(altitude_m) if not dialect.climbs_by_setpoint and known.position is not None:
+            case TakeOff(altitude_m) if not dialect.takes_off_by_setpoint and known.position is not None:
                 climb_m = altitude_m - known.position.up_m  # above home, which is where it stands
                 self._send_command_long(TAKE_OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, climb_m)
 
@@ -182,7 +188,7 @@ class Session:
         if (
             hearing.dialect is None
             or hearing.frame is None
-            or not hearing.dialect.takes_setpoints(hearing.landed_state)
+            or not hearing.dialect.accepts_setpoints(hearing.landed_state)
         ):
             return
         ned = hearing.frame.to_autopilot(setpoint)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from uav_dc_ros.offboard.flight_stacks import COPTERS, DIALECTS, FlightStack
+from uav_dc_ros.offboard.flight_stacks import COPTERS, FLIGHT_STACKS, FlightStack
 
 SYSTEM, COMPONENT = 255, 191  # of this end: what FS_GCS_ENABLE of ArduPilot looks after; an onboard computer
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -40,7 +40,7 @@ class Systems:
         """Take in a heartbeat, at a steady time."""
         if heartbeat.get_srcComponent() != AUTOPILOT or heartbeat.autopilot == NO_AUTOPILOT:
             return
-        system, dialect = heartbeat.get_srcSystem(), DIALECTS.get(heartbeat.autopilot)
+        system, dialect = heartbeat.get_srcSystem(), FLIGHT_STACKS.get(heartbeat.autopilot)
         meant = self.number in (None, system)
         if dialect is None or heartbeat.type not in COPTERS:
             if meant and self.dialect is None:
@@ -76,7 +76,7 @@ class Systems:
 
 def _stranger(system: int, heartbeat: Any) -> str:
     """Why a vehicle is not one that this system can fly."""
-    if heartbeat.autopilot in DIALECTS:
+    if heartbeat.autopilot in FLIGHT_STACKS:
         return f"system {system} is a vehicle of type {heartbeat.type}; expected a multicopter"
-    known = " or ".join(f"{number} ({dialect.name})" for number, dialect in DIALECTS.items())
+    known = " or ".join(f"{number} ({dialect.name})" for number, dialect in FLIGHT_STACKS.items())
     return f"system {system} has an autopilot of kind {heartbeat.autopilot}; expected {known}"

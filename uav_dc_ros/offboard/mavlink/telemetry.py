@@ -83,7 +83,7 @@ class MavlinkTelemetry:
     ) -> None:
         self.datum, self.place = datum, place
         self.systems, self.rivals = Systems(system, again), OtherControllers((SYSTEM, COMPONENT))
-        self.parameters = limits.Parameters()
+        self.parameters = limits.ParameterReader()
         self.discarded: Counter[str] = Counter()
         self._sequence, self._clock = Sequence(), VehicleClock()
         self.frame: LocalFrame | None = None
@@ -192,8 +192,8 @@ class MavlinkTelemetry:
             vehicle_s=self.vehicle_s,
             missing=self._missing(now_s),
             refusal=self._refusal(),
-            said="; ".join(self._said(now_s - TEXT_S, now_s)),
-            home=self._home.seen_from(self.datum) if self._home and self.datum else None,
+            status_text="; ".join(self._said(now_s - TEXT_S, now_s)),
+            home=self._home.enu_from(self.datum) if self._home and self.datum else None,
             target=self.frame.from_autopilot(target) if self.frame and target else None,
             target_s=self.heard.get("POSITION_TARGET_LOCAL_NED"),
             tilt_rad=self._tilt_rad if self._is_fresh("ATTITUDE", now_s) else None,
@@ -201,7 +201,7 @@ class MavlinkTelemetry:
             other_controller=self.rivals.found(self.vehicle_s),
             system=str(self.systems),
             system_id=self.system,
-            is_meant=self.systems.is_meant(now_s),
+            is_selected=self.systems.is_meant(now_s),
             discarded=dict(self.discarded),
         )
 
@@ -230,7 +230,7 @@ class MavlinkTelemetry:
         lacking = [name for name in self._needed() if name not in self.heard]
         if lacking:
             return f"the autopilot has not sent {', '.join(lacking)} yet"
-        if not self._armed and self.parameters.are_waited_for(self.dialect.parameters, now_s):
+        if not self._armed and self.parameters.are_pending(self.dialect.parameters, now_s):
             return "the autopilot has not answered for its parameters yet"
         if not self._armed and not self._flags_ok():
             told = [text for text in self._said(now_s - ADVICE_S, now_s) if text.startswith(ADVICE)]
@@ -261,7 +261,7 @@ class MavlinkTelemetry:
     def _on_gps_global_origin(self, message: Any, now_s: float) -> None:
         self._origin = _geodetic(message)
         if self.datum is not None:
-            self.frame = self._frame_at(self._origin.seen_from(self.datum))
+            self.frame = self._frame_at(self._origin.enu_from(self.datum))
         self._place()
 
     def _on_home_position(self, message: Any, now_s: float) -> None:
@@ -284,8 +284,8 @@ class MavlinkTelemetry:
 
     def _on_param_value(self, message: Any, now_s: float) -> None:
         if self.dialect is not None:
-            value = limits.number(message, bytewise=self.dialect.parameters_are_bytes)
-            self.parameters.take(message.param_id, value)
+            value = limits.decode(message, bytewise=self.dialect.parameters_are_bytes)
+            self.parameters.receive(message.param_id, value)
 
     def _on_extended_sys_state(self, message: Any, now_s: float) -> None:
         self.landed_state = message.landed_state
@@ -324,7 +324,7 @@ class MavlinkTelemetry:
             # Here is `place`, as far as the autopilot knows: the datum lies as far away as that says.
             here = self._frame_at(Enu(0.0, 0.0, 0.0)).from_autopilot(self._ned)
             self.datum = self._origin.at(here.minus(self.place))
-            self.frame = self._frame_at(self._origin.seen_from(self.datum))
+            self.frame = self._frame_at(self._origin.enu_from(self.datum))
         if self.frame is not None:
             self._position = self.frame.from_autopilot(self._ned)
 
@@ -343,7 +343,7 @@ class MavlinkTelemetry:
         self._position, self._ned, self._origin, self._position_s = None, None, None, None
         self._home, self._target, self._tilt_rad = None, None, None
         self.landed_state, self._flags = None, 0
-        self.parameters = limits.Parameters()
+        self.parameters = limits.ParameterReader()
 
     def _said(self, from_s: float, to_s: float) -> list[str]:
         """What it warned of between two steady times, each of it once."""

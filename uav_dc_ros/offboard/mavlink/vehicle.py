@@ -19,7 +19,7 @@ from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address, Connection, ConnectionLost, load_serial
 from uav_dc_ros.offboard.mavlink.session import Session
 from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
-from uav_dc_ros.offboard.realtime import run_when_due
+from uav_dc_ros.offboard.realtime import use_realtime_priority
 from uav_dc_ros.offboard.vehicle import Command, Telemetry
 
 OPEN_AGAIN_S = 0.5
@@ -159,7 +159,7 @@ class MavlinkVehicle:
             os.write(self._wake_in, b"\0")
 
     def _run(self) -> None:
-        run_when_due()
+        use_realtime_priority()
         opened_s = heard_s = -math.inf
         while not self._ended:
             now_s = time.monotonic()

@@ -15,9 +15,9 @@ from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.flight_stacks import (
     ARDUCOPTER,
     BATTERY,
+    CONST_POS_MODE,
     FLYABLE,
     IN_AIR,
-    MADE_UP,
     ON_GROUND,
     PREARM_CHECK,
     PX4,
@@ -113,7 +113,7 @@ class MavrosTelemetry:
             return Mode.OTHER
         if (custom := CUSTOM_MODE.fullmatch(told)) is not None:
             return dialect.mode(int(custom[1]))
-        numbers = (number for number, name in dialect.names.items() if name == told)
+        numbers = (number for number, name in dialect.mode_names.items() if name == told)
         return dialect.mode(next(numbers, -1))
 
     @property
@@ -157,7 +157,7 @@ class MavrosTelemetry:
         return (
             self.origin is not None
             and self.dialect is not None
-            and self.dialect.takes_setpoints(self.landed_state)
+            and self.dialect.accepts_setpoints(self.landed_state)
         )
 
     def telemetry(self, now_s: float, refusal: str | None = None, said: str = "") -> Telemetry:
@@ -182,7 +182,7 @@ class MavrosTelemetry:
             vehicle_s=self._time.at(now_s),
             missing=self._missing(now_s),
             refusal=refusal,
-            said=said,
+            status_text=said,
             home=self._in_grid(self._home),
             target=self._in_grid(self._target),
             target_s=self.heard.get(TARGET),
@@ -235,13 +235,13 @@ class MavrosTelemetry:
     def _estimate_ok(self, now_s: float) -> bool:
         """Does the autopilot trust its estimate: without one it sends no local position at all."""
         enabled, health = self._sensors
-        arms = not self.armed and self.dialect is not None and self.dialect.tells_readiness
+        arms = not self.armed and self.dialect is not None and self.dialect.reports_readiness
         if (AHRS | (PREARM_CHECK if arms else 0)) & enabled & ~health:
             return False
         if self._flags is None:
             return True
         fresh = now_s - self.heard[ESTIMATOR_STATUS] <= STALE_S
-        return fresh and self._flags & FLYABLE == FLYABLE and not self._flags & MADE_UP
+        return fresh and self._flags & FLYABLE == FLYABLE and not self._flags & CONST_POS_MODE
 
     def _anchor(self, now_s: float) -> None:
         """Find out where MAVROS counts from: only on the ground, where the vehicle stands still."""
@@ -253,7 +253,7 @@ class MavrosTelemetry:
         if self.datum is not None:
             if self._fix is None or now_s - self.heard[FIX] > FIX_S:
                 return
-            east_m, north_m, _ = self._fix.seen_from(self.datum)
+            east_m, north_m, _ = self._fix.enu_from(self.datum)
             here = Enu(east_m, north_m, self.place.up_m)
         self.origin = here.minus(self._local)
 

@@ -195,7 +195,7 @@ class MissionController:
 
     def _is_to_come_down(self, known: Telemetry) -> bool:
         """Is a vehicle before its mission one that nobody would have then. Of several it may be anybody's."""
-        return known.armed and known.is_meant and known.mode is Mode.COMMANDED and not self._taken
+        return known.armed and known.is_selected and known.mode is Mode.COMMANDED and not self._taken
 
     def is_done_with(self, known: Telemetry) -> bool:
         """Does the vehicle come to its end without any further word."""
@@ -260,7 +260,7 @@ class MissionController:
             return False  # it stands
         why = self.fault or (self.reason if landing else None) or known.refusal
         after = "".join(
-            f" ({word}: {what})" for word, what in (("after", why), ("it says", known.said)) if what
+            f" ({word}: {what})" for word, what in (("after", why), ("it says", known.status_text)) if what
         )
         moved = known.mode is not Mode.COMMANDED if not landing else not self._descent.is_ours(known.mode)
         self._taken |= moved or not known.armed

@@ -236,7 +236,7 @@ class Px4Telemetry:
         if self.datum is None and self.frame is not None:
             self.datum = reference.at(Enu(*(-o for o in self.frame.origin)))
         if self.datum is not None:
-            self.frame, self._reference = LocalFrame(origin=reference.seen_from(self.datum)), reference
+            self.frame, self._reference = LocalFrame(origin=reference.enu_from(self.datum)), reference
 
     def _pass_time(self, stamp_us: int) -> None:
         """Let its time go on. Its stamps leap where it agrees on a clock with the agent, or boots."""
