@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
-from uav_dc_ros.offboard.limits import ASKED
+from uav_dc_ros.offboard.limits import MAX_REQUESTS
 from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.vehicle import Limits, Telemetry
 
@@ -414,7 +414,7 @@ def test_a_vehicle_that_answers_for_no_parameter_is_not_waited_for_long(autopilo
         radio.now_s += 0.1
     assert radio.now_s < 3.0
     assert radio.hearing.telemetry(radio.now_s).missing is None
-    assert all(asked.count(name) == ASKED for name in asked)
+    assert all(asked.count(name) == MAX_REQUESTS for name in asked)
 
 
 # Another controller.
