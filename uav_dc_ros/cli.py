@@ -5,6 +5,7 @@ import atexit
 import contextlib
 import errno
 import io
+import math
 import os
 import queue
 import re
@@ -12,12 +13,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from typing import IO, TYPE_CHECKING, Any, NoReturn, TextIO, cast
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TextIO, cast
 
 from uav_dc_ros.errors import UavDcError
 
 if TYPE_CHECKING:  # rich takes as long to import as the rest of a command line
     from rich.console import Console
+    from rich.progress import ProgressColumn
 
 FAILED = 2
 INTERRUPTED = 130  # as a shell reports a command that Ctrl-C ended
@@ -42,24 +45,55 @@ class Parser(argparse.ArgumentParser):
         sys.exit(print_error(f"{self.prog}: {message}"))
 
 
-def whole_number(minimum: int) -> Callable[[str], int]:
-    """The type of an option that is a whole number of at least `minimum`."""
+def whole_number(minimum: int, maximum: int | None = None, expected: str = "") -> Callable[[str], int]:
+    """The type of an option that is a whole number within a range, its ends included."""
 
     def whole(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
             value = minimum - 1
-        if not minimum <= value < 2**62:  # so that sums of it still fit into 64 bits
-            raise argparse.ArgumentTypeError(
-                f"{text!r}; expected a whole number of at least {minimum}, and below 2^62"
-            )
+        if not minimum <= value < (2**62 if maximum is None else maximum + 1):  # sums of it fit into 64 bits
+            default = f"a whole number of at least {minimum}, and below 2^62"
+            raise argparse.ArgumentTypeError(f"{text!r}; expected {expected or default}")
         return value
 
     return whole
 
 
 count = whole_number(1)
+
+
+def number(minimum: float, maximum: float, expected: str) -> Callable[[str], float]:
+    """The type of an option that is a number within a range, its ends included."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not minimum <= value <= maximum:
+            raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}")
+        return value
+
+    return parse
+
+
+def names(expected: str, start: str = "") -> Callable[[str], tuple[str, ...]]:
+    """The type of an option that lists names, separated by commas, each once and with the same start."""
+
+    def parse(text: str) -> tuple[str, ...]:
+        found = tuple(name.strip() for name in text.split(","))
+        if not all(name and name.startswith(start) for name in found) or len(set(found)) < len(found):
+            raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}, each once, with ',' between")
+        return found
+
+    return parse
+
+
+def add_namespace(parser: argparse.ArgumentParser, help: str) -> None:
+    """Add `--namespace`, a ROS namespace, to a command."""
+    parser.add_argument("--namespace", type=namespace, default="/", metavar="NS", help=help)
 
 
 def namespace(text: str) -> str:
@@ -205,3 +239,39 @@ class _OutputStream(io.TextIOBase):
     def write(self, text: str) -> int:
         self._output.put(self._target.fileno(), text.encode(self.encoding, "backslashreplace"))
         return len(text)
+
+
+class LiveDisplay:
+    """A progress bar on a terminal, plain lines elsewhere; a context manager.
+
+    Args:
+        columns: of the bar, after the description and the bar itself.
+        settings: of rich's Progress.
+    """
+
+    def __init__(self, *columns: "ProgressColumn", **settings: Any) -> None:
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        self._output = Output()
+        self.console = self._output.console(sys.stdout)
+        self.errors = self._output.console(sys.stderr)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            *columns,
+            console=self.console,
+            disable=not self.console.is_terminal,
+            **settings,
+        )
+
+    def __enter__(self) -> Self:
+        """Start the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Restore the terminal, and wait until everything is written."""
+        self._bar.stop()
+        self._output.drain()

@@ -289,7 +289,7 @@ def test_what_cannot_be_played_is_told_and_left_out(ros: Ros, tmp_path: Path) ->
     assert printed.count("/foreign") == printed.count("/changed") == printed.count("/odd") == 1
     assert "their_msgs/msg/Thing is not installed" in printed
     assert "another definition" in printed
-    assert printed.count("does not hear /fine") == 1
+    assert printed.count("receives nothing on /fine") == 1
     status, printed = ros.run_fork(BAG, PLAY, bag, "--topics", "/foreign,/changed")
     assert (status, "no message that can be played" in printed) == (2, True), printed
 
@@ -330,7 +330,7 @@ def test_what_the_bag_has_not_is_refused(small_bag: Path, arguments: list[str], 
     parser = cli.Parser(prog="play")
     verb.add_options(parser)
     with BagReader(small_bag) as reader, pytest.raises(ParameterError, match=told):
-        verb._plan(reader, parser.parse_args([str(small_bag), *arguments]))
+        verb._playback_options(reader, parser.parse_args([str(small_bag), *arguments]))
 
 
 @pytest.mark.parametrize(
@@ -348,7 +348,7 @@ def test_a_bag_that_holds_nothing_is_told(
     parser = cli.Parser(prog="play")
     verb.add_options(parser)
     with BagReader(bag) as reader, pytest.raises(UavDcError, match=told):
-        verb._plan(reader, parser.parse_args([str(bag), *arguments]))
+        verb._playback_options(reader, parser.parse_args([str(bag), *arguments]))
 
 
 @pytest.mark.parametrize(

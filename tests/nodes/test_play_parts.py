@@ -39,11 +39,11 @@ def test_time_runs_by_the_rate_and_stands_still_in_a_pause() -> None:
     assert clock.due_s(14 * S) == 102.0
     now.s += 3.0
     assert clock.position_ns() == 16 * S
-    clock.pause()
+    clock.toggle_pause()
     now.s += 50.0
     assert clock.position_ns() == 16 * S
     assert clock.due_s(17 * S) == math.inf
-    clock.pause()
+    clock.toggle_pause()
     assert clock.due_s(17 * S) == now.s + 0.5
     clock.rate = 0.5
     assert clock.due_s(17 * S) == now.s + 2.0
@@ -64,14 +64,14 @@ def test_a_step_and_a_bag_without_schedule_carry_the_time_along() -> None:
     for clock in (PlaybackClock(1.0, paused=True), PlaybackClock(math.inf)):
         clock.jump(1 * S)
         clock.limit_ns = 7 * S
-        clock.played(7 * S)
+        clock.follow(7 * S)
         assert clock.position_ns() == 7 * S
 
 
 def test_what_had_to_be_waited_for_delays_the_rest() -> None:
     now = Steady()
     clock = PlaybackClock(1.0, now=now)
-    clock.hold(4.0)
+    clock.delay(4.0)
     assert clock.due_s(1 * S) == 105.0
 
 

@@ -1,4 +1,4 @@
-"""The time of a bag while it is played: runs faster or slower than that of the world, and may stand still."""
+"""The time of a bag during playback: faster or slower than the wall clock, or paused."""
 
 import math
 import time
@@ -9,16 +9,15 @@ RATE_MIN, RATE_MAX = 1e-3, 1e6
 
 
 class PlaybackClock:
-    """Log times of a bag against the steady clock, from one anchor: lateness of a message delays no other.
+    """Maps log times of a bag to the steady clock, from one reference point: a late message delays no other.
 
     Args:
-        rate: seconds of the bag in a second; infinite: no message waits for its time.
-        paused: does it stand still at first?
+        rate: seconds of the bag per second; infinite: no message waits for its time.
         now: the steady clock, seconds.
 
     Attributes:
-        paused: does it stand still?
-        limit_ns: log time of the next message: the time of the bag never runs ahead of what has been played.
+        paused: whether the bag's time stands still.
+        limit_ns: log time of the next message, upper bound of the bag's time.
     """
 
     def __init__(
@@ -28,46 +27,45 @@ class PlaybackClock:
         self.limit_ns = 0
         self._now = now
         self._rate = rate
-        self._at_ns, self._at_s = 0, now()
+        self._reference_ns, self._reference_s = 0, now()
 
     @property
     def rate(self) -> float:
-        """Seconds of the bag in a second."""
+        """Seconds of the bag per second; a new rate applies from the current position on."""
         return self._rate
 
     @rate.setter
     def rate(self, rate: float) -> None:
-        """Run at another rate from here on."""
         self.jump(self.position_ns())
         self._rate = rate
 
     def jump(self, to_ns: int) -> None:
-        """It is `to_ns` now."""
-        self._at_ns, self._at_s = to_ns, self._now()
+        """Set the bag's time."""
+        self._reference_ns, self._reference_s = to_ns, self._now()
 
     def position_ns(self) -> int:
-        """The time of the bag, nanoseconds since the epoch, as `/clock` tells it."""
+        """The bag's time, nanoseconds since the epoch, as published on `/clock`."""
         if self.paused or math.isinf(self._rate):
-            return self._at_ns
-        passed_ns = round((self._now() - self._at_s) * self._rate * 1e9)
-        return max(self._at_ns, min(self._at_ns + passed_ns, self.limit_ns))
+            return self._reference_ns
+        passed_ns = round((self._now() - self._reference_s) * self._rate * 1e9)
+        return max(self._reference_ns, min(self._reference_ns + passed_ns, self.limit_ns))
 
     def due_s(self, log_time_ns: int) -> float:
-        """When a message is to be published, on the steady clock; infinite while the time stands still."""
+        """Time at which to publish a message, on the steady clock; infinite during a pause."""
         if self.paused:
             return math.inf
-        return self._at_s + (log_time_ns - self._at_ns) * 1e-9 / self._rate
+        return self._reference_s + (log_time_ns - self._reference_ns) * 1e-9 / self._rate
 
-    def pause(self) -> None:
-        """Stand still, or go on."""
+    def toggle_pause(self) -> None:
+        """Pause, or resume."""
         self.jump(self.position_ns())
         self.paused = not self.paused
 
-    def hold(self, seconds: float) -> None:
-        """Time stood still for so long: somebody had to be waited for."""
-        self._at_s += seconds
+    def delay(self, seconds: float) -> None:
+        """Shift the schedule, after a wait for subscribers or a suspended process."""
+        self._reference_s += seconds
 
-    def played(self, log_time_ns: int) -> None:
-        """A message was published that no schedule asked for: it is its time now."""
+    def follow(self, log_time_ns: int) -> None:
+        """Advance to a message that was published without a schedule: single step, or infinite rate."""
         if self.paused or math.isinf(self._rate):
             self.jump(log_time_ns)

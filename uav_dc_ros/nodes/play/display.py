@@ -1,95 +1,73 @@
-"""What play shows: a bar on a terminal, plain lines elsewhere."""
+"""The progress display of playback: a bar on a terminal, plain lines elsewhere."""
 
 import math
-import sys
 import time
-from types import TracebackType
-from typing import Self
 
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import TextColumn
 
-from uav_dc_ros.cli import Output
+from uav_dc_ros.cli import LiveDisplay
 
 REFRESH_S = 0.1
-PLAIN_LINES = 6  # of progress in a pass through the bag, where there is no terminal
-# A picture takes a few milliseconds: it is drawn while no message is due, or, if one always is, now and then.
+PLAIN_LINES = 6  # per pass through the bag, without a terminal
+# Drawing takes milliseconds: it happens while no message is due, or when the last picture is overdue.
 DRAWING_S = 0.01
 OVERDUE_S = 1.0
 
 
-class PlaybackDisplay:
-    """Shows how far a bag has been played; a context manager. It draws only when it is asked to.
+class PlaybackDisplay(LiveDisplay):
+    """Shows the playback position; draws only when `progress` is called.
 
     Args:
-        begin_s, end_s: what is played, seconds from the bag's beginning.
+        begin_s, end_s: range to play, seconds from the bag's beginning.
     """
 
     def __init__(self, begin_s: float, end_s: float) -> None:
-        self._output = Output()
-        self.console = self._output.console(sys.stdout)
-        self._errors = self._output.console(sys.stderr)
+        # A drawing thread would delay messages.
+        super().__init__(TextColumn("{task.fields[text]}"), auto_refresh=False)
         self._begin_s, self._end_s = begin_s, end_s
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[told]}"),
-            console=self.console,
-            auto_refresh=False,  # a thread that draws would delay messages
-            disable=not self.console.is_terminal,
-        )
-        self._task = self._bar.add_task("waiting", total=max(1e-9, end_s - begin_s), told="")
+        self._length_s = max(1e-9, end_s - begin_s)
+        self._task = self._bar.add_task("waiting", total=self._length_s, text="")
         self._drawn_s = 0.0
         self._lines = 0
 
-    def tell(self, text: str) -> None:
-        """Tell what happens."""
-        self._bar.console.print(text, markup=False)
+    def info(self, text: str) -> None:
+        """Print a line."""
+        self.console.print(text, markup=False)
 
     def note(self, text: str) -> None:
-        """Tell what the user should know."""
-        self._errors.print(f"note: {text}", markup=False)
+        """Print a note to standard error."""
+        self.errors.print(f"note: {text}", markup=False)
 
-    def begin(self) -> None:
-        """Another pass begins."""
+    def restart(self) -> None:
+        """Start another pass."""
         self._lines = 0
 
-    def progress(self, state: str, at_s: float, rate: float, messages: int, idle_s: float) -> None:
-        """Show how far it is.
+    def progress(self, state: str, position_s: float, rate: float, messages: int, idle_s: float) -> None:
+        """Show the progress.
 
         Args:
-            state: what it does.
-            at_s: seconds from the bag's beginning.
-            rate: seconds of the bag in a second.
-            messages: published so far.
-            idle_s: how long there is nothing else to do.
+            state: waiting, paused or playing.
+            position_s: seconds from the bag's beginning.
+            rate: seconds of the bag per second.
+            messages: number published.
+            idle_s: time until the next message.
         """
-        told = f"{at_s:.1f}/{self._end_s:.1f} s, rate {text_of(rate)}, {messages} messages"
+        text = f"{position_s:.1f}/{self._end_s:.1f} s, rate {rate_text(rate)}, {messages} messages"
+        done_s = position_s - self._begin_s
         if self._bar.disable:
-            share = (at_s - self._begin_s) / max(1e-9, self._end_s - self._begin_s)
-            if share * PLAIN_LINES >= self._lines + 1:
-                self._lines = int(share * PLAIN_LINES)
-                self.tell(told)
+            lines = int(done_s / self._length_s * PLAIN_LINES)
+            if lines > self._lines:
+                self._lines = lines
+                self.info(text)
             return
         since_s = time.monotonic() - self._drawn_s
         if since_s < REFRESH_S or (idle_s < DRAWING_S and since_s < OVERDUE_S):
             return
-        self._bar.update(self._task, description=state, completed=at_s - self._begin_s, told=told)
+        self._bar.update(self._task, description=state, completed=done_s, text=text)
         self._bar.refresh()
         self._drawn_s = time.monotonic()
 
-    def __enter__(self) -> Self:
-        """Start the bar."""
-        self._bar.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Leave the terminal as it was."""
-        self._bar.stop()
-        self._output.drain()
-
-
-def text_of(rate: float) -> str:
-    """A rate in words."""
+def rate_text(rate: float) -> str:
+    """A rate as `--rate` accepts it."""
     return "max" if math.isinf(rate) else f"{rate:g}"

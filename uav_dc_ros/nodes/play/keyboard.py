@@ -1,4 +1,4 @@
-"""Single keys from a terminal, which is always left as it was."""
+"""Single keys from a terminal, whose settings are always restored."""
 
 import os
 import select
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
-# What terminals send, longest first: arrows in both of their modes.
+# Terminals send arrows in one of two modes.
 KEYS = {
     "\x1b[A": "faster",
     "\x1bOA": "faster",
@@ -27,99 +27,99 @@ KEYS = {
     " ": "pause",
     "q": "quit",
 }
-READ = 64  # bytes at once
+READ_BYTES = 64
 HELP = "space: pause, s or right: step, + or up: faster, - or down: slower, q: quit"
 
 
 class Keyboard:
-    """Reads keys, where standard input is a terminal and the command is in its foreground.
+    """Reads keys if standard input is a terminal and the command is in its foreground.
 
-    A context manager: inside, keys come at once and are not shown. Ctrl-C and Ctrl-Z stay what they are.
+    A context manager: inside, the terminal delivers keys at once and does not echo them. Ctrl-C and Ctrl-Z
+    keep their meaning.
 
     Args:
-        on_suspended: called after Ctrl-Z and `fg`, with the seconds between them.
+        on_resumed: called after Ctrl-Z and `fg`, with the seconds between them.
 
     Attributes:
-        active: are there keys to be read?
+        active: whether keys can be read.
     """
 
-    def __init__(self, on_suspended: Callable[[float], None]) -> None:
+    def __init__(self, on_resumed: Callable[[float], None]) -> None:
         self.active = False
-        self._on_suspended = on_suspended
-        self._before: list[Any] = []  # the terminal's settings
+        self._on_resumed = on_resumed
+        self._settings: list[Any] = []  # of the terminal, before
         self._fd = -1
-        self._rest = ""  # of an arrow whose end has not come yet
+        self._partial = ""  # start of an escape sequence
 
     def __enter__(self) -> Self:
-        """Take the keys."""
+        """Switch the terminal to single keys."""
         try:
             self._fd = sys.stdin.fileno()
-            # A command in the background that touches the terminal would be stopped.
+            # The terminal stops background processes that change its settings.
             foreground = os.isatty(self._fd) and os.tcgetpgrp(self._fd) == os.getpgrp()
-        except (OSError, ValueError, AttributeError):  # no standard input, or not a terminal of ours
+        except (OSError, ValueError, AttributeError):  # no standard input, or another session's terminal
             return self
         if foreground:
-            self._before = termios.tcgetattr(self._fd)
+            self._settings = termios.tcgetattr(self._fd)
             signal.signal(signal.SIGTSTP, self._suspend)
-            self._take()
+            self._activate()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the terminal as it was."""
-        if self._before:
+        """Restore the terminal."""
+        if self._settings:
             signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-            self._give_back()
+            self._restore()
 
-    def wait(self, seconds: float) -> list[str]:
-        """Wait for keys, so long at most; what they mean, in their order."""
+    def wait(self, timeout_s: float) -> list[str]:
+        """Wait for keys; returns their meanings, in order."""
         if not self.active:
-            if seconds > 0.0:
-                time.sleep(seconds)
+            if timeout_s > 0.0:
+                time.sleep(timeout_s)
             return []
-        if not select.select([self._fd], [], [], max(0.0, seconds))[0]:
+        if not select.select([self._fd], [], [], max(0.0, timeout_s))[0]:
             return []
         try:
-            read = os.read(self._fd, READ).decode(errors="replace")
+            read = os.read(self._fd, READ_BYTES).decode(errors="replace")
         except OSError:
             read = ""
-        if not read:  # the terminal is gone
+        if not read:  # the terminal was closed
             self.active = False
-        return self._meant(self._rest + read)
+        return self._parse(self._partial + read)
 
-    def _meant(self, text: str) -> list[str]:
-        meant = []
-        self._rest = ""
+    def _parse(self, text: str) -> list[str]:
+        meanings = []
+        self._partial = ""
         while text:
             key = next((key for key in KEYS if text.startswith(key)), None)
             if key is not None:
-                meant.append(KEYS[key])
+                meanings.append(KEYS[key])
             elif any(key.startswith(text) for key in KEYS):
-                self._rest = text
+                self._partial = text
                 break
             text = text[len(key or text[0]) :]
-        return meant
+        return meanings
 
-    def _take(self) -> None:
+    def _activate(self) -> None:
         tty.setcbreak(self._fd, termios.TCSANOW)
         self.active = True
 
-    def _give_back(self) -> None:
+    def _restore(self) -> None:
         self.active = False
         try:
-            termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
+            termios.tcsetattr(self._fd, termios.TCSANOW, self._settings)
         except termios.error:
-            return  # the terminal is gone
+            return  # the terminal was closed
 
     def _suspend(self, number: int, frame: Any) -> None:
-        """Ctrl-Z: stop with the terminal as it was; go on from `fg`, or without keys from `bg`."""
+        """Handle Ctrl-Z: suspend with the terminal restored; read keys again after `fg`, but not `bg`."""
         began_s = time.monotonic()
-        self._give_back()
+        self._restore()
         signal.signal(number, signal.SIG_DFL)
-        os.kill(os.getpid(), number)
-        # Here it goes on.
+        os.kill(os.getpid(), number)  # returns after SIGCONT
         signal.signal(number, self._suspend)
         if os.tcgetpgrp(self._fd) == os.getpgrp():
-            self._take()
-        self._on_suspended(time.monotonic() - began_s)
+            self._activate()
+        self._on_resumed(time.monotonic() - began_s)

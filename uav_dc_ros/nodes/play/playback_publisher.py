@@ -1,4 +1,4 @@
-"""A recorded topic that is published again: its publisher, what it still has to deliver, what it repeats."""
+"""Publishes one recorded topic again, and tracks acknowledgements and repeated messages."""
 
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
@@ -12,14 +12,14 @@ from uav_dc_ros.bags.records import CDR
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes.ros import message_types, recorded_qos
 
-AT_ONCE = Duration()
+NO_WAIT = Duration()
 
 
 def message_class(topic: RecordedTopic) -> type:
     """The class of a topic's messages, from the installed ROS packages.
 
     Raises:
-        NodeError: there is none, the messages have several types, or are not serialised as ROS 2 does.
+        NodeError: no such class, several types, or another serialization than CDR.
     """
     if topic.serialization != CDR:
         raise NodeError(f"its messages are in {topic.serialization!r}; expected {CDR!r}")
@@ -38,19 +38,15 @@ class PlaybackPublisher:
     """Publishes the messages of one recorded topic.
 
     Args:
-        node: that has the publisher.
         name: full name of the topic to publish.
-        topic: as recorded.
-        message_bytes, per_s: of its messages, see `recorded_qos.profile`.
+        message_bytes, per_s: size and rate of its messages, see `recorded_qos.profile`.
 
     Attributes:
-        name: full name of the topic.
-        publisher: of the topic.
-        latched: does who joins late get its last messages?
-        depth: so many messages, of those published last, are kept.
+        latched: whether late subscribers receive its last messages.
+        depth: number of messages in its history.
 
     Raises:
-        BagError: its recorded QoS makes no sense.
+        BagError: invalid recorded QoS.
         NodeError: its messages cannot be published here.
     """
 
@@ -58,68 +54,66 @@ class PlaybackPublisher:
         self, node: Node, name: str, topic: RecordedTopic, *, message_bytes: int, per_s: float
     ) -> None:
         kind = message_class(topic)
-        qos = recorded_qos.profile(topic, message_bytes=message_bytes, per_s=per_s)
-        self.latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        self.depth = qos.depth
+        profile = recorded_qos.profile(topic, message_bytes=message_bytes, per_s=per_s)
+        self.latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self.depth = profile.depth
         self.name = name
         self.publisher = node.create_publisher(
-            kind, name, qos, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False)
+            kind, name, profile, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False)
         )
-        self._reliable = qos.reliability == ReliabilityPolicy.RELIABLE
-        self._since_acknowledged = 0  # messages published since all were known to have arrived
-        self._played: dict[tuple[int, int], None] = {}  # the last messages of a latched topic
+        self._reliable = profile.reliability == ReliabilityPolicy.RELIABLE
+        self._unacknowledged = 0
+        self._published: dict[tuple[int, int], None] = {}  # the last messages of a latched topic
         try:
-            _same_definition(node, name, topic)
+            _check_definition(node, name, topic)
         except NodeError:
             node.destroy_publisher(self.publisher)
             raise
 
-    def begin(self) -> None:
-        """The bag is played from its beginning, once more."""
-        self._played.clear()
+    def restart(self) -> None:
+        """Forget published messages, for another pass through the bag."""
+        self._published.clear()
 
-    def repeats(self, message: BagMessage) -> bool:
-        """Was this very message published before? It is taken for published from now on, in any case.
+    def is_repeated(self, message: BagMessage) -> bool:
+        """Whether this latched message was published before; registers it as published.
 
-        A recorder that begins a file, or comes late, hears the last messages of latched topics once more.
+        A recorder that starts a new file, or starts late, receives the last latched messages again.
         """
-        if not self.latched or message.publish_time_ns <= 0:  # of another recorder, that does not tell it
+        if not self.latched or message.publish_time_ns <= 0:  # other recorders may lack a publish time
             return False
         key = message.publish_time_ns, hash(message.data)
-        if key in self._played:
+        if key in self._published:
             return True
-        self._played[key] = None
-        if len(self._played) > self.depth:
-            del self._played[next(iter(self._played))]
+        self._published[key] = None
+        if len(self._published) > self.depth:
+            del self._published[next(iter(self._published))]
         return False
 
     def has_room(self) -> bool:
-        """Whether a message can be published without pushing out one that has not arrived everywhere.
+        """Whether publishing keeps all unacknowledged messages in the history.
 
-        Publishing does not wait for slow subscribers, not even for reliable ones: the oldest message that is
-        kept makes room for the newest, and whoever has not got it yet never will.
+        Publishing never blocks: a full history drops its oldest message, even for reliable subscribers.
         """
-        return self._since_acknowledged < self.depth or self.delivered()
+        return self._unacknowledged < self.depth or self.is_acknowledged()
 
-    def delivered(self) -> bool:
-        """Whether all that was published has arrived at every reliable subscriber."""
-        if self._since_acknowledged and not self.publisher.wait_for_all_acked(AT_ONCE):
+    def is_acknowledged(self) -> bool:
+        """Whether all reliable subscribers have acknowledged all messages."""
+        if self._unacknowledged and not self.publisher.wait_for_all_acked(NO_WAIT):
             return False
-        self._since_acknowledged = 0
+        self._unacknowledged = 0
         return True
 
     def publish(self, data: bytes) -> None:
-        """Publish a message, serialised."""
+        """Publish a serialized message."""
         self.publisher.publish(data)
-        if self._reliable:
-            self._since_acknowledged += 1
+        self._unacknowledged += self._reliable
 
 
-def _same_definition(node: Node, name: str, topic: RecordedTopic) -> None:
-    """Compare what the bag says of a type with what is installed, as far as the bag says anything.
+def _check_definition(node: Node, name: str, topic: RecordedTopic) -> None:
+    """Compare the recorded definition of a type, if there is one, with the installed one.
 
     Raises:
-        NodeError: subscribers would read something else into the bytes.
+        NodeError: they differ.
     """
     if not topic.definition or topic.encoding != ENCODING:
         return
@@ -127,7 +121,7 @@ def _same_definition(node: Node, name: str, topic: RecordedTopic) -> None:
         types = get_typestore(Stores.EMPTY)
         types.register(get_types_from_msg(topic.definition.decode(), topic.type))
         recorded = types.hash_rihs01(topic.type)
-    except Exception:  # of rosbags, all sorts: a definition that is damaged, or too new for it
+    except Exception:  # rosbags raises many kinds: the definition is damaged, or unsupported
         return
     ours = [end for end in node.get_publishers_info_by_topic(name) if end.node_name == node.get_name()]
     installed = {str(end.topic_type_hash) for end in ours if end.topic_type == topic.type}

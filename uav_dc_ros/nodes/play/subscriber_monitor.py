@@ -1,4 +1,4 @@
-"""Who else is there while a bag is played: subscribers, those that cannot hear, other publishers."""
+"""Subscribers and other publishers of the topics of a playback."""
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator
@@ -13,35 +13,30 @@ from uav_dc_ros.topics import TOPICS
 
 
 class SubscriberMonitor:
-    """Looks at the graph around some outlets.
+    """Queries the ROS graph for the peers of playback publishers."""
 
-    Args:
-        node: that publishes.
-        outlets: its outlets.
-    """
-
-    def __init__(self, node: Node, outlets: Collection[PlaybackPublisher]) -> None:
+    def __init__(self, node: Node, publishers: Collection[PlaybackPublisher]) -> None:
         self._node = node
-        self._outlets = outlets
-        self._told: set[tuple[str, str]] = set()
+        self._publishers = publishers
+        self._reported: set[tuple[str, str]] = set()
 
     def counts(self) -> dict[str, int]:
-        """Number of subscribers that hear, by published topic."""
-        return {outlet.name: outlet.publisher.get_subscription_count() for outlet in self._outlets}
+        """Number of matched subscriptions, by published topic."""
+        return {each.name: each.publisher.get_subscription_count() for each in self._publishers}
 
-    def subscribers(self, outlet: PlaybackPublisher) -> str:
-        """Full names of the nodes that subscribe to an outlet's topic."""
-        ends = self._node.get_subscriptions_info_by_topic(outlet.name)
-        return ", ".join(sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends))
+    def subscribers(self, topic: str) -> str:
+        """Full names of the nodes that subscribe to a topic."""
+        ends = self._node.get_subscriptions_info_by_topic(topic)
+        return ", ".join(sorted(qos.full_name(end) for end in ends))
 
     def mission(self, also: Collection[str] = ()) -> str | None:
-        """The mission that publishes an outlet's topic, and has to be the only one; None: there is none.
+        """Description of a mission that publishes a played exclusive topic; None without one.
 
         Args:
-            also: full names of topics that are published beside the outlets.
+            also: full names of further topics that the player publishes.
         """
         publishers: dict[str, dict[str, list[str]]] = defaultdict(dict)  # by namespace and relative name
-        for name in sorted({*also, *(outlet.name for outlet in self._outlets)}):
+        for name in sorted({*also, *(each.name for each in self._publishers)}):
             namespace, _, relative = name.rpartition("/")
             if relative in TOPICS and TOPICS[relative].exclusive:
                 ends = self._node.get_publishers_info_by_topic(name)
@@ -52,20 +47,19 @@ class SubscriberMonitor:
                 return other_publishers.OtherPublishers(doubles=found.doubles).told()
         return None
 
-    def others(self) -> Iterator[str]:
-        """What is to be told of topics that somebody else publishes, too: two worlds at once help nobody."""
-        names = [outlet.name for outlet in self._outlets]
+    def competing_publishers(self) -> Iterator[str]:
+        """A note for each played topic that another node publishes."""
+        names = [each.name for each in self._publishers]
         for name in dict.fromkeys(names):
             if self._node.count_publishers(name) > names.count(name):
-                ends = self._node.get_publishers_info_by_topic(name)
-                nodes = {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}
+                nodes = {qos.full_name(end) for end in self._node.get_publishers_info_by_topic(name)}
                 others = sorted(nodes - {self._node.get_fully_qualified_name()})
-                yield f"topic {name} is published by {', '.join(others) or 'another player'}, too"
+                yield f"topic {name} is also published by {', '.join(others) or 'another player'}"
 
-    def deaf(self) -> Iterator[str]:
-        """What is to be told of subscribers that cannot hear, of each once."""
-        publishers = [outlet.publisher for outlet in self._outlets]
-        for topic, peer, why in qos.incompatible(self._node, publishers, ()):
-            if (topic, peer) not in self._told:
-                self._told.add((topic, peer))
-                yield f"{peer} does not hear {topic}: {why}"
+    def incompatible_subscribers(self) -> Iterator[str]:
+        """A note for each subscriber with an incompatible type or QoS, once each."""
+        publishers = [each.publisher for each in self._publishers]
+        for topic, peer, reason in qos.incompatible(self._node, publishers, ()):
+            if (topic, peer) not in self._reported:
+                self._reported.add((topic, peer))
+                yield f"{peer} receives nothing on {topic}: {reason}"

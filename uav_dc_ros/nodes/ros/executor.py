@@ -6,6 +6,8 @@ rclpy's EventsExecutor would be the one to use, but it is experimental, and call
 of 7.1.6. `benchmarks/lockstep.py` measures this one beside rclpy's own.
 """
 
+import gc
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -200,3 +202,16 @@ def _answer(client: Any) -> None:
     except KeyError:
         return  # nobody waits for it any more
     future.set_result(response)
+
+
+def shut_down(context: Context, timeout_s: float) -> None:
+    """Shut a context down in a thread: the middleware was seen to hang while several participants leave."""
+
+    def leave() -> None:
+        gc.collect()  # the middleware's part of a node ends with the last reference to it
+        context.try_shutdown()
+        context.destroy()
+
+    thread = threading.Thread(target=leave, daemon=True)
+    thread.start()
+    thread.join(timeout_s)
