@@ -231,9 +231,9 @@ class Flight:
         pose = cdr.Pose(serialize_message(pose_message(np.array([mission, step, 100.0]), time_ns)))
         at_ns = {topic: self.published_ns() for topic in ("pose", "users", "target")}
         told = {
-            "pose": lambda: self.track.pose(pose, at_ns["pose"]),
-            "target": lambda: self.track.target(pose),
-            "users": lambda: self.track.users(
+            "pose": lambda: self.track.add_pose(pose, at_ns["pose"]),
+            "target": lambda: self.track.add_target(pose),
+            "users": lambda: self.track.add_users(
                 mission=mission, step=step, stamp_ns=time_ns, published_ns=at_ns["users"]
             ),
         }
@@ -262,7 +262,7 @@ def test_what_is_flown_between_two_missions_belongs_to_none() -> None:
     for call in flight.step(0, 60):
         call()
     between = cdr.Pose(serialize_message(pose_message(np.array([9.0, 9.0, 100.0]), 61 * STEP_NS - 1)))
-    flight.track.pose(between, flight.published_ns())
+    flight.track.add_pose(between, flight.published_ns())
     for call in flight.step(1, 0):
         call()
     assert flight.steps == [(1.0, 0.0)]
@@ -317,7 +317,7 @@ def test_the_way_of_a_real_vehicle_is_thinned() -> None:
     track = PathHistory(SCENARIO)
     poses = list(real_poses(60.0, 10.0))
     for i, pose in enumerate(poses):
-        track.pose(pose, i)
+        track.add_pose(pose, i)
     east_m = [pose.position_m[0] for pose in track.poses]
     assert np.diff(east_m) == pytest.approx(5.0, abs=0.51)
     assert (track.version, track.newest) == (len(east_m), poses[-1])
@@ -326,7 +326,7 @@ def test_the_way_of_a_real_vehicle_is_thinned() -> None:
         cdr.Pose(cdr.encode_pose(np.array([600.0, 0.0, 100.0]), round(t * 1e9))) for t in (60.0, 60.5, 61.0)
     ]
     for i, pose in enumerate(standing):
-        track.pose(pose, 10_000 + i)
+        track.add_pose(pose, 10_000 + i)
     assert (track.version, track.newest) == (version + 1, standing[-1]), "the path need not be drawn again"
 
 
@@ -336,8 +336,8 @@ def test_a_way_of_any_length_stays_small() -> None:
     most = 0
     for i in range(36_000 * 2):
         place_m = np.array([i * 5.0, 0.0, 100.0])
-        track.pose(cdr.Pose(cdr.encode_pose(place_m, i * 5 * 10**8)), i)
-        most = max(most, len(track._poses))
+        track.add_pose(cdr.Pose(cdr.encode_pose(place_m, i * 5 * 10**8)), i)
+        most = max(most, len(track._path.kept))
     assert 500 < len(track.poses) <= most <= POSES_MAX
     assert track.poses[0].stamp_ns == 0
     apart_ns = np.diff([pose.stamp_ns for pose in track.poses])

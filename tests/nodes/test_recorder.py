@@ -147,7 +147,7 @@ def test_topics_by_list_and_a_namespace(ros: Ros) -> None:
             "/uav1/a": 5,
             "/elsewhere/b": 5,
         }
-    assert json.loads(custom(ros.folder / "bag")["not_recorded"]) == {"/uav1/never": "nobody published it"}
+    assert json.loads(custom(ros.folder / "bag")["not_recorded"]) == {"/uav1/never": "it has no publisher"}
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 class Recorder(RecorderBase):
     """Writes a mission's bag; what it is about (scenario, policy and its hash, seed) goes inside."""
 
-    looks_twice = True  # only then is it known whether another mission lives there
+    delays_new_topics = True  # a later scan tells whether another mission owns their namespace
 
     def __init__(self) -> None:
         super().__init__("recorder")

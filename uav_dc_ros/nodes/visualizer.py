@@ -1,6 +1,6 @@
 """The visualizer: the mission as RViz and Foxglove draw it, on `path` and `markers`.
 
-It hears every pose, for the path: see `track`. Of everything else it keeps the newest, as it came, and
+It hears every pose, for the path: see `PathHistory`. Of everything else it keeps the newest, as it came, and
 decodes that only when it draws: a lockstep of a thousand steps a second is drawn a few times a second.
 """
 
@@ -74,17 +74,17 @@ class Visualizer(MissionNode):
         return self.create_raw_subscription(topic, hear)
 
     def _take_pose(self, name: str, data: bytes, published_ns: int) -> None:
-        self._track.pose(cdr.Pose(data), published_ns)
+        self._track.add_pose(cdr.Pose(data), published_ns)
 
     def _take_target(self, name: str, data: bytes, published_ns: int) -> None:
-        self._track.target(cdr.Pose(data))
+        self._track.add_target(cdr.Pose(data))
 
     def _take_users(self, name: str, data: bytes, published_ns: int) -> None:
         try:
             heading = msgspec.json.decode(cdr.decode_string(data), type=_Heading)
         except (msgspec.DecodeError, RecursionError) as error:
             raise MessageError("malformed", str(error)) from None
-        began_ns = self._track.users(
+        began_ns = self._track.add_users(
             mission=heading.mission, step=heading.step, stamp_ns=heading.stamp_ns, published_ns=published_ns
         )
         if began_ns is not None and self._newest.get("rates", (began_ns + 1, b""))[0] <= began_ns:

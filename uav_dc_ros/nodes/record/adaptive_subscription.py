@@ -1,4 +1,4 @@
-"""One recorded topic: its subscription, changed when publishers come that offer less, and what it lost."""
+"""The subscription of one recorded topic: adapts to its publishers' QoS, and counts lost messages."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -14,8 +14,8 @@ from uav_dc_ros.nodes.ros.rclpy_private import EventCount
 Callback = Callable[[bytes, Any], None]
 
 
-def union(ends: Sequence[TopicEndpointInfo]) -> QoSProfile:
-    """The QoS with which all publishers are heard, and those that resend or keep messages do so."""
+def common_qos(ends: Sequence[TopicEndpointInfo]) -> QoSProfile:
+    """The strictest QoS that matches all publishers."""
     offers = [end.qos_profile for end in ends]
     reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
     latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
@@ -26,8 +26,8 @@ def union(ends: Sequence[TopicEndpointInfo]) -> QoSProfile:
     )
 
 
-class _Subscription:
-    """A subscription, and the middleware's count of what it lost."""
+class _CountedSubscription:
+    """A subscription, and the middleware's count of its lost messages."""
 
     def __init__(self, subscription: Any) -> None:
         self.subscription = subscription
@@ -35,27 +35,26 @@ class _Subscription:
         self.close = self._losses.close
 
     def lost(self) -> int:
-        """Messages that were lost until now; 0 with a middleware that does not count."""
+        """Number of lost messages; 0 with a middleware that does not count."""
         count = self._losses.take()
         return 0 if count is None else int(count.total_count)
 
     def take(self) -> Any:
-        """The next message and its info; None if there is none now."""
+        """The next message and its info, or None."""
         with self.subscription.handle:
             return self.subscription.handle.take_message(self.subscription.msg_type, True)
 
 
 class AdaptiveSubscription:
-    """A topic that is recorded.
+    """Subscribes to a recorded topic.
 
     Args:
-        node: that records it.
         name: full name.
         type: ROS 2 message type.
-        callback: takes each message and its info.
+        callback: receives each message and its info.
 
     Attributes:
-        publishers: how many there were when somebody last looked.
+        publishers: number of publishers at the last scan of the graph.
     """
 
     def __init__(self, node: Node, name: str, type: str, callback: Callback) -> None:
@@ -64,35 +63,35 @@ class AdaptiveSubscription:
         self.callback = callback
         self.publishers = 0
         self._node = node
-        self._ear: _Subscription
-        self._kind: Any = None  # the class of its messages; None: it is not to adapt
+        self._current: _CountedSubscription
+        self._previous: _CountedSubscription | None = None  # until the current one has matched as many
+        self._class: Any = None  # of the messages; None: the subscription does not adapt
         self._profile: QoSProfile
-        self._leaving: _Subscription | None = None
-        self._seen: set[tuple[int, int]] = set()  # messages, while two subscriptions hear them
-        self._lost = 0  # by subscriptions that are gone
+        self._received: set[tuple[int, int]] = set()  # messages, while there are two subscriptions
+        self._lost = 0  # by closed subscriptions
 
     @property
     def subscription(self) -> Any:
-        """The subscription."""
-        return self._ear.subscription
+        """The current subscription."""
+        return self._current.subscription
 
-    def add(self, subscription: Any, *, adapts: bool) -> None:
-        """Use a subscription that somebody else has made; one that does not adapt stays as it is."""
-        self._ear = _Subscription(subscription)
-        self._kind = subscription.msg_type if adapts else None
+    def use(self, subscription: Any, *, adapts: bool) -> None:
+        """Use an existing subscription."""
+        self._current = _CountedSubscription(subscription)
+        self._class = subscription.msg_type if adapts else None
         self._profile = subscription.qos_profile
 
-    def subscribe(self, kind: Any, ends: Sequence[TopicEndpointInfo]) -> None:
-        """Make a subscription that hears all of these publishers."""
-        self._kind = kind
-        self._profile = union(ends)
-        self._ear = self._made(self.callback)
+    def subscribe(self, message_class: Any, ends: Sequence[TopicEndpointInfo]) -> None:
+        """Create a subscription that matches all these publishers."""
+        self._class = message_class
+        self._profile = common_qos(ends)
+        self._current = self._create(self.callback)
 
-    def _made(self, callback: Callback) -> _Subscription:
-        handler: Any = callback  # rclpy sees by the signature what it takes; its types do not
-        return _Subscription(
+    def _create(self, callback: Callback) -> _CountedSubscription:
+        handler: Any = callback  # rclpy detects a second parameter, which its types lack
+        return _CountedSubscription(
             self._node.create_subscription(
-                self._kind,
+                self._class,
                 self.name,
                 handler,
                 self._profile,
@@ -102,75 +101,77 @@ class AdaptiveSubscription:
         )
 
     def adapt(self, ends: Sequence[TopicEndpointInfo]) -> None:
-        """Hear new publishers, too, if they offer less than was asked for.
+        """Match new publishers, too, with a second subscription if they offer less than the first requests.
 
-        A new subscription takes over from the old one; while there are two, each message is taken once.
+        While there are two subscriptions, each message is handled once.
         """
-        if self._kind is None or self._leaving is not None:
+        if self._class is None or self._previous is not None:
             return
-        wanted = union(ends)
-        if not _asks_less(wanted, self._profile):
+        profile = common_qos(ends)
+        if not _requests_less(profile, self._profile):
             return
-        self._profile = wanted
-        self._leaving = self._ear
-        self._leaving.subscription.callback = self._once
-        self._ear = self._made(self._once)
+        self._profile = profile
+        self._previous = self._current
+        self._previous.subscription.callback = self._once
+        self._current = self._create(self._once)
 
     def _once(self, data: bytes, info: Any) -> None:
         key = (info["publication_sequence_number"], info["source_timestamp"])
-        if key not in self._seen:
-            self._seen.add(key)
+        if key not in self._received:
+            self._received.add(key)
             self.callback(data, info)
 
     def settle(self) -> None:
-        """End the time of two subscriptions, once the new one hears all that the old one does."""
-        if self._leaving is None:
+        """Close the previous subscription, once the current one has matched all its publishers."""
+        previous = self._previous
+        if (
+            previous is None
+            or self.subscription.get_publisher_count() < previous.subscription.get_publisher_count()
+        ):
             return
-        if self.subscription.get_publisher_count() < self._leaving.subscription.get_publisher_count():
-            return
-        for ear in (self._leaving, self._ear):
-            while (taken := ear.take()) is not None:
+        for each in self._all:
+            while (taken := each.take()) is not None:
                 self._once(*taken)
-        self._lost += self._leaving.lost()
-        self._leaving.close()
-        self._node.destroy_subscription(self._leaving.subscription)
-        self._leaving = None
+        self._lost += previous.lost()
+        previous.close()
+        self._node.destroy_subscription(previous.subscription)
+        self._previous = None
         self.subscription.callback = self.callback
-        self._seen.clear()
+        self._received.clear()
 
     def lost(self) -> int:
-        """Messages that were published, and lost before they came here."""
-        return self._lost + sum(ear.lost() for ear in self._ears)
+        """Number of published messages that did not arrive."""
+        return self._lost + sum(each.lost() for each in self._all)
 
     @property
-    def _ears(self) -> list[_Subscription]:
-        return [self._ear] if self._leaving is None else [self._leaving, self._ear]
+    def _all(self) -> list[_CountedSubscription]:
+        return [self._current] if self._previous is None else [self._previous, self._current]
 
     def drain(self, until_ns: int, deadline_s: float) -> int:
-        """Handle what has arrived; how many of these messages there was no time for.
+        """Handle messages that have arrived; returns the number of unhandled ones at the deadline.
 
         Args:
-            until_ns: messages published later do not count, nanoseconds since the epoch.
-            deadline_s: of the monotonic clock.
+            until_ns: latest publication time, nanoseconds since the epoch.
+            deadline_s: on the monotonic clock.
         """
-        left = 0
-        for ear in self._ears:
-            while (taken := ear.take()) is not None and taken[1]["source_timestamp"] <= until_ns:
+        unhandled = 0
+        for each in self._all:
+            while (taken := each.take()) is not None and taken[1]["source_timestamp"] <= until_ns:
                 if time.monotonic() < deadline_s:
-                    ear.subscription.callback(*taken)
+                    each.subscription.callback(*taken)
                 else:
-                    left += 1
-        return left
+                    unhandled += 1
+        return unhandled
 
     def close(self) -> None:
-        """Let go of the subscriptions."""
-        for ear in self._ears:
-            ear.close()
-            self._node.destroy_subscription(ear.subscription)
-        self._leaving = None
+        """Destroy the subscriptions."""
+        for each in self._all:
+            each.close()
+            self._node.destroy_subscription(each.subscription)
+        self._previous = None
 
 
-def _asks_less(wanted: QoSProfile, asked: QoSProfile) -> bool:
-    return (wanted.reliability != asked.reliability and asked.reliability == ReliabilityPolicy.RELIABLE) or (
-        wanted.durability != asked.durability and asked.durability == DurabilityPolicy.TRANSIENT_LOCAL
+def _requests_less(new: QoSProfile, old: QoSProfile) -> bool:
+    return (old.reliability == ReliabilityPolicy.RELIABLE and new.reliability != old.reliability) or (
+        old.durability == DurabilityPolicy.TRANSIENT_LOCAL and new.durability != old.durability
     )

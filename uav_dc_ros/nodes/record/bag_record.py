@@ -1,7 +1,4 @@
-"""`python -m uav_dc_ros.bag record`: topics of any publisher into a bag, without a mission.
-
-Ctrl-C or SIGTERM ends it, and closes the bag.
-"""
+"""The verb `record`: records topics of any publisher into a bag, without a mission, until Ctrl-C or SIGTERM."""
 
 import argparse
 from collections.abc import Mapping
@@ -20,28 +17,24 @@ NODE = "bag_record"
 
 
 class BagRecorder(RecorderBase):
-    """Records until it is stopped, and tells what it recorded.
-
-    Args:
-        values: of its parameters.
-    """
+    """Records until it is stopped; `values` are its parameters."""
 
     def __init__(self, values: Mapping[str, bool | int | float | str]) -> None:
         overrides = [rclpy.Parameter(name, value=value) for name, value in values.items()]
-        super().__init__(NODE, [*overrides, rclpy.Parameter("peers", value=[NODE])])  # waits for nobody
+        super().__init__(NODE, [*overrides, rclpy.Parameter("peers", value=[NODE])])  # waits for no peer
 
     def about(self) -> Mapping[str, str]:
-        """By what it was recorded."""
+        """The version of this package."""
         return {"version": __version__}
 
     def activate(self) -> None:
-        """Record, and say so."""
+        """Start recording, and log what is recorded."""
         super().activate()
-        what = ", ".join(sorted(self.asked)) or f"everything in {self.get_namespace()}"
+        what = ", ".join(sorted(self.selected)) or f"everything in {self.get_namespace()}"
         self.get_logger().info(f"recording {what} into {self.values['bag']}; Ctrl-C ends it")
 
     def deactivate(self) -> None:
-        """Close the bag, and tell what it holds."""
+        """Close the bag, and log its size."""
         writer = self.writer
         super().deactivate()
         if writer is not None:
@@ -53,26 +46,18 @@ class BagRecorder(RecorderBase):
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the new bag")
-    parser.add_argument(
-        "--resume", action="store_true", help="go on with the bag of a recorder that was killed"
-    )
-    parser.add_argument(
-        "--namespace",
-        type=cli.namespace,
-        default="/",
-        metavar="NS",
-        help="whose topics to record (default: all of them)",
-    )
-    parser.add_argument("--topics", default="", metavar="A,B", help=f"{p.RECORDED_TOPICS.description}")
-    parser.add_argument(
-        "--split-bytes", type=cli.whole_number(0), default=0, metavar="N", help=p.SPLIT_BYTES.description
-    )
-    parser.add_argument("--split-s", type=float, default=0.0, metavar="S", help=p.SPLIT_S.description)
-    parser.add_argument("--compression", choices=COMPRESSIONS, default="zstd", help=p.COMPRESSION.description)
-    parser.add_argument(
+    size = cli.whole_number(0)
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="folder of the new bag")
+    add("--resume", action="store_true", help="go on with the bag of a recorder that was killed")
+    cli.add_namespace(parser, "whose topics to record (default: all of them)")
+    add("--topics", default="", metavar="A,B", help=p.RECORDED_TOPICS.description)
+    add("--split-bytes", type=size, default=0, metavar="N", help=p.SPLIT_BYTES.description)
+    add("--split-s", type=float, default=0.0, metavar="S", help=p.SPLIT_S.description)
+    add("--compression", choices=COMPRESSIONS, default="zstd", help=p.COMPRESSION.description)
+    add(
         "--min-free-bytes",
-        type=cli.whole_number(0),
+        type=size,
         default=p.MIN_FREE_BYTES.default,
         metavar="N",
         help=f"{p.MIN_FREE_BYTES.description} (default: {p.MIN_FREE_BYTES.default})",
@@ -80,10 +65,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Record until Ctrl-C or SIGTERM; leaves the process.
+    """Record until Ctrl-C or SIGTERM; exits the process.
 
     Raises:
-        ParameterError: a value that makes no sense.
+        ParameterError: an invalid value.
     """
     values = {
         "bag": str(options.out),
@@ -94,6 +79,6 @@ def run(options: argparse.Namespace) -> int:
         "compression": options.compression,
         "min_free_bytes": options.min_free_bytes,
     }
-    environment.prepare(alone=False)  # what is recorded may come from anywhere
+    environment.prepare(alone=False)  # publishers may be on any host
     remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
     node_main.main(lambda: BagRecorder(values), arguments=remapped)

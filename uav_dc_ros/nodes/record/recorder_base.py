@@ -1,10 +1,9 @@
-"""What nodes that write bags share: they hear whatever is published, and write it, serialised as it came.
+"""Base of nodes that write bags: they record serialized messages as received.
 
-Messages that were lost on the way are counted by the middleware: what a best-effort reader sees missing
-between two messages, and what a reliable publisher no longer had when it was to send it again. Subscriptions
-keep all; those of Fast DDS hold five thousand messages, so only who reads too slowly for long loses any.
-What nobody can count: the last messages of a best-effort publisher, if none comes after them, and what was
-published before a topic was found, a fifth of a second at most, unless it is latched.
+The middleware counts lost messages: gaps in a best-effort topic, and messages that a reliable publisher could
+not resend. Subscriptions keep all; Fast DDS limits them to five thousand messages, so only a slow recorder
+loses any. Not counted: the last messages of a best-effort publisher, and what was published before a topic
+was discovered (up to a fifth of a second), unless it is latched.
 """
 
 import importlib
@@ -25,58 +24,58 @@ from uav_dc_ros.topics import TOPICS, Topic
 if TYPE_CHECKING:  # what writes bags is slow to import: see `prepare`
     from uav_dc_ros.bags.write import BagWriter
 
-LOOK_S = 0.2  # for new topics
-SYNC_S = 0.5  # what a kill takes at most is what came since, and what waits to be handled
-DRAIN_S = 2.0  # for messages that have arrived when the node is deactivated
-HOUSEKEEPING = ("/parameter_events", "/rosout", "/transition_event")  # of ROS: not unless asked for by name
+SCAN_S = 0.2  # period of scans for new topics
+SYNC_S = 0.5  # a kill loses at most the messages of this time, and those not handled yet
+DRAIN_S = 2.0  # for received messages, at deactivation
+HOUSEKEEPING = ("/parameter_events", "/rosout", "/transition_event")  # of ROS: recorded only by name
 
 
 class RecorderBase(MissionNode):
-    """Records the topics of its row, and whatever else it is to.
+    """Records the topics of its row, and other topics that it discovers.
 
     Attributes:
         writer: the bag; None without one.
-        looks_twice: does it wait a moment before it records a new topic?
-        asked: full names of the topics to record; empty: all in the node's namespace.
+        delays_new_topics: whether a topic is recorded only from the second scan on that finds it.
+        selected: full names of the topics to record; empty: all in the node's namespace.
     """
 
     drains = True
-    rest_s = 0.005  # nobody waits for it
-    looks_twice = False
+    rest_s = 0.005  # no node waits for the recorder
+    delays_new_topics = False
 
     def __init__(self, name: str, *arguments: Any) -> None:
         super().__init__(name, *arguments)
         self.writer: BagWriter | None = None
-        self.asked: set[str] = set()
-        self._hearings: dict[str, AdaptiveSubscription] = {}  # by full name
+        self.selected: set[str] = set()
+        self._recorded: dict[str, AdaptiveSubscription] = {}  # by full name
         self._announced: set[str] = set()
         self._not_recorded: dict[str, str] = {}  # reasons
-        self._seen: Set[str] = set()  # topics at the last look
+        self._scanned: Set[str] = set()  # topics at the last scan
         self._undrained: dict[str, int] = {}
 
     def about(self) -> Mapping[str, str]:
-        """What the bag is about.
+        """Custom data of the bag.
 
         Raises:
-            UavDcError: it cannot be told.
+            UavDcError: a parameter is invalid.
         """
         raise NotImplementedError
 
-    # The life cycle.
+    # Life cycle.
 
     def prepare(self) -> None:
-        """Import what writes bags."""
+        """Import the bag writer."""
         importlib.import_module("uav_dc_ros.bags.write")
         importlib.import_module("uav_dc_ros.nodes.ros.recorded_qos")
 
     def configure(self) -> None:
-        """Make the bag."""
+        """Create the bag."""
         from uav_dc_ros.bags.write import BagWriter
 
         given = self.values
         if not given["bag"]:
             raise ParameterError("bag: ''; expected the folder of a new bag (-p bag:=FOLDER)")
-        self.asked = {self._full(name) for name in given["topics"]}
+        self.selected = {self._full_name(name) for name in given["topics"]}
         about, folder = self.about(), Path(given["bag"])
         self._check_space(folder)
         self.writer = BagWriter(
@@ -89,17 +88,17 @@ class RecorderBase(MissionNode):
         )
         for kept in (self._announced, self._not_recorded, self._undrained):
             kept.clear()
-        self._seen = set()
+        self._scanned = set()
 
-    def _full(self, name: str) -> str:
+    def _full_name(self, name: str) -> str:
         try:
             return self.resolve_topic_name(name)
-        except Exception as error:  # rclpy has one for each way in which a name can be wrong
-            told = str(error).splitlines()[0]
-            raise ParameterError(f"topics: {name!r}: {told}; expected the name of a topic") from None
+        except Exception as error:  # rclpy has an error class for each rule of names
+            reason = str(error).splitlines()[0]
+            raise ParameterError(f"topics: {name!r}: {reason}; expected the name of a topic") from None
 
     def activate(self) -> None:
-        """Record.
+        """Start recording.
 
         Raises:
             ParameterError: the bag of this configuration is closed.
@@ -108,22 +107,24 @@ class RecorderBase(MissionNode):
             raise ParameterError(
                 f"bag: {self.values['bag']} is closed; clean the node up, and configure it with a new folder"
             )
-        self.timer(LOOK_S, self._look)
+        self.timer(SCAN_S, self._scan)
         self.timer(SYNC_S, self._sync)
 
     def deactivate(self) -> None:
-        """Write what has arrived by now, and close the bag."""
+        """Write all received messages, and close the bag."""
         if self.writer is not None and not self.writer.closed:
-            self._drain()
+            now_ns, deadline_s = time.time_ns(), time.monotonic() + DRAIN_S
+            for name, topic in self._recorded.items():
+                self._undrained[name] = topic.drain(now_ns, deadline_s)
             dropped = self.dropped()
             self.writer.tell_dropped(dropped)
-            for name in self.asked - self._hearings.keys() - self._not_recorded.keys():
-                self._not_recorded[name] = "nobody published it"
+            for name in self.selected - self._recorded.keys() - self._not_recorded.keys():
+                self._not_recorded[name] = "it has no publisher"
             if self._not_recorded:
                 self.writer.tell({"not_recorded": json.dumps(self._not_recorded, sort_keys=True)})
             if dropped:
-                told = ", ".join(f"{name} {n}" for name, n in sorted(dropped.items()))
-                self.get_logger().warning(f"dropped messages: {told}")
+                counts = ", ".join(f"{name} {n}" for name, n in sorted(dropped.items()))
+                self.get_logger().warning(f"dropped messages: {counts}")
         self.cleanup()
 
     def cleanup(self) -> None:
@@ -133,120 +134,116 @@ class RecorderBase(MissionNode):
             self.writer = None
 
     def _fall_silent(self) -> None:
-        for hearing in self._hearings.values():
-            hearing.close()
-        self._hearings.clear()
+        for topic in self._recorded.values():
+            topic.close()
+        self._recorded.clear()
         super()._fall_silent()
 
-    # What is heard.
+    # Messages.
 
     def subscribe(self, topic: Topic) -> Any:
-        """Subscribe to a topic of the row, for its bytes.
+        """Subscribe to a topic of the row, serialized.
 
-        Also of a pose it asks for all that our nodes offer: best effort, a busy computer loses some. When one
-        comes that offers less, as an autopilot's does, it asks for less, unless that was overridden.
+        It requests the table's QoS even for poses, since best effort loses some on a busy machine. For a
+        publisher that offers less, such as an autopilot's, it adapts unless the QoS was overridden.
         """
-        assert self.writer is not None, "it was configured"
         name = self.resolve_topic_name(topic.name)
-        hearing = AdaptiveSubscription(self, name, topic.type, self._hear(name, topic.name, topic))
+        recorded = AdaptiveSubscription(self, name, topic.type, self._handler(name, topic))
         override = f"qos_overrides.{name}.subscription."
         overridden = any(given.startswith(override) for given in rclpy_private.overrides(self))
-        all_of_it = replace(topic, requests_reliable=topic.reliable)
-        subscription = self.create_raw_subscription(all_of_it, hearing.callback)
-        hearing.add(subscription, adapts=not (topic.requests_reliable or overridden))
-        self._hearings[name] = hearing
-        return hearing.subscription
+        full_qos = replace(topic, requests_reliable=topic.reliable)
+        subscription = self.create_raw_subscription(full_qos, recorded.callback)
+        recorded.use(subscription, adapts=not (topic.requests_reliable or overridden))
+        self._recorded[name] = recorded
+        return subscription
 
-    def _hear(self, name: str, label: str, topic: Topic | None) -> Any:
-        """What is done with each message of a topic; `label` is its name in diagnostics."""
+    def _handler(self, name: str, topic: Topic | None) -> Any:
+        """The callback of a topic: of the table, or None."""
         writer = self.writer
-        assert writer is not None, "it was configured"
-        if self.asked and name not in self.asked:
-            return lambda data, info: None  # a mission's peers count on the subscription
+        assert writer is not None, "configure created it"
+        if self.selected and name not in self.selected:
+            return lambda data, info: None  # the peers of a mission wait for the subscription
         already_ns = writer.already_written.get(name, -1)
+        label = name if topic is None else topic.name
         heard, write, announced = self.meter.heard, writer.write, self._announced
-        other_run = self.is_of_another_run
 
-        def hear(data: bytes, info: Any) -> None:
-            if topic is not None and other_run(topic.name, data):
-                return
+        def handle(data: bytes, info: Any) -> None:
+            if topic is not None:
+                if self.is_of_another_run(topic.name, data):
+                    return
+                if name not in announced:
+                    self.announce(name, topic)
             published_ns, received_ns = info["source_timestamp"], info["received_timestamp"]
-            if name not in announced and topic is not None:
-                self.announce(name, topic)
             if published_ns > already_ns:
                 write(name, data, log_time_ns=received_ns, publish_time_ns=published_ns)
             heard(label, info)
 
-        return hear
+        return handle
 
     def announce(self, name: str, topic: Topic) -> None:
-        """Enter a topic of the row into the bag, once, with the QoS that its publishers offer by now.
-
-        Of a topic that nobody publishes yet it is the table's.
-        """
-        if name not in self._announced and (not self.asked or name in self.asked):
+        """Add a topic of the row to the bag, once, with its publishers' QoS, or without any the table's."""
+        if name not in self._announced and (not self.selected or name in self.selected):
             self._announce(name, topic.type, topic)
 
     def _announce(self, name: str, type: str, topic: Topic | None) -> None:
-        """Enter a topic into the bag.
+        """Add a topic to the bag.
 
         Raises:
             BagError: earlier parts of the bag have it with another type; or the disk is full, or gone.
-            LookupError: a type inside its type is not installed.
+            LookupError: a nested type is not installed.
         """
         from uav_dc_ros.nodes.ros import recorded_qos
 
         ends = [end for end in self.get_publishers_info_by_topic(name) if end.topic_type == type]
         profiles = [end.qos_profile for end in ends] or ([] if topic is None else [qos.offered(topic)])
         depth = None if topic is None else topic.depth
-        hashes = {str(end.topic_type_hash) for end in ends}
         assert self.writer is not None, "subscriptions end with the bag"
         self.writer.add_topic(
             name,
             type,
             sorted({recorded_qos.offered(profile, depth) for profile in profiles}, key=str),
             definition=message_types.definition(type),
-            type_hash=min(hashes, default=""),
+            type_hash=min((str(end.topic_type_hash) for end in ends), default=""),
         )
         self.writer.keep_latched(name, len(ends))
         self._announced.add(name)
 
-    def _look(self) -> None:
-        """Hear topics that are new, and adapt to new publishers of those that are not."""
+    def _scan(self) -> None:
+        """Record new topics, and adapt to new publishers of recorded ones."""
         found = dict(self.get_topic_names_and_types())
-        others = tuple(f"{place}/" for place in self.other_missions(found))
+        others = tuple(f"{namespace}/" for namespace in self.other_missions(found))
         for name, types in found.items():
-            if name in self._hearings:
-                self._keep_up(self._hearings[name])
-            elif name in self._not_recorded or (self.looks_twice and name not in self._seen):
+            if name in self._recorded:
+                self._update(self._recorded[name])
+            elif name in self._not_recorded or (self.delays_new_topics and name not in self._scanned):
                 continue
-            elif self._is_wanted(name, others):
-                self._take_up(name, types)
-        self._seen = found.keys()
+            elif self._is_selected(name, others):
+                self._record(name, types)
+        self._scanned = found.keys()
 
     def other_missions(self, found: Mapping[str, list[str]]) -> set[str]:
-        """Namespaces inside ours that are not ours to record; `found` are topics with their types."""
+        """Nested namespaces to leave out; `found` holds the types of each topic."""
         return set()
 
-    def _keep_up(self, hearing: AdaptiveSubscription) -> None:
-        """Adapt to publishers that came or went."""
-        hearing.settle()
-        publishers = self.count_publishers(hearing.name)
-        if publishers == hearing.publishers:
+    def _update(self, topic: AdaptiveSubscription) -> None:
+        """Adapt to a changed set of publishers."""
+        topic.settle()
+        publishers = self.count_publishers(topic.name)
+        if publishers == topic.publishers:
             return
-        ends = self.get_publishers_info_by_topic(hearing.name)
-        hearing.adapt([end for end in ends if end.topic_type == hearing.type])
-        for label, ours in self.subscriptions_of.items():
-            if ours.topic_name == hearing.name:
-                self.subscriptions_of[label] = hearing.subscription
-        if hearing.name in self._announced:
-            hearing.publishers = publishers
+        ends = self.get_publishers_info_by_topic(topic.name)
+        topic.adapt([end for end in ends if end.topic_type == topic.type])
+        for label, subscription in self.subscriptions_of.items():
+            if subscription.topic_name == topic.name:
+                self.subscriptions_of[label] = topic.subscription
+        if topic.name in self._announced:
+            topic.publishers = publishers
             assert self.writer is not None, "timers end with the bag"
-            self.writer.keep_latched(hearing.name, publishers)
+            self.writer.keep_latched(topic.name, publishers)
 
-    def _is_wanted(self, name: str, others: tuple[str, ...]) -> bool:
-        if self.asked:
-            return name in self.asked
+    def _is_selected(self, name: str, others: tuple[str, ...]) -> bool:
+        if self.selected:
+            return name in self.selected
         inside = self.get_namespace().rstrip("/") + "/"
         if name.endswith(HOUSEKEEPING) or not name.startswith(inside) or name.startswith(others):
             return False
@@ -254,84 +251,76 @@ class RecorderBase(MissionNode):
         hidden = any(part.startswith("_") for part in name.split("/"))
         return not hidden and (row is None or row.recorded)
 
-    def _take_up(self, name: str, types: list[str]) -> None:
-        """Subscribe to a topic that somebody else publishes."""
+    def _record(self, name: str, types: list[str]) -> None:
+        """Subscribe to a topic that another node publishes."""
         ends = self.get_publishers_info_by_topic(name)
-        us = (self.get_namespace(), self.get_name())
-        if all((end.node_namespace, end.node_name) == us for end in ends):
+        if all(qos.full_name(end) == self.get_fully_qualified_name() for end in ends):
             return
         type = types[0]
-        kind = message_types.find(type)
-        if len(types) > 1 or kind is None:
-            several = f"it has several types: {', '.join(types)}"
-            self._leave_out(name, several if len(types) > 1 else f"type {type} is not installed here")
+        message_class = message_types.find(type)
+        if len(types) > 1:
+            self._exclude(name, f"it has several types: {', '.join(types)}")
             return
-        hearing = AdaptiveSubscription(self, name, type, self._hear(name, name, None))
-        hearing.publishers = len(ends)
+        if message_class is None:
+            self._exclude(name, f"type {type} is not installed here")
+            return
+        topic = AdaptiveSubscription(self, name, type, self._handler(name, None))
+        topic.publishers = len(ends)
         try:
-            hearing.subscribe(kind, ends)
-        except Exception as error:  # of rclpy and of what a package's own type support raises
-            self._leave_out(name, f"type {type} cannot be used: {error}")
+            topic.subscribe(message_class, ends)
+        except Exception as error:  # of rclpy, or of a package's type support
+            self._exclude(name, f"type {type} cannot be used: {error}")
             return
         try:
             self._announce(name, type, None)
         except (BagError, LookupError) as error:
-            hearing.close()
+            topic.close()
             assert self.writer is not None, "timers end with the bag"
             if self.writer.closed:
                 raise
-            self._leave_out(
-                name, f"{error} is not installed" if isinstance(error, LookupError) else str(error)
-            )
+            missing = " is not installed" if isinstance(error, LookupError) else ""
+            self._exclude(name, f"{error}{missing}")
             return
-        self._hearings[name] = hearing
+        self._recorded[name] = topic
 
-    def _leave_out(self, name: str, why: str) -> None:
-        self._not_recorded[name] = why
-        self.get_logger().warning(f"{name} is not recorded: {why}")
+    def _exclude(self, name: str, reason: str) -> None:
+        self._not_recorded[name] = reason
+        self.get_logger().warning(f"{name} is not recorded: {reason}")
 
-    # What is kept.
+    # The bag.
 
     def _sync(self) -> None:
-        """Have the bag reach the disk, as long as there is room.
+        """Write the bag to disk, and check the free space.
 
         Raises:
             NodeError: the disk is nearly full.
-            BagError: it is full, or gone.
+            BagError: the disk is full, or gone.
         """
         assert self.writer is not None, "timers end with the bag"
         self.writer.sync()
         self._check_space(self.writer.folder)
 
     def _check_space(self, folder: Path) -> None:
-        """Stop before the disk is full: the bag's end needs room, too.
+        """Stop before the disk is full, since closing the bag needs space.
 
         Raises:
-            NodeError: there is less than `min_free_bytes`.
+            NodeError: less space than `min_free_bytes`.
         """
-        above = next((one for one in (folder, *folder.absolute().parents) if one.exists()), Path("/"))
-        free, least = shutil.disk_usage(above).free, self.values["min_free_bytes"]
-        if free < least:
+        existing = next((one for one in (folder, *folder.absolute().parents) if one.exists()), Path("/"))
+        free, minimum = shutil.disk_usage(existing).free, self.values["min_free_bytes"]
+        if free < minimum:
             raise NodeError(
-                f"bag {folder}: its disk has {free} bytes left; expected at least {least} (min_free_bytes). "
+                f"bag {folder}: its disk has {free} bytes left; expected at least {minimum} (min_free_bytes). "
                 "Recording stops here, and what was recorded is whole"
             )
 
-    def _drain(self) -> None:
-        """Write what was published until now, as far as it has arrived; count what there is no time for."""
-        now_ns, deadline_s = time.time_ns(), time.monotonic() + DRAIN_S
-        for name, hearing in self._hearings.items():
-            left = hearing.drain(now_ns, deadline_s)
-            if left:
-                self._undrained[name] = left
-
     def dropped(self) -> dict[str, int]:
-        """Messages that were lost until now, by full name of topics that lost any."""
-        lost = {name: each.lost() + self._undrained.get(name, 0) for name, each in self._hearings.items()}
+        """Number of lost messages, by full name of the topics that lost any."""
+        lost = {name: topic.lost() + self._undrained.get(name, 0) for name, topic in self._recorded.items()}
         return {name: n for name, n in lost.items() if n}
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
-        """What was recorded, and what was not."""
+        """Numbers of recorded and dropped messages, and topics that are not recorded."""
         if self.writer is None or self.writer.closed:
             return [], {}
         dropped = self.dropped()

@@ -1,7 +1,6 @@
-"""A Foxglove WebSocket server for messages that are serialised already. Knows no node.
+"""A Foxglove WebSocket server for serialized messages, without ROS.
 
-The SDK's server keeps nothing for clients that come later. This one does: whoever opens a latched topic
-gets its last message at once.
+Unlike the SDK's server, it keeps the last message of latched topics for later clients.
 """
 
 import importlib.util
@@ -18,10 +17,10 @@ MISSING = "the live view needs foxglove-sdk: no module foxglove; pip install 'ua
 
 
 def check(*, address: str, port: int) -> None:
-    """See whether a server could be started, before anything is.
+    """Check whether a server could be started.
 
     Raises:
-        NodeError, ParameterError: as FoxgloveServer does.
+        NodeError, ParameterError: as FoxgloveServer.
     """
     if importlib.util.find_spec("foxglove") is None:
         raise NodeError(MISSING)
@@ -29,28 +28,29 @@ def check(*, address: str, port: int) -> None:
     try:
         socket.create_server((address, port), family=family).close()
     except OSError as error:
-        why = str(error.strerror).partition(" (while")[0]  # Python repeats the address there
-        raise ParameterError(_no_port(address, port, why)) from None
+        raise _port_error(address, port, str(error.strerror).partition(" (while")[0]) from None
 
 
-def _no_port(address: str, port: int, why: str) -> str:
-    return f"port: {port} at address {address!r}: {why}; expected a free port of this machine (0: any)"
+def _port_error(address: str, port: int, reason: str) -> ParameterError:
+    return ParameterError(
+        f"port: {port} at address {address!r}: {reason}; expected a free port of this machine (0: any)"
+    )
 
 
 class FoxgloveServer:
-    """A server that listens from here on, with a channel for each topic.
+    """A running server with a channel for each topic.
 
-    Its clients may look only: it offers none of the protocol's services, parameters or published topics.
+    It is read-only: clients cannot call services, set parameters or publish.
 
     Args:
-        name: that clients show.
+        name: shown by clients.
         address: network address to listen on.
-        port: TCP port; 0: any that is free.
+        port: TCP port; 0: any free one.
         topics: rows of the topics, by full name.
 
     Raises:
         NodeError: foxglove-sdk is not installed.
-        ParameterError: the port is in use, or the address is not this machine's.
+        ParameterError: the port is in use, or the address belongs to another machine.
     """
 
     def __init__(self, *, name: str, address: str, port: int, topics: Mapping[str, Topic]) -> None:
@@ -58,17 +58,16 @@ class FoxgloveServer:
             import foxglove
         except ModuleNotFoundError:
             raise NodeError(MISSING) from None
-        self._context = foxglove.Context()  # with the last reference to it, its channels would close
-        self._last: dict[int, tuple[bytes, int]] = {}  # of latched topics, by channel: message, and its time
-        self._lock = threading.Lock()  # the SDK calls from its own threads; no older message may come last
-        listener: Any = self  # the SDK asks for all methods of its protocol; it calls two
+        self._context = foxglove.Context()  # its channels close with the last reference to it
+        self._last: dict[int, tuple[bytes, int]] = {}  # message and time of latched topics, by channel
+        self._lock = threading.Lock()  # the SDK's threads must not send an older message last
+        listener: Any = self  # the SDK's protocol has more methods; it calls these two
         try:
             self._server = foxglove.start_server(
                 name=name, host=address, port=port, context=self._context, server_listener=listener
             )
         except RuntimeError as error:
-            why = str(error).removeprefix("FoxgloveError: ")
-            raise ParameterError(_no_port(address, port, why)) from None
+            raise _port_error(address, port, str(error).removeprefix("FoxgloveError: ")) from None
         self._topics = topics
         self._channels = {
             full_name: foxglove.Channel(
@@ -83,16 +82,16 @@ class FoxgloveServer:
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
+        """TCP port of the server."""
         return self._server.port
 
     def send(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Send a message to the clients that have opened its topic.
+        """Send a message to the subscribers of its topic.
 
         Args:
             topic: full name.
-            data: the message, serialised (CDR).
-            time_ns: when it was received, nanoseconds since the epoch.
+            data: the message, CDR.
+            time_ns: time of receipt, nanoseconds since the epoch.
         """
         channel = self._channels[topic]
         if not self._topics[topic].latched:
@@ -104,14 +103,14 @@ class FoxgloveServer:
             channel.log(data, log_time=time_ns)
 
     def on_subscribe(self, client: Any, view: Any) -> None:
-        """Send the last message again: to all clients of the topic, since the SDK cannot do so to one."""
+        """Send the last latched message again, to all subscribers: the SDK has no call for a single one."""
         with self._lock:
             if view.id in self._last:
                 data, time_ns = self._last[view.id]
                 self._by_id[view.id].log(data, log_time=time_ns)
 
     def on_unsubscribe(self, client: Any, view: Any) -> None:
-        """Nothing is to be done."""
+        """Do nothing; the SDK requires it."""
 
     def stop(self) -> None:
         """Close all connections, and the port."""

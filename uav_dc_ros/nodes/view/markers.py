@@ -1,4 +1,4 @@
-"""What RViz and Foxglove show of a mission: a MarkerArray, made of the core's values."""
+"""Markers of a mission for RViz and Foxglove: a serialized MarkerArray."""
 
 import textwrap
 from collections.abc import Sequence
@@ -17,20 +17,21 @@ from uav_dc_ros.messages import Mission, Phase
 Rgba = tuple[float, float, float, float]
 Xyz = tuple[float, float, float]
 
-USER_CELLS = 0.16  # diameter of a user, in cells, where they do not crowd
-USER_SPACING = 0.6  # and of its share of the cluster's disc, where they do ...
-USER_CELLS_MIN = 0.03  # ... down to this: a speck that is too small shows nothing
-SERVED_SCALE = 1.5  # a user being served is larger: told without colour, too
+# Sizes in cells of the grid.
+USER_CELLS = 0.16  # diameter of a user ...
+USER_SPACING = 0.6  # ... but not more than this share of the mean distance in a cluster ...
+USER_CELLS_MIN = 0.03  # ... and visible
+SERVED_SCALE = 1.5  # served users differ from others without colour, too
 UAV_CELLS = 0.3
 DOCK_CELLS = 0.5
 TEXT_CELLS = 0.32  # height of a capital
 TEXT_ABOVE_CELLS = 0.9
-REASON_WIDTH, REASON_LINES = 40, 3  # of letters: a text in space that is longer hides what it is about
-THIN_CELLS = 0.01  # of what lies on the ground, layer upon layer, so that no two surfaces coincide
+REASON_WIDTH, REASON_LINES = 40, 3  # characters: a larger text hides the scene
+THIN_CELLS = 0.01  # thickness and vertical distance of flat markers, so that no two surfaces coincide
 
 
 class UserState(IntEnum):
-    """What a user is shown as; the value is the id of its marker."""
+    """State of a user; the value is the id of its marker."""
 
     WAITING = 0
     SERVED = 1
@@ -42,30 +43,28 @@ def _rgba(hex: str, alpha: float = 1.0) -> Rgba:
     return red, green, blue, alpha
 
 
-# Okabe and Ito's palette, made for colour-blind eyes. Of its eight, these three users' colours also differ
-# in lightness (L* 54, 89, 70), so that a grey print, and any kind of colour blindness, tells them apart.
+# Okabe and Ito's colour-blind safe palette. The colours of users also differ in lightness (L* 54, 89, 70).
 USER_COLOURS: dict[UserState, Rgba] = {
-    UserState.WAITING: _rgba("D55E00"),  # vermilion: still to do
-    UserState.SERVED: _rgba("F0E442"),  # yellow: lit up
-    UserState.COLLECTED: _rgba("56B4E9"),  # sky blue: done
+    UserState.WAITING: _rgba("D55E00"),  # vermilion
+    UserState.SERVED: _rgba("F0E442"),  # yellow
+    UserState.COLLECTED: _rgba("56B4E9"),  # sky blue
 }
-FOOTPRINT_COLOUR = _rgba("F0E442", 0.18)  # the light that users are lit by
+FOOTPRINT_COLOUR = _rgba("F0E442", 0.18)
 CLUSTER_COLOUR = _rgba("999999", 0.35)
 DOCK_COLOUR = _rgba("009E73", 0.9)  # bluish green
-UAV_COLOUR = _rgba("CC79A7")  # reddish purple, that nothing else has
+UAV_COLOUR = _rgba("CC79A7")  # reddish purple
 TEXT_COLOUR = _rgba("FFFFFF")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What is known of the mission now; what is not known yet is None, or empty.
+    """State of a mission; unknown values are None, or empty.
 
     Attributes:
         time_ns: mission time of the pose, nanoseconds.
-        position_m: of the UAV: x, y, altitude, metres.
+        position_m: x, y and altitude of the UAV, metres.
         users_m: positions, metres, `[U, 2]`.
         served, collected: of each user, bool `[U]`.
-        mission: what the vehicle said last.
         sum_rate_bps: sum-rate of the last step, bit/s.
     """
 
@@ -80,7 +79,7 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """A visualization_msgs/Marker: those of its fields that are used here. Metres, frame `map`."""
+    """The fields in use of a visualization_msgs/Marker, in frame `map`."""
 
     ns: str
     id: int = 0
@@ -94,7 +93,7 @@ class Shape:
 
 
 def markers(scenario: Scenario, scene: Scene) -> bytes:
-    """A visualization_msgs/MarkerArray of a scene, serialised: complete, whatever was drawn before."""
+    """A serialized visualization_msgs/MarkerArray that replaces all markers."""
     shapes = [*_ground(scenario), *_users(scenario, scene), *_uav(scenario, scene)]
     writer = Writer()
     writer.numbers("I", len(shapes))
@@ -104,20 +103,19 @@ def markers(scenario: Scenario, scene: Scene) -> bytes:
 
 
 def user_states(served: Array, collected: Array) -> Array:
-    """The UserState of each user, `[U]`. Who was collected in the very step that served it is collected."""
+    """The UserState of each user, `[U]`; `collected` takes precedence over `served`."""
     return np.where(collected, UserState.COLLECTED, np.where(served, UserState.SERVED, UserState.WAITING))
 
 
 def status_text(scenario: Scenario, scene: Scene) -> str:
-    """Step, users collected and sum-rate, a line each; of a real vehicle what it does, and why."""
+    """Step, users collected and sum-rate, a line each; of a real vehicle also its state and the reason."""
     lines = []
-    if scene.mission is not None:
-        told = scene.mission
-        waits = told.phase is Phase.READY and not told.held
-        state = "" if waits else f": {told.state}"
-        lines.append(f"step {told.step} of {scenario.mission.max_steps}{state}")
-        if told.reason and not waits:
-            lines += textwrap.wrap(told.reason, REASON_WIDTH)[:REASON_LINES]
+    if (mission := scene.mission) is not None:
+        is_ready = mission.phase is Phase.READY and not mission.held
+        state = "" if is_ready else f": {mission.state}"
+        lines.append(f"step {mission.step} of {scenario.mission.max_steps}{state}")
+        if mission.reason and not is_ready:
+            lines += textwrap.wrap(mission.reason, REASON_WIDTH)[:REASON_LINES]
     if scene.sum_rate_bps is not None:
         lines.append(f"{int(np.sum(scene.collected))} of {scenario.n_users} users collected")
         lines.append(f"{scene.sum_rate_bps / 1e6:.2f} Mbit/s")
@@ -125,7 +123,7 @@ def status_text(scenario: Scenario, scene: Scene) -> str:
 
 
 def _ground(scenario: Scenario) -> Sequence[Shape]:
-    """What does not move: the discs in which the users start, and the dock."""
+    """The start areas of the clusters, and the dock."""
     cell_m = scenario.grid.cell_m
     thin_m = THIN_CELLS * cell_m
     width_m = 2 * scenario.users.cluster_radius_m
@@ -151,11 +149,9 @@ def _ground(scenario: Scenario) -> Sequence[Shape]:
 
 
 def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
-    """The users on the ground, those of each state one marker."""
-    crowded_m = (
-        USER_SPACING * scenario.users.cluster_radius_m / float(np.sqrt(scenario.users.users_per_cluster))
-    )
-    cell_m = scenario.grid.cell_m
+    """One marker for the users of each state."""
+    users, cell_m = scenario.users, scenario.grid.cell_m
+    crowded_m = USER_SPACING * users.cluster_radius_m / float(np.sqrt(users.users_per_cluster))
     width_m = min(USER_CELLS * cell_m, max(crowded_m, USER_CELLS_MIN * cell_m))
     states = user_states(scene.served, scene.collected)
     shapes = []
@@ -170,14 +166,14 @@ def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
                 scale_m=(size_m, size_m, size_m),
                 colour=colour,
                 points_m=np.column_stack([users_m, np.zeros(len(users_m))]),
-                shown=len(users_m) > 0,  # RViz complains about a list of nothing
+                shown=len(users_m) > 0,  # RViz warns about empty lists
             )
         )
     return shapes
 
 
 def _uav(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
-    """The UAV, a line down to the ground, whom it can serve from there, and how its mission stands."""
+    """The UAV, a line down to the ground, its service area, and the status text."""
     cell_m = scenario.grid.cell_m
     known = scene.position_m is not None
     x_m, y_m, z_m = at_m = scene.position_m or (0.0, 0.0, 0.0)
@@ -222,26 +218,25 @@ def _uav(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
 
 
 def _write(writer: Writer, shape: Shape, time_ns: int) -> None:
-    """A visualization_msgs/Marker, field by field in the order of its definition."""
-    nothing = 0  # length of a sequence that is not used
+    """Write a visualization_msgs/Marker, in the order of its definition."""
     writer.stamp(time_ns)
     writer.text(FRAME)
     writer.text(shape.ns)
     writer.numbers("i", shape.id, shape.type, Marker.ADD if shape.shown else Marker.DELETE)
     writer.numbers("d", *shape.position_m, 0.0, 0.0, 0.0, 1.0, *shape.scale_m)
     writer.numbers("f", *shape.colour)
-    writer.stamp(0)  # lifetime: for ever
+    writer.stamp(0)  # lifetime: unlimited
     writer.numbers("?", False)  # frame_locked
     writer.points(shape.points_m)
-    writer.numbers("I", nothing)  # colors
+    writer.numbers("I", 0)  # colors
     writer.text("")  # texture_resource, and texture: header, format, data
     writer.stamp(0)
     writer.text("")
     writer.text("")
-    writer.numbers("I", nothing)
-    writer.numbers("I", nothing)  # uv_coordinates
+    writer.numbers("I", 0)
+    writer.numbers("I", 0)  # uv_coordinates
     writer.text(shape.text)
     writer.text("")  # mesh_resource, and mesh_file: filename, data
     writer.text("")
-    writer.numbers("I", nothing)
+    writer.numbers("I", 0)
     writer.numbers("?", False)  # mesh_use_embedded_materials
