@@ -1,4 +1,4 @@
-"""The verb `record`: records topics of any publisher into a bag, without a mission, until Ctrl-C or SIGTERM."""
+"""The verb `record`: records topics of any publisher into a bag, without a mission."""
 
 import argparse
 from collections.abc import Mapping

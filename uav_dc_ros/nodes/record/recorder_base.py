@@ -310,8 +310,8 @@ class RecorderBase(MissionNode):
         free, minimum = shutil.disk_usage(existing).free, self.values["min_free_bytes"]
         if free < minimum:
             raise NodeError(
-                f"bag {folder}: its disk has {free} bytes left; expected at least {minimum} (min_free_bytes). "
-                "Recording stops here, and what was recorded is whole"
+                f"bag {folder}: its disk has {free} bytes left; expected at least {minimum} "
+                "(min_free_bytes). Recording stops here, and what was recorded is whole"
             )
 
     def dropped(self) -> dict[str, int]:
