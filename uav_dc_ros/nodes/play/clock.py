@@ -31,11 +31,12 @@ class PlaybackClock:
 
     @property
     def rate(self) -> float:
-        """Seconds of the bag per second; a new rate applies from the current position on."""
+        """Seconds of the bag per second."""
         return self._rate
 
     @rate.setter
     def rate(self, rate: float) -> None:
+        """Change the rate from the current position on."""
         self.jump(self.position_ns())
         self._rate = rate
 
