@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from uav_dc_ros import cli
 from uav_dc_ros.nodes.framework.node_table import NODES
-from uav_dc_ros.nodes.framework.parameters import EVERY
+from uav_dc_ros.nodes.framework.parameters import COMMON
 
 
 class Parsed(BaseException):
@@ -37,7 +37,7 @@ def commands(text: str) -> Iterator[list[str]]:
 def parameter(node: str, assignment: str) -> Any:
     """The value that a node would use of `NAME:=VALUE`."""
     name, _, text = assignment.partition(":=")
-    row = {row.name: row for row in (*NODES[node].parameters, *EVERY)}[name]
+    row = {row.name: row for row in (*NODES[node].parameters, *COMMON)}[name]
     return row.value(YAML(typ="safe", pure=True).load(text))
 
 

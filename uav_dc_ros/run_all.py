@@ -156,7 +156,7 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
         config = _config(parser(prog).parse_args(arguments))
         from uav_dc_ros.nodes.ros import environment, fastdds
 
-        environment.prepare(alone=config.nodes is None)  # before ROS is imported
+        environment.prepare(local_only=config.nodes is None)  # before ROS is imported
         from uav_dc_ros.nodes.framework import node_main
         from uav_dc_ros.runner.mission_runner import MissionRunner
 
@@ -164,7 +164,7 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
             flight = MissionRunner(config)
             signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the terminal is gone: the mission goes on
             cli.on_stop(flight.interrupt)
-            node_main.give_way()
+            node_main.use_batch_scheduling()
             has_flown = True
             return flight.run()
         finally:
@@ -204,7 +204,7 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
     try:
         from uav_dc_ros.nodes.ros import environment, fastdds
 
-        environment.prepare(alone=config.nodes is None)  # before ROS is imported
+        environment.prepare(local_only=config.nodes is None)  # before ROS is imported
         from uav_dc_ros.messages import Phase
         from uav_dc_ros.runner.mission_runner import MissionRunner
 

@@ -10,7 +10,7 @@ Quality of service:
   autopilot's is not; not a move, since an old one is useless.
 - *Depth*: publishers keep messages for restarted and slow subscribers. Payloads with an entry per user can be
   large: publishers keep at least ten, and at most as many as 64 MiB hold. Subscriptions keep the newest
-  hundred, or all (`hears_all` in the node table).
+  hundred, or all (`keeps_all` in the node table).
 
 ROS parameters `qos_overrides./TOPIC.publisher.*` and `qos_overrides./TOPIC.subscription.*` override
 `history`, `depth`, `reliability` and `durability` for each node.

@@ -13,8 +13,8 @@ from html import escape
 from pathlib import Path
 
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes.framework.node_table import NODES, rows
-from uav_dc_ros.nodes.framework.parameters import EVERY, Parameter
+from uav_dc_ros.nodes.framework.node_table import NODES, mission_rows
+from uav_dc_ros.nodes.framework.parameters import COMMON, Parameter
 from uav_dc_ros.phases import TRANSITIONS
 from uav_dc_ros.topics import TOPICS, Topic
 
@@ -80,7 +80,7 @@ def line(points: list[tuple[float, float]], colour: str, mark: str = "", dashed:
 
 def edges(nodes: tuple[str, ...]) -> dict[str, tuple[list[str], list[str]]]:
     """Of each topic of a mission of these nodes: who publishes it, and who subscribes to it."""
-    table = {name: row for name, row in rows(nodes).items() if name in nodes}
+    table = {name: row for name, row in mission_rows(nodes).items() if name in nodes}
     found = {}
     for topic in TOPICS:
         publishers = [name for name, row in table.items() if topic in row.publishes]
@@ -236,7 +236,7 @@ def parameter_tables() -> list[str]:
     """The ROS parameters of each node that is a process, then those that every node has."""
     lines = []
     tables = {f"`{row.name}`": row.parameters for row in NODES.values() if row.process}
-    for name, parameters in {**tables, "Every node": EVERY}.items():
+    for name, parameters in {**tables, "Every node": COMMON}.items():
         lines += [f"## {name}", ""]
         if parameters:
             lines += ["| parameter | default | expected | meaning |", "|---|---|---|---|"]

@@ -37,7 +37,7 @@ def main() -> None:
             qos.MESSAGE_TYPES[topic.type],
             name,
             lambda m, h=hear: h(m),
-            qos.requested(topic, all=True),
+            qos.requested(topic, keep_all=True),
         )
     publishers = {}
 

@@ -44,13 +44,13 @@ class Stranger(Node):
         self.publishers_of: dict[str, Publisher] = {}
         self.hearing = {name: sum(name in NODES[peer].subscribes for peer in peers) for name in TOPICS}
         self.listening = self.create_subscription(
-            String, "mission", self.on_mission, qos.requested(ROWS["mission"], all=True)
+            String, "mission", self.on_mission, qos.requested(ROWS["mission"], keep_all=True)
         )
         self.create_subscription(
             DiagnosticArray,
             "diagnostics",
             self.on_diagnostics,
-            qos.requested(ROWS["diagnostics"], all=True),
+            qos.requested(ROWS["diagnostics"], keep_all=True),
         )
 
     def on_mission(self, message: String) -> None:

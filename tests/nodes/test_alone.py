@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import Ros, finish, wait_for
 from uav_dc_ros.nodes.framework.node_table import NODES
-from uav_dc_ros.nodes.framework.parameters import EVERY
+from uav_dc_ros.nodes.framework.parameters import COMMON
 
 RUN = "fedcba9876543210"
 NAMESPACE = ("-r", "__ns:=/uav1")
@@ -125,7 +125,7 @@ def test_help_tells_the_parameters(ros: Ros) -> None:
     status, output = ros.run_fork("uav_dc_ros.nodes.world", "--help")
     assert status == 0, output
     assert output.startswith("usage: python -m uav_dc_ros.nodes.world [-h] [--ros-args -p PARAMETER:=VALUE")
-    for row in (*NODES["world"].parameters, *EVERY):
+    for row in (*NODES["world"].parameters, *COMMON):
         assert re.search(rf"^  {row.name} +{re.escape(row.description)}", output, re.MULTILINE), row.name
 
 

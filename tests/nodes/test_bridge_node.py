@@ -82,7 +82,7 @@ class Made:
         for _ in range(2000):
             if done():
                 return
-            self.node.serve(0.005)
+            self.node.spin_once(0.005)
         raise AssertionError("this never came to be")
 
     @property
@@ -100,7 +100,7 @@ def made(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> Iterator[Made]:
     monkeypatch.setenv("XDG_STATE_HOME", str(ros.folder / "state"))
     with node_in(ros, "-p", "connect:=tcp:127.0.0.1:1", "-p", "peers:=[bridge]") as (_, executor):
         node = AutopilotBridge()
-        node.serve = executor.spin_once
+        node.spin_once = executor.spin_once
         executor.add_node(node)
         yield Made(node, vehicle)
         if node.state != "finalized":

@@ -51,7 +51,7 @@ def test_a_variable_that_keeps_ros_from_starting_is_named_with_its_value(
 ) -> None:
     monkeypatch.setenv(name, value)
     with pytest.raises(ParameterError) as refused:
-        environment.prepare(alone=True)
+        environment.prepare(local_only=True)
     assert str(refused.value).startswith(f"{name} is ")
     assert value in str(refused.value)
     assert "expected" in str(refused.value)
@@ -60,12 +60,12 @@ def test_a_variable_that_keeps_ros_from_starting_is_named_with_its_value(
 @pytest.mark.parametrize("domain", ["", "0", "61", "061", "0x3d", "232"])
 def test_a_domain_that_ros_takes_is_taken(monkeypatch: pytest.MonkeyPatch, domain: str) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
-    environment.prepare(alone=True)
+    environment.prepare(local_only=True)
 
 
 def test_what_the_user_left_open_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(environment.RANGE, "")
-    environment.prepare(alone=False)
+    environment.prepare(local_only=False)
     assert os.environ[environment.RANGE] == "SUBNET"
 
 
@@ -74,7 +74,7 @@ def test_without_a_home_the_password_database_knows_where_logs_go(
 ) -> None:
     monkeypatch.delenv("HOME")
     monkeypatch.setattr(os.path, "expanduser", lambda path: path.replace("~", str(tmp_path / "pw")))
-    environment.prepare(alone=True)
+    environment.prepare(local_only=True)
     assert os.environ["ROS_LOG_DIR"] == str(tmp_path / "pw" / ".ros" / "log")
     assert Path(os.environ["ROS_LOG_DIR"]).is_dir()
 
@@ -83,7 +83,7 @@ def test_a_home_that_cannot_be_written_is_said_and_logs_go_elsewhere(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("HOME", "/dev/null")
-    environment.prepare(alone=True)
+    environment.prepare(local_only=True)
     folder = Path(os.environ["ROS_LOG_DIR"])
     assert folder.is_dir()
     assert str(folder) in capsys.readouterr().err
@@ -93,14 +93,14 @@ def test_a_home_that_cannot_be_written_is_said_and_logs_go_elsewhere(
 def test_a_full_shared_memory_is_refused_before_it_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fastdds, "free_mb", lambda: 0.0)
     with pytest.raises(ParameterError, match=r"is full \(0\.00 MB free\).*expected 16 MB"):
-        environment.prepare(alone=True)
+        environment.prepare(local_only=True)
 
 
 def test_a_small_shared_memory_is_not_used(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(fastdds, "free_mb", lambda: 4.0)
-    environment.prepare(alone=True)
+    environment.prepare(local_only=True)
     assert os.environ[fastdds.TRANSPORTS] == "UDPv4"
     assert "4.0 MB free; expected 16: messages travel over UDP alone" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""Broken messages on every topic: refused, counted by reason, told once; the mission goes on."""
+"""Broken messages on every topic: refused, counted by reason, logged once; the mission goes on."""
 
 import json
 import re
@@ -83,7 +83,7 @@ def test_a_broken_message_changes_nothing(
     expected["pose"] = ("channel_monitor", {"not_finite", "frame"})
     for topic, (node, reasons) in expected.items():
         for reason in reasons:
-            told = re.findall(rf"^{node}: WARN: {topic}: {reason}: .*told once", output, re.MULTILINE)
+            told = re.findall(rf"^{node}: WARN: {topic}: {reason}: .*logged once", output, re.MULTILINE)
             assert len(told) == 1, output
             counts = re.search(rf"^{node}: WARN: rejected messages: .*", output, re.MULTILINE)
             assert counts is not None, output

@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import Ros, finish
 from tests.support.fake_autopilot.mavros_flight import node_in, spin
-from uav_dc_ros.nodes.ros.liveliness import CONFIRMED_S, Confirmed, LivelinessMonitor
+from uav_dc_ros.nodes.ros.liveliness import CONFIRMED_S, LivelinessFilter, LivelinessMonitor
 from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.02
@@ -19,23 +19,23 @@ TICK_S = 0.02
 
 def test_liveliness_that_comes_back_at_once_was_not_lost() -> None:
     now_s = 100.0
-    confirmed = Confirmed(lambda: now_s)
-    assert not confirmed.is_gone(False), "nobody was there yet"
-    assert not confirmed.is_gone(True)
+    confirmed = LivelinessFilter(lambda: now_s)
+    assert not confirmed.is_lost(False), "nobody was there yet"
+    assert not confirmed.is_lost(True)
     told = []
     for alive in (*[False] * 10, True, *[False] * 14):
         now_s += TICK_S
-        told.append(confirmed.is_gone(alive))
+        told.append(confirmed.is_lost(alive))
     assert told == [*[False] * 24, True]
     assert 12 * TICK_S < CONFIRMED_S <= 13 * TICK_S
     now_s += TICK_S
-    assert not confirmed.is_gone(True)
+    assert not confirmed.is_lost(True)
     now_s += 3.0  # this process itself stood still: what it sees first is old
-    assert not confirmed.is_gone(False)
-    confirmed.forget()
+    assert not confirmed.is_lost(False)
+    confirmed.reset()
     for _ in range(20):
         now_s += TICK_S
-        assert not confirmed.is_gone(False), "another has published since, who offers no lease"
+        assert not confirmed.is_lost(False), "another has published since, who offers no lease"
 
 
 def test_a_policy_that_was_killed_is_missed_and_one_that_was_held_up_is_not(ros: Ros) -> None:
@@ -46,19 +46,19 @@ def test_a_policy_that_was_killed_is_missed_and_one_that_was_held_up_is_not(ros:
         policy = ros.start("uav_dc_ros.nodes.policy")
         try:
             end_s = time.monotonic() + 60.0
-            while not lease._confirmed._was_there:
+            while not lease._filter._was_alive:
                 assert time.monotonic() < end_s
-                lease.is_gone()
+                lease.is_lost()
                 spin(executor, TICK_S)
             held_up(policy, 0.5)
             end_s = time.monotonic() + 1.0
             while time.monotonic() < end_s:
-                assert not lease.is_gone(), "it was held up for a moment only"
+                assert not lease.is_lost(), "it was held up for a moment only"
                 spin(executor, TICK_S)
         finally:
             policy.kill()
         killed_s = time.monotonic()
-        while not lease.is_gone():
+        while not lease.is_lost():
             assert time.monotonic() < killed_s + 60.0
             spin(executor, TICK_S)
         finish(policy)
@@ -86,18 +86,18 @@ def test_a_busy_computer_is_no_dead_policy(ros: Ros) -> None:
             times = []
             try:
                 end_s = time.monotonic() + 300.0
-                while not lease._confirmed._was_there:
+                while not lease._filter._was_alive:
                     assert time.monotonic() < end_s
-                    lease.is_gone()
+                    lease.is_lost()
                     spin(executor, TICK_S)
                 end_s = time.monotonic() + 60.0
                 while time.monotonic() < end_s:
-                    times.append(lease.is_gone())
+                    times.append(lease.is_lost())
                     spin(executor, TICK_S)
             finally:
                 policy.kill()
             killed_s = time.monotonic()
-            while not lease.is_gone():
+            while not lease.is_lost():
                 assert time.monotonic() < killed_s + 60.0
                 spin(executor, TICK_S)
             print(f"{sum(times)} of {len(times)} looks; missed after {time.monotonic() - killed_s:.2f} s")

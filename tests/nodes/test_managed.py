@@ -11,9 +11,9 @@ from rclpy.parameter import Parameter
 
 from tests.conftest import Ros, finish
 from tests.support.fake_autopilot.mavros_flight import node_in
-from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
-from uav_dc_ros.nodes.framework.parameters import EVERY
-from uav_dc_ros.nodes.world import World
+from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
+from uav_dc_ros.nodes.framework.parameters import COMMON
+from uav_dc_ros.nodes.world import WorldNode
 
 PROCESSES = [name for name, row in NODES.items() if row.process and name != "live_view"]
 NOBODY = "tcp:127.0.0.1:9"  # where no autopilot is
@@ -77,15 +77,15 @@ def test_a_bad_policy_fails_at_configure_with_its_reason_and_a_good_one_heals_it
 def check_parameters(asker: Asker, name: str) -> None:
     """Every parameter of a node is described, with unit and range."""
     told = asker.ask(node=f"/{name}")
-    for row in (*EVERY, *NODES[name].parameters):
+    for row in (*COMMON, *NODES[name].parameters):
         unit = f" [{row.unit}]" if row.unit else ""
         assert told[row.name] == {
             "description": f"{row.description}{unit}",
             "expected": row.expected,
             "read_only": row.read_only,
-            "range": [] if row.least is None else [[row.least, row.most]],
+            "range": [] if row.min is None else [[row.min, row.max]],
         }
-    own = {row.name for row in (*EVERY, *NODES[name].parameters)}
+    own = {row.name for row in (*COMMON, *NODES[name].parameters)}
     assert {n for n in told if not n.startswith(("use_sim_time", "start_type_"))} == own
 
 
@@ -144,8 +144,8 @@ def test_parameters_are_refused_with_their_reason(ros: Ros, asker: Asker) -> Non
 
 def test_a_world_that_is_configured_anew_has_the_topics_of_its_vehicle(ros: Ros) -> None:
     with node_in(ros):
-        world = World()
-        for vehicle, row in (("external", WORLD_AROUND), ("simulated", NODES["world"])):
+        world = WorldNode()
+        for vehicle, row in (("external", WORLD_BESIDE_BRIDGE), ("simulated", NODES["world"])):
             world.set_parameters([Parameter("vehicle", value=vehicle)])
             world.trigger_configure()
             assert set(world.publishers_of) == set(row.publishes), vehicle
@@ -160,7 +160,7 @@ def test_a_whole_number_is_a_real_one_wherever_it_is_given(ros: Ros, asker: Aske
     given = ("-p", "min_battery:=0", "-p", "policy_timeout_steps:=3", "--params-file", str(file))
     node = waiting(ros, "bridge", "-p", f"connect:={NOBODY}", *given)
     real = [row for row in NODES["bridge"].parameters if isinstance(row.default, float)]
-    whole = {row.name: math.ceil(row.least or 0) for row in real}
+    whole = {row.name: math.ceil(row.min or 0) for row in real}
     told = asker.ask(node="/bridge", set=whole)
     assert all(answer["success"] for answer in told.values()), told
     refused = asker.ask(

@@ -207,7 +207,7 @@ def test_who_keeps_messages_as_bytes_knows_those_of_another_run(bench: Bench) ->
         ('{"run":', False),
     ):
         assert node.is_of_another_run("mission", cdr.encode_string(text.encode())) is expected, text
-    assert node.meter.rejected["mission", "another_run"] == 2
+    assert node.statistics.rejected["mission", "another_run"] == 2
     assert not node.is_of_another_run("path", b"")
 
 

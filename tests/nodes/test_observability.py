@@ -156,7 +156,7 @@ def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
     assert world.stdout is not None
     told = wait_for(world.stdout, "does not match")
     assert "/target: /somebody/demanding does not match: its QoS: " in told
-    assert "Best effort publisher and reliable subscription; (told once)" in told
+    assert "Best effort publisher and reliable subscription; (logged once)" in told
     world.terminate()
     peer.kill()
     peer.communicate()

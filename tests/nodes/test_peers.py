@@ -44,8 +44,8 @@ def is_ready(mission: list[str], move: list[str]) -> bool:
         _peers_timer=SimpleNamespace(cancel=lambda: None),
         on_peers=lambda: found.append(True),
     )
-    world._are_all_in = MissionNode._are_all_in.__get__(world)  # type: ignore[attr-defined]
-    MissionNode._look_for_peers(world)  # type: ignore[arg-type]
+    world._are_matched = MissionNode._are_matched.__get__(world)  # type: ignore[attr-defined]
+    MissionNode._find_peers(world)  # type: ignore[arg-type]
     return bool(found)
 
 

@@ -12,25 +12,27 @@ from rclpy.event_handler import QoSSubscriptionEventType, SubscriptionEventCallb
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import String
 
+import uav_dc_ros
 from tests.conftest import Ros
 from uav_dc_ros.nodes.ros import rclpy_private
 
-NODES = Path(rclpy_private.__file__).parent
+PACKAGE = Path(uav_dc_ros.__file__).parent
 PRIVATE = re.compile(
     r"implementation_singleton|\._(callback_type|state_machine|service_change_state|parameter_overrides)\b"
 )
-# Its exceptions of `rclpy.init` have no public name.
-EXCEPTED = {"runtime.py"}
 
 
 def test_it_is_in_use_in_one_module_only() -> None:
-    found = {path.name for path in NODES.rglob("*.py") if PRIVATE.search(path.read_text("utf-8"))}
-    assert found - EXCEPTED == {"rclpy_private.py"}
+    found = {path.name for path in PACKAGE.rglob("*.py") if PRIVATE.search(path.read_text("utf-8"))}
+    assert found == {"rclpy_private.py"}
 
 
 def test_all_of_it_is_there(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in ros.environment.items():
         monkeypatch.setenv(name, value)
+    context = rclpy.Context()
+    with pytest.raises(rclpy_private.INIT_ERRORS):
+        context.init(["--ros-args", "-p"])
     context = rclpy.Context()
     context.init()
     given = rclpy.Parameter("given", value=3)
@@ -43,8 +45,8 @@ def test_all_of_it_is_there(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def check(node: LifecycleNode, context: Any) -> None:
-    assert rclpy_private.overrides(node)["given"].value == 3
-    rclpy_private.overrides(node)["given"] = rclpy.Parameter("given", value=4)
+    assert rclpy_private.parameter_overrides(node)["given"].value == 3
+    rclpy_private.parameter_overrides(node)["given"] = rclpy.Parameter("given", value=4)
     assert node.declare_parameter("given", 0).value == 4, "what is changed there is what it declares"
 
     assert rclpy_private.state(node) == "unconfigured"
@@ -54,7 +56,7 @@ def check(node: LifecycleNode, context: Any) -> None:
         answered.append(request)
         return before(request, response)
 
-    before = rclpy_private.answer_transitions(node, answer)
+    before = rclpy_private.replace_change_state(node, answer)
     assert node._service_change_state.callback is answer
     request = SimpleNamespace(transition=SimpleNamespace(label="", id=Transition.TRANSITION_ACTIVATE))
     with pytest.raises(rclpy_private.RCLError):  # no transition of this state

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from uav_dc_ros.nodes.framework import other_publishers
-from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
 from uav_dc_ros.nodes.play.subscriber_monitor import SubscriberMonitor
 from uav_dc_ros.topics import TOPICS
 
@@ -37,7 +37,7 @@ def test_a_player_is_named_with_what_it_publishes() -> None:
         OURS | {"pose": ["/uav1/world", "/player"], "rates": ["/player"]}, "/uav1", NODES
     )
     assert found.foreign == {"/player": ["pose", "rates"]}
-    assert found.told("0123456789abcdef") == (
+    assert found.description("0123456789abcdef") == (
         "/player publishes pose, rates here (run 0123456789abcdef), and is no node of this mission"
     )
 
@@ -48,14 +48,14 @@ def test_a_node_of_our_names_in_another_namespace_is_foreign() -> None:
 
 def test_a_node_that_is_there_twice_is_another_mission() -> None:
     found = other_publishers.find(OURS | {"mission": ["/uav1/world"] * 2}, "/uav1", NODES)
-    assert found.told("0123456789abcdef") == (
+    assert found.description("0123456789abcdef") == (
         "another mission is being flown here by /uav1/world (run 0123456789abcdef)"
     )
 
 
 def test_a_node_that_we_have_not_begun_is_another_mission() -> None:
     found = other_publishers.find(OURS, "/uav1", NODES, absent=["world", "policy"])
-    assert found.told() == "another mission is being flown here by /uav1/world, /uav1/policy"
+    assert found.description() == "another mission is being flown here by /uav1/world, /uav1/policy"
 
 
 @pytest.mark.parametrize("twice", ["world", "policy"])
@@ -67,7 +67,7 @@ def test_the_graph_may_still_tell_of_a_node_that_was_killed(twice: str) -> None:
 
 def test_nobody_is_a_rival_on_a_topic_that_this_mission_does_not_have() -> None:
     """Beside a real vehicle nobody of ours makes a clock: a simulator may."""
-    around = {**NODES, "world": WORLD_AROUND}
+    around = {**NODES, "world": WORLD_BESIDE_BRIDGE}
     assert not other_publishers.find({"clock": ["/gazebo"]}, "/", around)
     assert other_publishers.find({"clock": ["/gazebo"]}, "/", NODES)
 

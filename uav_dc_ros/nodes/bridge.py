@@ -118,21 +118,21 @@ class AutopilotBridge(MissionNode):
             self._begun = True  # a vehicle that flies already is brought down, too
             self.bridge.stop("the bridge was stopped", self._known)
             self._wait_until_it_obeys()
-        self._tell_diagnostics()  # the last changes, too
+        self._publish_diagnostics()  # the last changes, too
 
     def _wait_until_it_obeys(self) -> None:
         """Go on as before: to see whether it obeys takes messages, and the timer of `_tick`."""
         deadline_s, failed = time.monotonic() + OBEYS_S, False
         while not self.bridge.is_done_with(self._known) and time.monotonic() < deadline_s:
             try:
-                self.serve(TICK_LEAST_S)
+                self.spin_once(TICK_LEAST_S)
             except Exception as error:  # whatever it was: the vehicle is asked again
                 if not failed:
                     self.get_logger().error(f"while the vehicle is brought down: {error}")
                 failed = True
 
-    def _fall_silent(self) -> None:
-        super()._fall_silent()
+    def _undo_activation(self) -> None:
+        super()._undo_activation()
         self._open.close()
 
     # Before the start.
@@ -149,7 +149,7 @@ class AutopilotBridge(MissionNode):
     def _begin_if_all_ready(self) -> None:
         if not self._peers_seen or not self._ready_peers.issuperset(self.peers):
             return
-        self.check_alone()
+        self.check_other_publishers()
         self._begun = True
 
     def _datum(self) -> Geodetic | None:
@@ -189,7 +189,7 @@ class AutopilotBridge(MissionNode):
 
     def on_move(self, payload: messages.Move) -> None:
         """Fly a move."""
-        self._policy.hear()
+        self._policy.reset()
         if payload.mission != 0:
             raise MessageError("wrong_step", f"a move for mission {payload.mission}; expected mission 0")
         if (why := self.bridge.move(payload.step, Action[payload.action.upper()])) is not None:
@@ -204,7 +204,7 @@ class AutopilotBridge(MissionNode):
         if not self._begun:
             self._begin_if_all_ready()
         if self._begun:
-            self.bridge.policy_is_gone = self._policy.is_gone()
+            self.bridge.policy_is_gone = self._policy.is_lost()
             for command in self.bridge.tick(time.monotonic(), known):
                 self.vehicle.send_command(command)
         self.vehicle.set_setpoint(self.bridge.setpoint)
@@ -308,7 +308,7 @@ class AutopilotBridge(MissionNode):
         if status != self._told:
             self._told = status
             self._news.append(f"{status.state}, step {status.step}: {status.reason}")
-            self.say("mission", status)
+            self.publish_payload("mission", status)
             if not self.is_supervised and bridge.phase not in (Phase.READY, Phase.MOVING):
                 self.get_logger().info(f"{status.state}: {status.reason}")
 
@@ -346,4 +346,4 @@ class AutopilotBridge(MissionNode):
 
 
 if __name__ == "__main__":
-    node_main.main(AutopilotBridge, gives_way=False)  # the vehicle does not wait
+    node_main.main(AutopilotBridge, batch_scheduling=False)  # the vehicle does not wait

@@ -20,7 +20,7 @@ USER_BYTES = 60  # of `rates`, for each user
 WAITING_MAX = 256  # poses without users, and users without a pose
 
 
-class ChannelMonitor(MissionNode):
+class ChannelMonitorNode(MissionNode):
     """Answers each `users` with the `rates` of that step."""
 
     def __init__(self) -> None:
@@ -120,7 +120,7 @@ class ChannelMonitor(MissionNode):
         said = self._said if self._said is not None and self._said.run == users.run else None
         now, before = (users.mission, users.step), (said.mission, said.step) if said else (-1, 0)
         if said is not None and now == before:
-            self.say("rates", said)  # a repeated step is measured, and booked, once
+            self.publish_payload("rates", said)  # a repeated step is measured, and booked, once
             return
         if now < before and published_ns <= self._heard_ns:
             raise MessageError(
@@ -160,8 +160,8 @@ class ChannelMonitor(MissionNode):
         self._said, self._data_bits, self._collected = rates, data_bits, collected
         keep = self.journal.append if users.step else self.journal.begin
         keep(text)  # before it is said: what others know is never forgotten
-        self.say_encoded("rates", text)
+        self.publish_encoded("rates", text)
 
 
 if __name__ == "__main__":
-    node_main.main(ChannelMonitor)
+    node_main.main(ChannelMonitorNode)

@@ -30,9 +30,9 @@ def parser() -> cli.Parser:
 
 
 def node_class(name: str) -> type[MissionNode]:
-    """The class of a row of the node table: `ChannelMonitor` in the module `channel_monitor`."""
+    """The class of a composable node: `ChannelMonitorNode` in the module `channel_monitor`."""
     module = importlib.import_module(f"uav_dc_ros.nodes.{name}")
-    found: type[MissionNode] = getattr(module, name.title().replace("_", ""))
+    found: type[MissionNode] = getattr(module, f"{name.title().replace('_', '')}Node")
     return found
 
 

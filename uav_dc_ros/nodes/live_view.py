@@ -18,10 +18,10 @@ LAYOUT_FOLDER, LAYOUT = "share/foxglove", "mission.json"
 ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # listened on; where to find it on this machine
 
 
-class LiveView(MissionNode):
+class LiveViewNode(MissionNode):
     """A WebSocket server with one channel for each topic."""
 
-    rest_s = 0.02  # nobody waits for it
+    pause_s = 0.02  # nobody waits for it
 
     def __init__(self) -> None:
         super().__init__("live_view")
@@ -65,7 +65,7 @@ class LiveView(MissionNode):
             if self.is_of_another_run(topic.name, data):
                 return
             view.send(full_name, data, info["received_timestamp"])
-            self.meter.heard(topic.name, info)
+            self.statistics.count_received(topic.name, info)
 
         return self.create_raw_subscription(topic, hear)
 
@@ -75,4 +75,4 @@ class LiveView(MissionNode):
 
 
 if __name__ == "__main__":
-    node_main.main(LiveView)
+    node_main.main(LiveViewNode)

@@ -14,7 +14,7 @@ from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.step_synchronizer import StepSynchronizer
 
 
-class Policy(MissionNode):
+class PolicyNode(MissionNode):
     """Flies a trained policy."""
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class Policy(MissionNode):
         data_bits, collected = payloads.collection(rates, self.scenario)
         steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
         action = self._decide(mission.cell, steps_flown, data_bits, collected)
-        self.say(
+        self.publish_payload(
             "move",
             messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label),
         )
@@ -71,4 +71,4 @@ class Policy(MissionNode):
 
 
 if __name__ == "__main__":
-    node_main.main(Policy)
+    node_main.main(PolicyNode)

@@ -18,7 +18,7 @@ from uav_dc_ros.nodes.record.recorder_base import RecorderBase
 from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 
 
-class Recorder(RecorderBase):
+class RecorderNode(RecorderBase):
     """Writes a mission's bag; what it is about (scenario, policy and its hash, seed) goes inside."""
 
     delays_new_topics = True  # a later scan tells whether another mission owns their namespace
@@ -64,4 +64,4 @@ class Recorder(RecorderBase):
 
 
 if __name__ == "__main__":
-    node_main.main(Recorder)
+    node_main.main(RecorderNode)

@@ -28,11 +28,11 @@ class _Heading(msgspec.Struct):
     stamp_ns: int
 
 
-class Visualizer(MissionNode):
+class VisualizerNode(MissionNode):
     """Draws what changed, at most `rate` times a second."""
 
     drains = True  # the end of a mission is drawn, too
-    rest_s = 0.05  # nobody waits for it
+    pause_s = 0.05  # nobody waits for it
 
     def __init__(self) -> None:
         super().__init__("visualizer")
@@ -69,7 +69,7 @@ class Visualizer(MissionNode):
                 self.reject(topic.name, error)
             else:
                 self._changed = True
-            self.meter.heard(topic.name, info)
+            self.statistics.count_received(topic.name, info)
 
         return self.create_raw_subscription(topic, hear)
 
@@ -137,4 +137,4 @@ class Visualizer(MissionNode):
 
 
 if __name__ == "__main__":
-    node_main.main(Visualizer)
+    node_main.main(VisualizerNode)

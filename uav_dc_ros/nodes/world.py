@@ -32,7 +32,7 @@ from uav_dc_ros.nodes.external_users import ExternalUsers
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
-from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_AROUND
+from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
 from uav_dc_ros.nodes.framework.parameters import EXTERNAL
 from uav_dc_ros.nodes.ros import convert
 
@@ -54,7 +54,7 @@ class Flown(msgspec.Struct, frozen=True):
     run: str
 
 
-class World(MissionNode):
+class WorldNode(MissionNode):
     """Simulates missions one after the other: seeds `seed`, `seed + 1`, ..."""
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ class World(MissionNode):
         self.pace: float | None = self.values["pace"]
         self.surroundings: ExternalUsers | None = None
         is_around = self.values["vehicle"] == EXTERNAL
-        self.row = WORLD_AROUND if is_around else NODES["world"]
+        self.row = WORLD_BESIDE_BRIDGE if is_around else NODES["world"]
         if is_around:
             self.surroundings = ExternalUsers(self.scenario, self.values["seed"])
         else:
@@ -101,7 +101,9 @@ class World(MissionNode):
             self.get_logger().warning(f"{self._hovered} steps were hovered: no move came in time")
         if self._flying and self._phase is Phase.READY:
             self._phase = Phase.ABORTED
-            self.say("mission", self._status("the vehicle was stopped before the end of the mission"))
+            self.publish_payload(
+                "mission", self._status("the vehicle was stopped before the end of the mission")
+            )
 
     # Before the first mission.
 
@@ -125,7 +127,7 @@ class World(MissionNode):
         if self._flying or not self._peers_seen or not self._ready_peers.issuperset(self.peers):
             return
         if self._phase is None:
-            self.check_alone()
+            self.check_other_publishers()
         self._flying = True
         if self._phase is None:
             self._begin(0)
@@ -267,7 +269,7 @@ class World(MissionNode):
                 f"{POSE_AGE_MAX_S:g} s: it was recorded, and is played",
             )
         if (users := self.surroundings.users(pose.stamp_ns, self.run)) is not None:
-            self.say("users", users)
+            self.publish_payload("users", users)
 
     # What the others hear.
 
@@ -277,10 +279,10 @@ class World(MissionNode):
         pose = cdr.encode_pose(position_m, self.scenario.time_ns(self._mission, self._step))
         self.publish("pose", pose)
         if self._ahead is not None and self._ahead[:2] == (self._mission, self._step):
-            self.say_encoded("users", self._ahead[2])
+            self.publish_encoded("users", self._ahead[2])
         else:
-            self.say_encoded("users", self._users(self._step, self._crowd.positions_m))
-        self.say("mission", self._status())
+            self.publish_encoded("users", self._users(self._step, self._crowd.positions_m))
+        self.publish_payload("mission", self._status())
         self.publish("target", pose)  # a simulated vehicle is where it was sent to
         if self.pace is None and self._phase is Phase.READY:  # while the others are at work
             self._ahead = self._mission, self._step + 1, self._users(self._step + 1, self._crowd.ahead_m())
@@ -340,4 +342,4 @@ class World(MissionNode):
 
 
 if __name__ == "__main__":
-    node_main.main(World)
+    node_main.main(WorldNode)

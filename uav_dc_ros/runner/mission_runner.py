@@ -19,7 +19,7 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
 from uav_dc_ros.mission_summary import Summary
-from uav_dc_ros.nodes.framework.node_table import rows
+from uav_dc_ros.nodes.framework.node_table import mission_rows
 from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.nodes.framework.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
@@ -52,7 +52,7 @@ class Network:
         self._context = Context()
         self._context.init(["--ros-args", "-r", f"__ns:={namespace}", "-r", "/clock:=clock"])
         self.node = make(self._context)
-        self.executor = DirectExecutor(self.node.rest_s, self._context)
+        self.executor = DirectExecutor(self.node.pause_s, self._context)
         self.executor.add_node(self.node)
         self._has_left = False
 
@@ -97,7 +97,7 @@ class MissionRunner:
         self.is_simulated = config.vehicle == SIMULATED
         if self.is_simulated:
             pace.check(self.scenario, config.factor, config.missions)
-        self.rows = rows(() if self.is_simulated else ("bridge",))
+        self.rows = mission_rows(() if self.is_simulated else ("bridge",))
         self.nodes = run_options.nodes(config)
         # Whoever starts the vehicle draws the run's identity; a run_all on another host adopts it.
         self.run_id = new_run() if ("world" if self.is_simulated else "bridge") in self.nodes else ""
@@ -218,7 +218,7 @@ class MissionRunner:
                     node.restarts_of, self._step_s = supervisor.restarts, now_s
                 node.close(LAST_RATES_S)
                 self._check_patience(node, now_s)
-            time.sleep(min(node.rest_s, tick_s))
+            time.sleep(min(node.pause_s, tick_s))
 
     def _check_patience(self, node: MissionMonitor, now_s: float) -> None:
         """Wait for steps that are due, and for nodes that are started here; others may take their time."""

@@ -108,7 +108,7 @@ class MissionMonitor(MissionNode):
         restarts_of: how often each node was started again, for the diagnostics.
     """
 
-    rest_s = 0.01  # nobody waits for it
+    pause_s = 0.01  # nobody waits for it
 
     def __init__(
         self,
@@ -173,22 +173,22 @@ class MissionMonitor(MissionNode):
         if not begun and (found or self._other_run is not None):
             self._found_s = self._found_s or now_s
             if (found and self._other_run is not None) or now_s - self._found_s >= TELL_S:
-                raise other_publishers.AnotherMissionError(found.told(self._other_run or ""))
+                raise other_publishers.AnotherMissionError(found.description(self._other_run or ""))
             return
         if found.foreign.keys() - self._noted:
             self._noted |= found.foreign.keys()
-            self._on_note(f"{found.told()}; its payloads are ignored, its poses may be recorded")
+            self._on_note(f"{found.description()}; its payloads are ignored, its poses may be recorded")
         if have_started:
             self._started_s = min(self._started_s, now_s)
         self.is_alone |= now_s - self._since_s >= ALONE_S and now_s - self._started_s >= STARTED_S
 
-    def _look_for_peers(self) -> None:
+    def _find_peers(self) -> None:
         if self.is_alone:  # otherwise another mission's nodes of these names would do
-            super()._look_for_peers()
+            super()._find_peers()
 
-    def _tell_diagnostics(self) -> None:
+    def _publish_diagnostics(self) -> None:
         if self.is_alone:
-            super()._tell_diagnostics()
+            super()._publish_diagnostics()
 
     def check_run(self, topic: str, run: str) -> None:
         """Note another run whose messages come before this mission has begun.

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes.framework.node_main import GAVE_UP, NOT_BEGUN
+from uav_dc_ros.nodes.framework.node_main import EXIT_FAILED, EXIT_NOT_STARTED
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.framework.process_control import ACTIVATE, CONFIGURE
 from uav_dc_ros.runner.node_process import NodeProcess
@@ -130,7 +130,7 @@ class Supervisor:
         parameters = {
             node.row.name: {
                 **node.parameters,
-                **(node.row.again if node.restarts else {}),
+                **(node.row.restart_parameters if node.restarts else {}),
                 "autostart": False,
             }
             for node in nodes
@@ -170,7 +170,7 @@ class Supervisor:
             process.watch(min(now_s - before_s, PASSED_MAX_S))
             nodes = [node for node in self.nodes if node.process is process]
             active = all(node.state == "active" for node in nodes)
-            patience_s = max(node.row.hang_s for node in nodes) if active else BEGIN_S
+            patience_s = max(node.row.hang_timeout_s for node in nodes) if active else BEGIN_S
             if process.silent_s > patience_s and not process.ended:
                 process.kill(f"gave no sign of life for {patience_s:.0f} s")
 
@@ -188,7 +188,7 @@ class Supervisor:
         nodes = [node for node in self.nodes if node.process is process]
         for node in nodes:
             node.process, node.state = None, None
-        if process.process.returncode in (NOT_BEGUN, GAVE_UP):  # it told why; it would do so again
+        if process.process.returncode in (EXIT_NOT_STARTED, EXIT_FAILED):  # it told why; it would do so again
             for node in nodes:
                 self._lose(node, told)
             return
@@ -199,7 +199,7 @@ class Supervisor:
 
     def _start_again_later(self, node: SupervisedNode, told: str) -> None:
         """Let a node that died rest for a while, or, if it has died too often, give up."""
-        now_s, most = time.monotonic(), node.row.restarts
+        now_s, most = time.monotonic(), node.row.max_restarts
         node.deaths_s.append(now_s)
         while now_s - node.deaths_s[0] > RESTART_WINDOW_S:
             node.deaths_s.popleft()

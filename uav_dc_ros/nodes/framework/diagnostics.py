@@ -1,73 +1,73 @@
-"""What a node reports about itself once a second: rates, latencies, what it rejected, restarts.
+"""What a node reports about itself once a second: rates, latencies, rejected messages, restarts.
 
-Values of a node's status, beside those of its own (`MissionNode.diagnose`), by key; TOPIC is a topic's name:
+Keys of a node's status, besides those of its own (`MissionNode.diagnose`); TOPIC is a topic's name:
 
 state                                   of the life cycle
-restarts                                how often run_all has started it again
-process id                              of its process, which others may share
+restarts                                how often run_all has restarted it
+process id                              of its process, which other nodes may share
 cpu [%]                                 of one core, over the last period, the whole process
 TOPIC said [Hz]                         messages published
 TOPIC heard [Hz]                        messages handled
 TOPIC transport latency p50, p99 [ms]   from publishing a message to its receipt by this node's middleware
 TOPIC handling latency p50, p99 [ms]    from publishing a message to the end of its handling in this node
-TOPIC rejected: REASON                  messages refused since the start
+TOPIC rejected: REASON                  messages rejected since the start
 
 Latencies are those of the last period; between hosts they hold as far as their clocks agree. Older bags have
-one `TOPIC latency p50 [ms]`: until the end of the handling, but until the receipt where a node keeps messages
+one `TOPIC latency p50 [ms]`: until the end of the handling, or until the receipt where a node keeps messages
 as bytes (recorder, visualizer, live view).
 """
 
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 PERIOD_S = 1.0
-LATENCIES = ("transport", "handling")  # from publishing to the receipt, and to the end of the handling
-LATENCIES_KEPT = 4096  # of one topic and period: the last ones
+LATENCIES = ("transport", "handling")
+LATENCIES_KEPT = 4096  # the newest of one topic and period
 
 
 class MessageStatistics:
-    """Counts what a node hears and says, and how long messages took.
+    """Counts the messages of a node, and measures their latencies.
 
     Attributes:
-        rejected: refused messages since the start, by topic and reason.
+        rejected: rejected messages since the start, by topic and reason.
     """
 
     def __init__(self) -> None:
         self.rejected: Counter[tuple[str, str]] = Counter()
-        self._heard: Counter[str] = Counter()
-        self._said: Counter[str] = Counter()
+        self._received: Counter[str] = Counter()
+        self._published: Counter[str] = Counter()
         self._latencies_ns: dict[str, deque[tuple[int, int]]] = {}  # in the order of LATENCIES
         self._since_s = time.monotonic()
         self._cpu_s = time.process_time()
         self._rejected_before = 0
 
-    def heard(self, topic: str, info: Mapping[str, int]) -> None:
-        """Note a message that was handled just now; `info` came with it."""
-        self._heard[topic] += 1
+    def count_received(self, topic: str, info: Mapping[str, int]) -> None:
+        """Count a message that was just handled; `info` is its rclpy message info."""
+        self._received[topic] += 1
         if topic not in self._latencies_ns:
             self._latencies_ns[topic] = deque(maxlen=LATENCIES_KEPT)
         published_ns = info["source_timestamp"]
         latencies_ns = info["received_timestamp"] - published_ns, time.time_ns() - published_ns
         self._latencies_ns[topic].append(latencies_ns)
 
-    def said(self, topic: str) -> None:
-        """Note a message that was published."""
-        self._said[topic] += 1
+    def count_published(self, topic: str) -> None:
+        """Count a message that was published."""
+        self._published[topic] += 1
 
     def report(self) -> tuple[bool, dict[str, str]]:
-        """Was anything rejected since the last report, and the values; begins a new period."""
+        """Whether messages were rejected since the last report, and the values. Begins a new period."""
         now_s, cpu_s = time.monotonic(), time.process_time()
         period_s = max(now_s - self._since_s, 1e-9)
-        # Nodes that share a process tell the same of it.
+        # Nodes that share a process report the same values for it.
         values = {"process id": str(os.getpid()), "cpu [%]": f"{100 * (cpu_s - self._cpu_s) / period_s:.1f}"}
-        for topic, count in self._said.items():
+        for topic, count in self._published.items():
             values[f"{topic} said [Hz]"] = f"{count / period_s:.1f}"
-        for topic, count in self._heard.items():
+        for topic, count in self._received.items():
             values[f"{topic} heard [Hz]"] = f"{count / period_s:.1f}"
             if latencies_ns := self._latencies_ns[topic]:
                 percentiles_ms = np.percentile(np.asarray(latencies_ns), (50, 99), axis=0) * 1e-6
@@ -78,21 +78,20 @@ class MessageStatistics:
         for (topic, reason), count in self.rejected.items():
             values[f"{topic} rejected: {reason}"] = str(count)
         rejected = self.rejected.total()
-        news, self._rejected_before = rejected > self._rejected_before, rejected
+        has_rejected, self._rejected_before = rejected > self._rejected_before, rejected
         self._since_s, self._cpu_s = now_s, cpu_s
-        for counts in (self._heard, self._said):
+        for counts in (self._received, self._published):
             for topic in counts:
                 counts[topic] = 0
-        return news, values
+        return has_rejected, values
 
 
-def status(name: str, warnings: Iterable[str], told: str, values: Mapping[str, str]) -> DiagnosticStatus:
-    """A node's status: a warning if there is any, else OK with what is told."""
-    warned = "; ".join(warnings)
+def status(name: str, warnings: Sequence[str], message: str, values: Mapping[str, str]) -> DiagnosticStatus:
+    """A node's status: WARN with its warnings, if there are any, else OK with a message."""
     return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if warned else DiagnosticStatus.OK,
+        level=DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK,
         name=name,
-        message=warned or told,
+        message="; ".join(warnings) or message,
         hardware_id="uav_dc_ros",
         values=[KeyValue(key=key, value=value) for key, value in values.items()],
     )

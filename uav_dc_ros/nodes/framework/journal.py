@@ -1,7 +1,6 @@
-"""What a node must know again when it is started anew after a kill: lines in a file.
+"""A file of lines from which a node that was killed and restarted restores its state.
 
-The file is written for a killed process, not for a pulled plug: what was given to the operating system is
-there for the next process, so nothing waits for a disk.
+The file outlives a process, not a power failure: nothing waits for a disk.
 """
 
 import os
@@ -14,7 +13,7 @@ from uav_dc_ros.errors import NodeError
 
 
 class Journal:
-    """Lines of the mission that is being flown; `begin` starts a new mission's.
+    """Lines of the current mission. All methods raise NodeError if the file cannot be read or written.
 
     Args:
         path: the file; empty: nothing is kept.
@@ -25,56 +24,44 @@ class Journal:
         self._file = -1
 
     def lines(self) -> list[bytes]:
-        """Whole lines, without their ends; one that was not finished is taken away.
-
-        Raises:
-            NodeError: the file cannot be read, or is none.
-        """
+        """Whole lines, without their ends; an incomplete last line is removed from the file."""
         if self._path is None:
             return []
         if self._path.exists() and not self._path.is_file():
             raise NodeError(f"journal {self._path}: it is no file; expected one, or a new one")
-        with self._told("read"):
+        with self._reported("read"):
             text = self._path.read_bytes() if self._path.exists() else b""
-            whole, _, torn = text.rpartition(b"\n")
-            if torn:
-                os.truncate(self._path, len(text) - len(torn))
+            whole, _, incomplete = text.rpartition(b"\n")
+            if incomplete:
+                os.truncate(self._path, len(text) - len(incomplete))
         return whole.split(b"\n") if whole else []
 
     def begin(self, line: bytes) -> None:
-        """Forget what is there, and write a first line; at no moment is there neither.
-
-        Raises:
-            NodeError: the file cannot be written.
-        """
+        """Begin a mission: replace all lines by one, atomically."""
         if self._path is None:
             return
         self.close()
-        with self._told("written"), files.replacing(self._path, durable=False) as new:
+        with self._reported("written"), files.replacing(self._path, durable=False) as new:
             new.write_bytes(line + b"\n")
 
     def append(self, line: bytes) -> None:
-        """Write a line.
-
-        Raises:
-            NodeError: the file cannot be written.
-        """
+        """Append a line."""
         if self._path is None:
             return
-        with self._told("written"):
+        with self._reported("written"):
             if self._file < 0:
                 self._file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
             os.write(self._file, line + b"\n")
 
     @contextmanager
-    def _told(self, what: str) -> Iterator[None]:
+    def _reported(self, action: str) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            raise NodeError(f"journal {self._path} cannot be {what}: {error.strerror}") from None
+            raise NodeError(f"journal {self._path} cannot be {action}: {error.strerror}") from None
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
         self._file = -1

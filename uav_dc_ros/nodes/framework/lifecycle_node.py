@@ -1,4 +1,4 @@
-"""A managed node: its life cycle, and its parameters from the tables."""
+"""A node with the life cycle of ROS 2, and with its parameters from the node table."""
 
 import difflib
 import traceback
@@ -18,28 +18,27 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 from uav_dc_ros.errors import ParameterError, UavDcError
 from uav_dc_ros.nodes.framework.node_table import NODES
-from uav_dc_ros.nodes.framework.parameters import EVERY, Parameter
+from uav_dc_ros.nodes.framework.parameters import COMMON, Parameter
 from uav_dc_ros.nodes.ros import rclpy_private
 
 
 class ManagedNode(LifecycleNode):
-    """A node of the table with the life cycle of ROS 2.
+    """A node of the table.
 
-    `configure` loads and checks, `activate` starts, `deactivate` is a safe stop, `cleanup` forgets. A
-    UavDcError in `configure` or `activate` is told, undone, and refuses the transition.
+    A UavDcError in `configure` or `activate` is logged, undone, and fails the transition.
 
     Args:
-        name: of its row.
-        overrides: values of parameters, over those of the command line.
-        context: of ROS; None: the process's own.
+        name: name of its row.
+        overrides: parameter values that replace those of the command line.
+        context: ROS context; None: the default one.
 
     Raises:
-        ParameterError: a value that cannot be, or a parameter that the node does not have.
+        ParameterError: an invalid value, or a parameter that the node does not have.
 
     Attributes:
         row: its row of the node table.
-        values: values of its parameters; they are checked when it is configured.
-        failure: why the last transition was refused.
+        values: values of its parameters, checked when it is configured.
+        failure: error of the last transition, if it failed.
     """
 
     def __init__(
@@ -53,19 +52,14 @@ class ManagedNode(LifecycleNode):
         self.values: dict[str, Any] = {}
         self.failure: UavDcError | None = None
         self._is_active = False
-        self._change_state = rclpy_private.answer_transitions(self, self._refuse_impossible)
+        self._change_state = rclpy_private.replace_change_state(self, self._reject_impossible)
         self._declare()
 
     # Parameters.
 
     def _declare(self) -> None:
-        """Declare the row's parameters.
-
-        Raises:
-            ParameterError: a value that cannot be, or a parameter that the node does not have.
-        """
-        rows = {row.name: row for row in (*EVERY, *self.row.parameters)}
-        overrides = rclpy_private.overrides(self)
+        rows = {row.name: row for row in (*COMMON, *self.row.parameters)}
+        overrides = rclpy_private.parameter_overrides(self)
         for row in rows.values():
             if (given := overrides.get(row.name)) is not None:
                 overrides[row.name] = _typed(given, row)
@@ -74,7 +68,7 @@ class ManagedNode(LifecycleNode):
             except InvalidParameterValueException:
                 value = overrides[row.name].value
             self.values[row.name] = row.value(value)
-        self._refuse_unknown("", list(rows))
+        self._reject_unknown("", list(rows))
         for peer in self.values["peers"]:
             if peer not in NODES:
                 raise ParameterError(f"peers: {peer!r}; expected some of {', '.join(NODES)}")
@@ -83,16 +77,16 @@ class ManagedNode(LifecycleNode):
         )
         self.add_on_set_parameters_callback(self._on_set)
 
-    def _refuse_unknown(self, kind: str, known: Sequence[str]) -> None:
-        """Refuse parameters that were given, and that the node has not declared: typing errors, mostly."""
-        for name in rclpy_private.overrides(self):
+    def _reject_unknown(self, kind: str, known: Sequence[str]) -> None:
+        """Raise ParameterError for an override that no parameter has; `kind`: of QoS, or of the others."""
+        for name in rclpy_private.parameter_overrides(self):
             if name.startswith("qos_overrides.") == bool(kind) and not self.has_parameter(name):
                 close = difflib.get_close_matches(name, known, 1)
                 meant = f"did you mean {close[0]!r}?" if close else f"expected some of {', '.join(known)}"
                 raise ParameterError(f"{name}: no such parameter of node {self.row.name}; {meant}")
 
     def _on_set(self, given: list[Any]) -> SetParametersResult:
-        """Refuse values that make no sense, and all while the node works with what it has read."""
+        """Reject invalid values, and every value while the node is configured."""
         rows = {row.name: row for row in self.row.parameters}
         for parameter in given:
             row = rows.get(parameter.name)
@@ -102,7 +96,7 @@ class ManagedNode(LifecycleNode):
                 return SetParametersResult(
                     successful=False,
                     reason=f"{row.name}: the node is {self.state}; expected it to be unconfigured, "
-                    "since what it has checked and loaded does not change under it",
+                    "since it reads its parameters only when it is configured",
                 )
             try:
                 row.value(parameter.value)
@@ -118,11 +112,7 @@ class ManagedNode(LifecycleNode):
         return rclpy_private.state(self)
 
     def configure(self) -> None:
-        """Load and check what the parameters name.
-
-        Raises:
-            UavDcError: it cannot be flown.
-        """
+        """Load and check what the parameters name. Raises UavDcError where that fails."""
 
     def activate(self) -> None:
         """Start. The topics work from here on."""
@@ -131,10 +121,10 @@ class ManagedNode(LifecycleNode):
         """Stop safely. The topics still work."""
 
     def cleanup(self) -> None:
-        """Let go of what `configure` made."""
+        """Release what `configure` created."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Transition to inactive: parameters are read, everything is loaded."""
+        """Transition to inactive: read the parameters and configure."""
         return self._attempt(self._configure, undo=self._cleanup)
 
     def _configure(self) -> None:
@@ -144,26 +134,25 @@ class ManagedNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition to active."""
-        return self._attempt(self._activate, undo=self._fall_silent)
+        return self._attempt(self._activate, undo=self._undo_activation)
 
     def _activate(self) -> None:
         self._is_active = True
         self.activate()
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Transition to inactive: a safe stop; nothing is heard any more."""
+        """Transition to inactive: a safe stop, and the end of all subscriptions."""
         return self._attempt(self._deactivate)
 
     def _deactivate(self) -> None:
         self.deactivate()
-        self._say_all()
-        self._fall_silent()
+        self._flush()
+        self._undo_activation()
 
-    def _say_all(self) -> None:
-        """Have the last words heard."""
+    def _flush(self) -> None:
+        """Wait until the last messages have been received."""
 
-    def _fall_silent(self) -> None:
-        """Undo what `_activate` did."""
+    def _undo_activation(self) -> None:
         self._is_active = False
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -174,11 +163,11 @@ class ManagedNode(LifecycleNode):
         self.cleanup()
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Transition to finalized, from wherever the node is."""
+        """Transition to finalized, from any state."""
         return self._attempt(self._shut_down)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """After a transition that failed in a way nobody thought of: back to unconfigured."""
+        """Return to unconfigured after an unexpected error in a transition."""
         return self._attempt(self._shut_down)
 
     def _shut_down(self) -> None:
@@ -187,50 +176,48 @@ class ManagedNode(LifecycleNode):
         self._cleanup()
 
     def _attempt(
-        self, act: Callable[[], None], undo: Callable[[], None] = lambda: None
+        self, transition: Callable[[], None], undo: Callable[[], None] = lambda: None
     ) -> TransitionCallbackReturn:
-        """Do what a transition asks for; what goes wrong is told, undone, and refuses the transition."""
+        """Make a transition. An error is logged; a UavDcError is also undone."""
         self.failure = None
         try:
-            act()
+            transition()
         except UavDcError as error:
             self.failure = error
             self.get_logger().error(str(error))
             undo()
             return TransitionCallbackReturn.FAILURE
-        except Exception:  # the caller would swallow it
+        except Exception:  # rclpy would swallow it
             self.get_logger().fatal(traceback.format_exc())
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
-    def _refuse_impossible(self, request: Any, response: Any) -> Any:
-        """Answer a wish for a transition that this state does not have: rclpy would end the node."""
+    def _reject_impossible(self, request: Any, response: Any) -> Any:
+        """Reject a request for a transition that this state does not have: rclpy would end the node."""
         try:
             return self._change_state(request, response)
         except rclpy_private.RCLError:
-            wanted = request.transition.label or request.transition.id
-            self.get_logger().warning(f"transition {wanted}: not one from the state {self.state}")
+            requested = request.transition.label or request.transition.id
+            self.get_logger().warning(f"transition {requested}: not one from the state {self.state}")
             response.success = False
             return response
 
 
 def _typed(given: rclpy.Parameter, row: Parameter) -> rclpy.Parameter:
-    """A parameter with a value of its row's type, where the given value denotes one."""
+    """A parameter of its row's type, where its value can be converted."""
     value = row.typed(given.value)
     return given if value is given.value else rclpy.Parameter(row.name, value=value)
 
 
 def _descriptor(row: Parameter) -> ParameterDescriptor:
-    """What ROS tells about a parameter, and checks itself."""
-    unit = f" [{row.unit}]" if row.unit else ""
     descriptor = ParameterDescriptor(
-        description=f"{row.description}{unit}",
+        description=row.description_with_unit,
         additional_constraints=row.expected,
         read_only=row.read_only,
-        dynamic_typing=True,  # a wrong type is refused here, by the parameter's name
+        dynamic_typing=True,  # `Parameter.value` rejects a wrong type, by the parameter's name
     )
     if isinstance(row.default, float):
-        descriptor.floating_point_range = [FloatingPointRange(from_value=row.least, to_value=row.most)]
-    elif row.least is not None:
-        descriptor.integer_range = [IntegerRange(from_value=int(row.least), to_value=int(row.most or 0))]
+        descriptor.floating_point_range = [FloatingPointRange(from_value=row.min, to_value=row.max)]
+    elif row.min is not None:
+        descriptor.integer_range = [IntegerRange(from_value=int(row.min), to_value=int(row.max or 0))]
     return descriptor

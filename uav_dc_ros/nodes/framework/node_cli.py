@@ -1,4 +1,4 @@
-"""The command line of a node: ROS arguments only; `--help` tells its parameters."""
+"""The command line of a node: ROS arguments only; `--help` lists its parameters."""
 
 import argparse
 import sys
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from uav_dc_ros import cli
 from uav_dc_ros.nodes.framework.node_table import NODES
-from uav_dc_ros.nodes.framework.parameters import EVERY, Parameter
+from uav_dc_ros.nodes.framework.parameters import COMMON, Parameter
 
 ROS_ARGUMENTS = "--ros-args"
 
@@ -19,28 +19,25 @@ def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def parser(name: str, description: str) -> cli.Parser:
-    """The command line of a row of the node table, or of a program of another name that runs one."""
+    """The command line of a node of the table, or of another program that runs one."""
     own = NODES[name].parameters if name in NODES else ()
-    rows = {row.name: row for row in (*own, *EVERY)}
     return cli.Parser(
         prog=f"python -m uav_dc_ros.nodes.{name}",
         usage="%(prog)s [-h] [--ros-args -p PARAMETER:=VALUE ... -r __ns:=/NAMESPACE ...]",
         description=description,
-        epilog="\n".join(["parameters:", *(_line(row) for row in rows.values())]),
+        epilog="\n".join(["parameters:", *map(_line, (*own, *COMMON))]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
 
 def _line(row: Parameter) -> str:
-    """A parameter, its default, and what it is for."""
     value = str(row.default).lower() if isinstance(row.default, bool) else row.default  # as ROS reads it
     default = "" if value == "" else f" (default: {value})"
-    unit = f" [{row.unit}]" if row.unit else ""
-    return f"  {row.name:<20}  {row.description}{unit}{default}"
+    return f"  {row.name:<20}  {row.description_with_unit}{default}"
 
 
 def ros_arguments(description: str) -> list[str]:
-    """What stands on a node's command line for ROS; exits with 2 if there is more, which would be ignored."""
+    """The ROS arguments of a node's command line; exits with 2 if there are others: ROS ignores those."""
     others, for_ros = split(sys.argv[1:])
     command = parser(Path(sys.argv[0]).stem, description)
     _, unknown = command.parse_known_args(others)

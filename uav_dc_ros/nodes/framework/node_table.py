@@ -1,49 +1,47 @@
-"""The nodes, one row each: the only list. Topics are those of `topics.TOPICS`. Knows no ROS."""
+"""The nodes, one row each: the only list. Topics are those of `topics.TOPICS`. Needs no ROS."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
-from uav_dc_ros.nodes.framework import bridge_parameters
 from uav_dc_ros.nodes.framework import parameters as p
 from uav_dc_ros.topics import TOPICS
 
 
 @dataclass(frozen=True, kw_only=True)
 class NodeRow:
-    """A node.
+    """A node: its topics and parameters, and how run_all supervises it.
 
     Attributes:
-        name: its name in the ROS graph.
+        name: name in the ROS graph.
         publishes, subscribes: names of topics.
-        parameters: its own, beside those that every node has.
-        hears_all: does it keep every message until it gets to it, or the newest hundred?
-        process: is it a process of its own, `python -m uav_dc_ros.nodes.NAME`?
-        composable: may it share a process with others (see `container`)? Those may that wait for one another
-            in every step.
-        rank: nodes of a lower rank are brought up first, and taken down last: the recorder must hear the
-            first word and the last, and the world starts the mission.
-        restarts: how often a node that died is started again within `supervisor.RESTART_WINDOW_S`; once more
-            ends the mission, or, if the node is not needed for it, the restarts.
-        hang_s: how long its process may give no sign of life, once it is active, before it is killed and
-            started again: longer than any of its callbacks takes on a busy computer.
-        needed: can no mission be flown without it? A bridge, not without one where the vehicle is a real one.
-        on_request: is it started only when it is asked for?
-        again: parameters with which it is restarted, beside those that it had.
+        parameters: own parameters, beside `parameters.COMMON`.
+        keeps_all: subscriptions keep every message until it is handled, not only the newest hundred.
+        process: the node is a process of its own, `python -m uav_dc_ros.nodes.NAME`.
+        composable: the node may share a process with the others that wait for it in every step.
+        rank: nodes of a lower rank start first and stop last: the recorder receives the first and the last
+            message, and the world starts the mission.
+        max_restarts: restarts within `supervisor.RESTART_WINDOW_S`. One more failure ends the mission or, if
+            the node is not needed, its restarts.
+        hang_timeout_s: time without a report of an active node after which its process is killed and
+            restarted: longer than any callback takes on a busy computer.
+        needed: the mission cannot fly without this node (the bridge: only with a real vehicle).
+        on_request: the node starts only if the user requests it.
+        restart_parameters: parameters that a restart adds.
     """
 
     name: str
     publishes: tuple[str, ...]
     subscribes: tuple[str, ...]
     parameters: tuple[p.Parameter, ...] = ()
-    hears_all: bool = False
+    keeps_all: bool = False
     process: bool = True
     composable: bool = False
     rank: int = 1
-    restarts: int = 3
-    hang_s: float = 5.0
+    max_restarts: int = 3
+    hang_timeout_s: float = 5.0
     needed: bool = True
     on_request: bool = False
-    again: Mapping[str, object] = field(default_factory=dict)
+    restart_parameters: Mapping[str, object] = field(default_factory=dict)
 
 
 NODES: dict[str, NodeRow] = {
@@ -61,12 +59,7 @@ NODES: dict[str, NodeRow] = {
             name="bridge",
             publishes=("pose", "mission", "target", "diagnostics"),
             subscribes=("move", "ready"),
-            parameters=(
-                *(bridge_parameters.VEHICLE, bridge_parameters.CONNECT, bridge_parameters.SYSTEM),
-                bridge_parameters.DATUM,
-                *(p.SCENARIO, p.SEED, p.JOURNAL, bridge_parameters.FENCE_MARGIN_M),
-                *bridge_parameters.SETTINGS,
-            ),
+            parameters=p.BRIDGE,
             rank=2,
             on_request=True,
         ),
@@ -81,7 +74,7 @@ NODES: dict[str, NodeRow] = {
             name="policy",
             publishes=("move", "ready", "diagnostics"),
             subscribes=("mission", "rates"),
-            parameters=(p.POLICY, p.SCENARIO_OR_POLICYS),
+            parameters=(p.POLICY, p.SCENARIO_OF_POLICY),
             composable=True,
         ),
         NodeRow(
@@ -89,23 +82,22 @@ NODES: dict[str, NodeRow] = {
             publishes=("ready", "diagnostics"),
             subscribes=tuple(topic.name for topic in TOPICS.values() if topic.recorded),
             parameters=(
-                *(p.BAG, p.RESUME, p.SCENARIO, p.POLICY_IF_KNOWN, p.SEED, p.MISSIONS, p.PACE),
-                p.VEHICLE_FLOWN,
-                *p.BAG_FILES,
+                *(p.SCENARIO, p.RECORDED_POLICY, p.SEED, p.MISSIONS, p.PACE, p.RECORDED_VEHICLE),
+                *p.BAG_WRITER,
             ),
-            hears_all=True,
+            keeps_all=True,
             rank=0,
-            hang_s=10.0,  # a slow disk makes it wait
-            again={"resume": True},
+            hang_timeout_s=10.0,  # a slow disk blocks its callbacks
+            restart_parameters={"resume": True},
         ),
         NodeRow(
             name="bag_record",
             publishes=("diagnostics",),
             subscribes=(),
-            parameters=(p.BAG, p.RESUME, *p.BAG_FILES),
-            hears_all=True,
+            parameters=p.BAG_WRITER,
+            keeps_all=True,
             process=False,
-            restarts=0,
+            max_restarts=0,
             needed=False,
             on_request=True,
         ),
@@ -114,7 +106,7 @@ NODES: dict[str, NodeRow] = {
             publishes=("path", "markers", "ready", "diagnostics"),
             subscribes=("pose", "target", "users", "rates", "mission"),
             parameters=(p.SCENARIO, p.RATE_HZ),
-            hears_all=True,
+            keeps_all=True,
             needed=False,
         ),
         NodeRow(
@@ -129,21 +121,21 @@ NODES: dict[str, NodeRow] = {
             name="mission_monitor",
             publishes=("ready", "diagnostics"),
             subscribes=("mission", "rates"),
-            hears_all=True,
+            keeps_all=True,
             process=False,
-            restarts=0,
+            max_restarts=0,
         ),
     )
 }
 
 COMPOSABLE = tuple(row.name for row in NODES.values() if row.composable)
 
-# Around a real vehicle the world has the users only.
-WORLD_AROUND = replace(
+# Beside a bridge the world only moves the users.
+WORLD_BESIDE_BRIDGE = replace(
     NODES["world"], publishes=("users", "ready", "diagnostics"), subscribes=("mission", "pose")
 )
 
 
-def rows(nodes: Collection[str]) -> Mapping[str, NodeRow]:
-    """The rows as they are in a mission of these nodes: a bridge brings a vehicle of its own."""
-    return {**NODES, "world": WORLD_AROUND} if "bridge" in nodes else NODES
+def mission_rows(nodes: Collection[str]) -> Mapping[str, NodeRow]:
+    """The node table in a mission of these nodes: a bridge changes the world's row."""
+    return {**NODES, "world": WORLD_BESIDE_BRIDGE} if "bridge" in nodes else NODES

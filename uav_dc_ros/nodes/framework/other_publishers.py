@@ -1,7 +1,6 @@
-"""Who else publishes what a mission has one publisher of: another mission, or a player of bags.
+"""Other nodes that publish a mission's exclusive topics: another mission, or a player of bags.
 
-A payload says which run it belongs to; a pose and a clock do not. So a mission does not begin where somebody
-else publishes them, and tells who does.
+A payload names its run; a pose and a clock do not. So a mission does not begin beside such publishers.
 """
 
 from collections import Counter
@@ -22,34 +21,34 @@ ADVICE = (
 
 
 class AnotherMissionError(NodeError):
-    """A mission cannot begin where somebody else publishes its topics."""
+    """A mission cannot begin: other nodes publish its topics."""
 
-    def __init__(self, told: str) -> None:
-        super().__init__(f"{told}: {ADVICE}")
+    def __init__(self, description: str) -> None:
+        super().__init__(f"{description}: {ADVICE}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class OtherPublishers:
-    """Publishers that do not belong to this mission.
+    """Publishers that do not belong to this mission; false if there are none.
 
     Attributes:
-        foreign: topics by full name of a node that no mission of this namespace has.
-        doubles: topics by full name of a node that another mission has, too.
+        foreign: topics by full name of a node that is not in this mission's table.
+        doubles: topics by full name of a node of the table that another mission has, too.
     """
 
     foreign: Mapping[str, Sequence[str]] = field(default_factory=dict)
     doubles: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
-        """Is there any."""
+        """Whether there are any."""
         return bool(self.foreign or self.doubles)
 
-    def told(self, run: str = "") -> str:
-        """Who publishes what, in words; `run` is that of the messages received, where there were any."""
+    def description(self, run: str = "") -> str:
+        """Names and topics of the publishers, in words; `run` is that of the messages received from them."""
         of_run = f" (run {run})" if run else ""
-        told = [f"{name} publishes {', '.join(on)}" for name, on in self.foreign.items()]
-        if told:
-            return f"{'; '.join(told)} here{of_run}, and is no node of this mission"
+        if self.foreign:
+            names = "; ".join(f"{name} publishes {', '.join(on)}" for name, on in self.foreign.items())
+            return f"{names} here{of_run}, and is no node of this mission"
         by = f" by {', '.join(self.doubles)}" if self.doubles else ""
         return f"another mission is being flown here{by}{of_run}"
 
@@ -61,33 +60,33 @@ def find(
     restarted: Collection[str] = (),
     absent: Collection[str] = (),
 ) -> OtherPublishers:
-    """Rivals among the publishers of exclusive topics.
+    """Find the publishers that do not belong to a mission.
 
     Args:
-        publishers: full names of the nodes behind the publishers, one for each, by topic.
+        publishers: full names of the publishers' nodes, by topic, see `publishers`.
         namespace: of the mission.
-        rows: the node table, as it is in this mission.
-        absent: nodes of this mission that do not publish yet.
-        restarted: nodes that were started again: of those that were killed the graph may still tell.
+        rows: the node table of the mission.
+        restarted: nodes that were restarted: the graph may still list the killed ones.
+        absent: nodes of the mission that do not publish yet.
     """
     foreign: dict[str, list[str]] = {}
     doubles: dict[str, list[str]] = {}
     for topic, names in publishers.items():
-        ours = {
+        own = {
             f"{namespace.rstrip('/')}/{row.name}": row.name for row in rows.values() if topic in row.publishes
         }
-        if not ours:
-            continue  # nobody publishes it in this mission, nor trusts it
+        if not own:
+            continue  # no node of this mission publishes it, nor relies on it
         for name, count in Counter(names).items():
-            if name not in ours:
+            if name not in own:
                 foreign.setdefault(name, []).append(topic)
-            elif count > (ours[name] not in absent) and ours[name] not in restarted:
+            elif count > (own[name] not in absent) and own[name] not in restarted:
                 doubles.setdefault(name, []).append(topic)
     return OtherPublishers(foreign=foreign, doubles=doubles)
 
 
 def publishers(node: Node) -> dict[str, list[str]]:
-    """Full names of the nodes behind the publishers of exclusive topics, as the graph tells now."""
+    """Full names of the publishers' nodes, one for each publisher, by exclusive topic, from the graph."""
     return {
         topic.name: [
             name

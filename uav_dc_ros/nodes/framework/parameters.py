@@ -1,8 +1,8 @@
-"""The nodes' ROS parameters: each declared once, with description, unit and range. Knows no ROS."""
+"""ROS parameters of the nodes, one row each, with default, description, unit and range. Needs no ROS."""
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import msgspec
@@ -11,76 +11,73 @@ from uav_dc_ros.bags.compression import COMPRESSIONS
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.messages import Run
-from uav_dc_ros.topics import SIMULATED, VEHICLES
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
+from uav_dc_ros.offboard.mission.geofence import MARGIN_M
+from uav_dc_ros.topics import SIMULATED, SYSTEM_MAX, VEHICLES
 
-EXTERNAL = "external"  # what the world calls a vehicle that is not its own
-WHOLE_MAX = 2**63 - 1  # of a ROS integer
-SPLIT_MAX_S = 1e9  # thirty years
-PORT_MAX = 65535
+EXTERNAL = "external"  # value of the world's `vehicle` beside a bridge
+INTEGER_MAX = 2**63 - 1  # of a ROS integer
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Parameter:
-    """A parameter.
-
-    Its type is that of its default. It can be set until the node is configured, and again after the node
-    was cleaned up: what a node has checked and loaded does not change under it.
+    """A ROS parameter, of the type of its default. It can be set while its node is unconfigured.
 
     Attributes:
-        name: its name.
-        default: its value unless another is given.
-        description: what it is for.
-        unit: of its value; empty for names, counts and switches.
-        least, most: range of a number.
-        read_only: is it fixed when the node starts?
-        parse: makes the value that the node uses; raises ParameterError.
+        unit: unit of the value; empty for names, counts and switches.
+        min, max: range of a number.
+        read_only: the value is fixed when the node starts.
+        parse: returns the value that the node uses; raises ParameterError.
     """
 
     name: str
     default: bool | int | float | str | list[str]
     description: str
     unit: str = ""
-    least: float | None = None
-    most: float | None = None
+    min: float | None = None
+    max: float | None = None
+    _: KW_ONLY
     read_only: bool = False
     parse: Callable[[Any], Any] | None = None
 
     @property
-    def expected(self) -> str:
-        """What is expected of its value, in words."""
-        if self.least is None:
-            words = {bool: "true or false", list: "a list of texts"}
-            return words.get(type(self.default), "text")
-        kind = "a whole number" if isinstance(self.default, int) else "a number"
-        return f"{kind} from {self.least} to {self.most}{f' {self.unit}' if self.unit else ''}"
+    def description_with_unit(self) -> str:
+        """The description, as ROS and `--help` show it."""
+        return f"{self.description} [{self.unit}]" if self.unit else self.description
 
-    def typed(self, given: Any) -> Any:
-        """A value as one of the parameter's type, where it denotes one: `dwell_s:=1` and `pace:=90` do."""
+    @property
+    def expected(self) -> str:
+        """Type and range of the value, in words."""
+        if self.min is None:
+            return {bool: "true or false", list: "a list of texts"}.get(type(self.default), "text")
+        kind = "a whole number" if isinstance(self.default, int) else "a number"
+        return f"{kind} from {self.min} to {self.max}{f' {self.unit}' if self.unit else ''}"
+
+    def typed(self, value: Any) -> Any:
+        """Convert a value to the parameter's type where that loses nothing: `dwell_s:=1`, `pace:=90`."""
         if isinstance(self.default, list):
-            return list(given) if isinstance(given, list | tuple) else given
-        if isinstance(self.default, str) and isinstance(given, bool | int | float):
-            return str(given)
-        if type(self.default) is float and type(given) is int:
+            return list(value) if isinstance(value, list | tuple) else value
+        if isinstance(self.default, str) and isinstance(value, bool | int | float):
+            return str(value)
+        if type(self.default) is float and type(value) is int:
             with contextlib.suppress(OverflowError):
-                return float(given)
-        return given
+                return float(value)
+        return value
 
     def value(self, given: Any) -> Any:
-        """The value that a node uses, checked.
+        """Check a value and return what the node uses.
 
         Raises:
-            ParameterError: a value of another type, out of range, or that makes no sense.
+            ParameterError: wrong type, out of range, or refused by `parse`.
         """
-        given = self.typed(given)
-        if type(given) is not type(self.default):
-            raise ParameterError(f"{self.name}: {given!r}; expected {self.expected}")
-        number: Any = given
-        if self.least is not None and not self.least <= number <= (self.most or 0):
-            raise ParameterError(f"{self.name}: {given!r}; expected {self.expected}")
+        value = self.typed(given)
+        has_type = type(value) is type(self.default)
+        if not has_type or (self.min is not None and not self.min <= value <= (self.max or 0)):
+            raise ParameterError(f"{self.name}: {value!r}; expected {self.expected}")
         if self.parse is None:
-            return given
+            return value
         try:
-            return self.parse(given)
+            return self.parse(value)
         except ParameterError as error:
             raise ParameterError(f"{self.name}: {error}") from None
 
@@ -92,8 +89,8 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def one_of(*choices: str) -> Callable[[str], str]:
-    """The check of a text that is one of a few."""
+def _one_of(*choices: str) -> Callable[[str], str]:
+    """A check that a text is one of these."""
 
     def check(text: str) -> str:
         if text not in choices:
@@ -110,135 +107,169 @@ def _run(text: str) -> str:
         raise ParameterError(f"{text!r}; expected 16 hexadecimal digits in lower case, as a text") from None
 
 
-AUTOSTART = Parameter(
-    name="autostart",
-    default=True,
-    description="configure and activate at once; false: wait for a lifecycle manager",
-    read_only=True,
+# Of every node.
+COMMON = (
+    Parameter(
+        "autostart",
+        True,
+        "configure and activate at once; false: wait for a lifecycle manager",
+        read_only=True,
+    ),
+    Parameter(
+        "peers",
+        ["world", "channel_monitor", "policy"],
+        "nodes of this mission, by name; it starts when all of them are there",
+        read_only=True,
+    ),
+    Parameter(
+        "run",
+        "",
+        "identity of this run of missions, 16 hexadecimal digits: the node ignores messages of every other "
+        "run; empty: the vehicle draws one, the others adopt the vehicle's",
+        read_only=True,
+        parse=_run,
+    ),
 )
-PEERS = Parameter(
-    name="peers",
-    default=["world", "channel_monitor", "policy"],
-    description="nodes of this mission, by name; it starts when all of them are there",
-    read_only=True,
-)
-RUN = Parameter(
-    name="run",
-    default="",
-    description="identity of this run of missions, 16 hexadecimal digits: the node ignores messages of every "
-    "other run; empty: the vehicle draws one, the others adopt the vehicle's",
-    read_only=True,
-    parse=_run,
-)
-SCENARIO = Parameter(
-    name="scenario", default="five_clusters", description="name of a shipped scenario, or path of a TOML file"
-)
-SCENARIO_OR_POLICYS = Parameter(
-    name="scenario", default="", description="scenario of the mission; empty: the policy's own"
-)
-POLICY = Parameter(
-    name="policy",
-    default="five_clusters_dueling",
-    description="name of a shipped policy, or its folder",
-)
-POLICY_IF_KNOWN = Parameter(
-    name="policy", default="", description="policy that flies, by name or folder; empty: not known"
-)
-SEED = Parameter(
-    name="seed", default=0, least=0, most=WHOLE_MAX, description="seed of the first mission's users"
-)
-MISSIONS = Parameter(
-    name="missions",
-    default=1,
-    least=1,
-    most=WHOLE_MAX,
-    description="missions to fly, one after the other, with seeds that follow each other",
-)
+
+# Of the nodes of a mission.
+SCENARIO = Parameter("scenario", "five_clusters", "name of a shipped scenario, or path of a TOML file")
+SCENARIO_OF_POLICY = Parameter("scenario", "", "scenario of the mission; empty: the policy's own")
+POLICY = Parameter("policy", "five_clusters_dueling", "name of a shipped policy, or its folder")
+RECORDED_POLICY = Parameter("policy", "", "policy that flies, by name or folder; empty: not known")
+SEED = Parameter("seed", 0, "seed of the first mission's users", "", 0, INTEGER_MAX)
+MISSIONS = Parameter("missions", 1, "number of missions, with consecutive seeds", "", 1, INTEGER_MAX)
 PACE = Parameter(
-    name="pace",
-    default=pace.LOCKSTEP,
-    description="'lockstep', or how many times faster than real time",
-    parse=pace.parse,
+    "pace", pace.LOCKSTEP, "'lockstep', or how many times faster than real time", parse=pace.parse
 )
 JOURNAL = Parameter(
-    name="journal",
-    default="",
-    description="file in which the node keeps what it must know again after a restart, one file for one "
-    "flight; empty: it forgets",
+    "journal", "", "file with the node's state for a restart, one file for one flight; empty: none"
 )
-BAG = Parameter(name="bag", default="", description="folder of the new bag")
-RESUME = Parameter(
-    name="resume",
-    default=False,
-    description="go on with the bag of a recorder that was killed, instead of refusing an existing folder",
+VEHICLE_OF_WORLD = Parameter(
+    "vehicle",
+    SIMULATED,
+    f"'{SIMULATED}': this node flies the vehicle; '{EXTERNAL}': a bridge does, and this node moves the users",
+    parse=_one_of(SIMULATED, EXTERNAL),
 )
+RECORDED_VEHICLE = Parameter(
+    "vehicle",
+    SIMULATED,
+    f"vehicle that flies: '{SIMULATED}', or the interface of a real one: one of {', '.join(VEHICLES)}",
+    parse=_one_of(SIMULATED, *VEHICLES),
+)
+RATE_HZ = Parameter("rate", 5.0, "maximum rate of path and markers", "Hz", 0.1, 60.0)
+PORT = Parameter("port", 8765, "TCP port of the Foxglove WebSocket server; 0: any that is free", "", 0, 65535)
+ADDRESS = Parameter(
+    "address", "127.0.0.1", "network address that the server listens on; 0.0.0.0: all of this machine's"
+)
+
+# Of the nodes that write a bag.
 RECORDED_TOPICS = Parameter(
-    name="topics",
-    default="",
-    description="topics to record, by name, with a comma between; empty: all in the node's namespace",
+    "topics",
+    "",
+    "topics to record, by name, with a comma between; empty: all in the node's namespace",
     parse=_names,
 )
 SPLIT_BYTES = Parameter(
-    name="split_bytes",
-    default=0,
-    least=0,
-    most=WHOLE_MAX,
-    unit="bytes",
-    description="size of a bag's file after which the next one is begun; 0: never",
+    "split_bytes", 0, "size at which a bag's next file begins; 0: never", "bytes", 0, INTEGER_MAX
 )
-SPLIT_S = Parameter(
-    name="split_s",
-    default=0.0,
-    least=0.0,
-    most=SPLIT_MAX_S,
-    unit="s",
-    description="time after which the next file of a bag is begun; 0: never",
-)
+SPLIT_S = Parameter("split_s", 0.0, "time after which a bag's next file begins; 0: never", "s", 0.0, 1e9)
 COMPRESSION = Parameter(
-    name="compression",
-    default="zstd",
-    description=f"how a bag's chunks are compressed: one of {', '.join(COMPRESSIONS)}",
-    parse=one_of(*COMPRESSIONS),
+    "compression",
+    "zstd",
+    f"how a bag's chunks are compressed: one of {', '.join(COMPRESSIONS)}",
+    parse=_one_of(*COMPRESSIONS),
 )
 MIN_FREE_BYTES = Parameter(
-    name="min_free_bytes",
-    default=256 * 2**20,
-    least=0,
-    most=WHOLE_MAX,
-    unit="bytes",
-    description="free space of the disk below which recording stops, and the bag is closed",
+    "min_free_bytes", 2**28, "free disk space below which recording stops", "bytes", 0, INTEGER_MAX
 )
-RATE_HZ = Parameter(
-    name="rate",
-    default=5.0,
-    least=0.1,
-    most=60.0,
-    unit="Hz",
-    description="how often path and markers are drawn, at most",
+BAG_WRITER = (
+    Parameter("bag", "", "folder of the new bag"),
+    Parameter(
+        "resume",
+        False,
+        "true: continue the bag of a recorder that was killed; false: refuse an existing folder",
+    ),
+    *(RECORDED_TOPICS, SPLIT_BYTES, SPLIT_S, COMPRESSION, MIN_FREE_BYTES),
 )
-PORT = Parameter(
-    name="port",
-    default=8765,
-    least=0,
-    most=PORT_MAX,
-    description="TCP port of the Foxglove WebSocket server; 0: any that is free",
+
+
+def _safety(name: str, description: str, unit: str, min: float, max: float) -> Parameter:
+    """A field of `SafetySettings`, with its default."""
+    return Parameter(name, getattr(SafetySettings, name), description, unit, min, max)
+
+
+# Of the bridge: the interface of the vehicle, and how carefully the bridge flies it.
+BRIDGE = (
+    Parameter(
+        "vehicle",
+        "mavlink",
+        f"interface of the autopilot: one of {', '.join(VEHICLES)}",
+        parse=_one_of(*VEHICLES),
+    ),
+    Parameter(
+        "connect",
+        "",
+        "address of a vehicle on MAVLink, such as tcp:127.0.0.1:5760, udp:0.0.0.0:14550 or "
+        "serial:/dev/ttyAMA0:921600",
+    ),
+    Parameter("system", 0, "MAVLink system number; 0: the only autopilot on the link", "", 0, SYSTEM_MAX),
+    Parameter(
+        "datum",
+        "",
+        "position of the grid's corner: here (the vehicle stands at the scenario's start when its first good "
+        "position arrives), last (as in the last flight), or latitude, longitude (degrees) and altitude "
+        "(metres) with a comma between; needed with arm; empty: here",
+    ),
+    *(SCENARIO, SEED, JOURNAL),
+    Parameter(
+        "fence_margin_m", MARGIN_M, "distance of the fence around and above the grid", "m", 1.0, 1000.0
+    ),
+    Parameter(
+        "arm",
+        SafetySettings.arm,
+        "true: the bridge sets the mode and arms; false: it waits until a pilot has done so",
+    ),
+    _safety("tolerance_m", "distance to a cell's centre that counts as reached", "m", 0.1, 50.0),
+    _safety("dwell_s", "time at the cell's centre that completes a step, vehicle time", "s", 0.0, 60.0),
+    _safety("position_timeout_s", "maximum age of the position; an older one is a fault", "s", 0.1, 10.0),
+    _safety("heartbeat_timeout_s", "age of the last heartbeat at which the link is lost", "s", 1.5, 60.0),
+    _safety("policy_timeout_steps", "timeout of the policy, in durations of a step", "", 0.1, 100.0),
+    _safety("policy_timeout_s", "minimum timeout of the policy, by this computer's clock", "s", 0.0, 600.0),
+    _safety("max_speed_mps", "maximum speed; a faster change of position is a jump", "m/s", 1.0, 100.0),
+    _safety("max_position_jump_m", "maximum jump of a position that is accepted", "m", 0.1, 100.0),
+    _safety("fault_timeout_s", "fault timer: a fault that lasts longer ends the mission", "s", 0.1, 600.0),
+    _safety("link_lost_timeout_s", "time without a heartbeat until the bridge gives up", "s", 1.0, 3600.0),
+    _safety("min_battery", "minimum battery charge, 0 to 1; below it the mission ends", "", 0.0, 1.0),
+    Parameter(
+        "failsafe_action",
+        str(SafetySettings.failsafe_action),
+        "failsafe action of the bridge: return or land",
+        parse=_one_of("return", "land"),
+    ),
+    Parameter(
+        "flying_at_start",
+        SafetySettings.flying_at_start,
+        "action when the bridge starts beside a vehicle in the commanded mode: resume or land",
+        parse=_one_of("resume", "land"),
+    ),
+    _safety("command_retry_s", "pause before a request is repeated, vehicle time", "s", 0.5, 60.0),
+    _safety("max_return_attempts", "requests to return before the bridge requests land", "", 1, 100),
+    _safety("takeoff_timeout_s", "timeout of take-off and way to the start, vehicle time", "s", 5.0, 3600.0),
+    _safety("max_offset_cells", "distance from its cell at which a late step may end", "cells", 0.0, 1.0),
+    _safety("progress_timeout_s", "time to come nearer to a cell after that, vehicle time", "s", 1.0, 600.0),
+    _safety("target_timeout_s", "how long the autopilot may report another target", "s", 1.0, 600.0),
+    _safety("landing_radius_m", "distance from the dock within which it has landed there", "m", 0.1, 1000.0),
+    _safety(
+        "return_progress_timeout_s", "time to come nearer to home on a return, vehicle time", "s", 5.0, 3600.0
+    ),
+    _safety(
+        "landing_progress_timeout_s",
+        "time to come lower or disarm in a landing, vehicle time",
+        "s",
+        5.0,
+        3600.0,
+    ),
+    _safety("max_tilt_deg", "tilt beyond which the vehicle is not flying", "deg", 10.0, 180.0),
+    _safety("max_sink_m", "maximum sink below the setpoint", "m", 1.0, 1000.0),
+    _safety("crash_timeout_s", "time beyond these two, or on the ground in flight", "s", 0.1, 60.0),
 )
-ADDRESS = Parameter(
-    name="address",
-    default="127.0.0.1",
-    description="network address that the server listens on; 0.0.0.0: all of this machine's",
-)
-VEHICLE_OF_WORLD = Parameter(
-    name="vehicle",
-    default=SIMULATED,
-    description=f"'{SIMULATED}': this node flies it; '{EXTERNAL}': a bridge does, and here are the users",
-    parse=one_of(SIMULATED, EXTERNAL),
-)
-VEHICLE_FLOWN = Parameter(
-    name="vehicle",
-    default=SIMULATED,
-    description=f"what flies: '{SIMULATED}', or the way to a real one: one of {', '.join(VEHICLES)}",
-    parse=one_of(SIMULATED, *VEHICLES),
-)
-BAG_FILES = (RECORDED_TOPICS, SPLIT_BYTES, SPLIT_S, COMPRESSION, MIN_FREE_BYTES)  # of who writes a bag
-EVERY = (AUTOSTART, PEERS, RUN)  # that every node has

@@ -1,8 +1,7 @@
 """How run_all controls the processes of its nodes: commands through standard input, reports through a pipe.
 
-The services of the life cycle are there for everybody else. run_all does not use them: ROS finds a service by
-its name, so that beside another mission in the same namespace a request may reach that mission's node, too. A
-pipe has no other end than the process that was started with it, and loses and repeats nothing.
+run_all does not use the lifecycle services: ROS finds a service by its name, so a request may reach a node of
+another mission in the same namespace. A pipe connects two processes only, and neither loses nor repeats.
 """
 
 import contextlib
@@ -16,20 +15,15 @@ if TYPE_CHECKING:
     from uav_dc_ros.nodes.framework.lifecycle_node import ManagedNode
 
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this process has been restarted
-REPORTS = "UAV_DC_ROS_REPORTS"  # set by run_all: the file descriptor that takes the reports
-PERIOD_S = 0.25  # from one report to the next
+REPORTS = "UAV_DC_ROS_REPORTS"  # set by run_all: the file descriptor for the reports
+PERIOD_S = 0.25  # of the reports
 CONFIGURE, ACTIVATE = "configure", "activate"
-FINALIZED = "finalized"  # the state in which a node has said its last
-REASON_MAX = 1000  # characters; a report is shorter than what a pipe takes in one piece
+FINALIZED = "finalized"  # the state in which a node publishes no more
+REASON_MAX = 1000  # characters; a report is shorter than what a pipe writes atomically
 
 
 class NodeReport(msgspec.Struct, frozen=True):
-    """How far a node has come.
-
-    Attributes:
-        state: of its life cycle.
-        refused: why it refused the last transition; None if it did not.
-    """
+    """State of a node's life cycle, and why its last transition failed (None: it did not)."""
 
     state: str
     refused: str | None = None
@@ -44,18 +38,15 @@ def command(transition: str, node: str) -> bytes:
 
 
 def decode(line: bytes) -> Mapping[str, NodeReport]:
-    """Reports by name of the node, from a line."""
+    """Decode a line of reports, by name of the node."""
     return _decoder.decode(line)
 
 
 class Reporter:
-    """The nodes' end: makes the transitions that are commanded, and reports.
+    """The nodes' end: makes the commanded transitions, and reports.
 
-    A report is also a heartbeat: the executor's own thread sends one every `PERIOD_S`. A callback that hangs
+    A report is also a heartbeat: the executor's thread sends one every `PERIOD_S`. A callback that hangs
     stops them.
-
-    Args:
-        nodes: of this process.
     """
 
     def __init__(self, nodes: "Sequence[ManagedNode]") -> None:
@@ -72,11 +63,11 @@ class Reporter:
         reports = {
             name: NodeReport(node.state, self._refused.get(name)) for name, node in self._nodes.items()
         }
-        # The pipe is full while run_all is suspended, and closed when it is gone, which Stopper notices.
+        # The pipe is full while run_all is suspended, and closed once it has ended: see StopMonitor.
         with contextlib.suppress(OSError):
             os.write(self._pipe, msgspec.json.encode(reports) + b"\n")
 
-    def obey(self, line: str) -> None:
+    def execute(self, line: str) -> None:
         """Make the transition that a line commands, and report."""
         transition, name = line.split()
         node = self._nodes[name]

@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A bag with moves and poses must not reach a vehicle on the network by accident.
-    environment.prepare(alone=True)
+    environment.prepare(local_only=True)
     with BagReader(options.bag) as reader:
         _play(reader, _playback_options(reader, options))
     return 0

@@ -44,7 +44,7 @@ class SubscriberMonitor:
         for namespace, ends_by_topic in publishers.items():
             found = other_publishers.find(ends_by_topic, namespace, NODES, absent=NODES)
             if found.doubles:
-                return other_publishers.OtherPublishers(doubles=found.doubles).told()
+                return other_publishers.OtherPublishers(doubles=found.doubles).description()
         return None
 
     def competing_publishers(self) -> Iterator[str]:

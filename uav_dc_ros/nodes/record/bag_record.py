@@ -79,6 +79,6 @@ def run(options: argparse.Namespace) -> int:
         "compression": options.compression,
         "min_free_bytes": options.min_free_bytes,
     }
-    environment.prepare(alone=False)  # publishers may be on any host
+    environment.prepare(local_only=False)  # publishers may be on any host
     remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
     node_main.main(lambda: BagRecorder(values), arguments=remapped)

@@ -40,7 +40,7 @@ class RecorderBase(MissionNode):
     """
 
     drains = True
-    rest_s = 0.005  # no node waits for the recorder
+    pause_s = 0.005  # no node waits for the recorder
     delays_new_topics = False
 
     def __init__(self, name: str, *arguments: Any) -> None:
@@ -133,11 +133,11 @@ class RecorderBase(MissionNode):
             self.writer.close()
             self.writer = None
 
-    def _fall_silent(self) -> None:
+    def _undo_activation(self) -> None:
         for topic in self._recorded.values():
             topic.close()
         self._recorded.clear()
-        super()._fall_silent()
+        super()._undo_activation()
 
     # Messages.
 
@@ -150,7 +150,7 @@ class RecorderBase(MissionNode):
         name = self.resolve_topic_name(topic.name)
         recorded = AdaptiveSubscription(self, name, topic.type, self._handler(name, topic))
         override = f"qos_overrides.{name}.subscription."
-        overridden = any(given.startswith(override) for given in rclpy_private.overrides(self))
+        overridden = any(given.startswith(override) for given in rclpy_private.parameter_overrides(self))
         full_qos = replace(topic, requests_reliable=topic.reliable)
         subscription = self.create_raw_subscription(full_qos, recorded.callback)
         recorded.use(subscription, adapts=not (topic.requests_reliable or overridden))
@@ -165,7 +165,7 @@ class RecorderBase(MissionNode):
             return lambda data, info: None  # the peers of a mission wait for the subscription
         already_ns = writer.already_written.get(name, -1)
         label = name if topic is None else topic.name
-        heard, write, announced = self.meter.heard, writer.write, self._announced
+        heard, write, announced = self.statistics.count_received, writer.write, self._announced
 
         def handle(data: bytes, info: Any) -> None:
             if topic is not None:

@@ -10,7 +10,7 @@ from uav_dc_ros.core.arrays import Array
 
 
 def clock(time_ns: int) -> Clock:
-    """A time, nanoseconds, as a message for `clock`."""
+    """A message for `clock`."""
     return Clock(clock=stamp(time_ns))
 
 

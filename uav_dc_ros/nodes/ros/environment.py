@@ -1,4 +1,4 @@
-"""What holds for a command's ROS and that of its nodes, unless the user's environment says otherwise."""
+"""Checks the environment of ROS, for a command and its nodes, and sets what the user left open."""
 
 import contextlib
 import importlib.util
@@ -12,34 +12,34 @@ from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.nodes.ros import fastdds
 
 LINES = "RCUTILS_CONSOLE_OUTPUT_FORMAT"
-LINE_OF_NODE = "{severity}: {message}"  # whose line it is says who passes it on
+LINE_OF_NODE = "{severity}: {message}"  # whoever passes it on adds the node's name
 LINE_OF_ONE_OF_MANY = "{severity}: {name}: {message}"
 DOMAIN_MAX = 232  # the ports of higher ones do not exist
-NUMBER = re.compile(r"(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*")  # as C's strtoul reads it: rcl uses that
+NUMBER = re.compile(r"(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*")  # as C's strtoul reads it, and so rcl
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 RANGES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
-LOG_FOLDERS = (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"))  # of rcl, the first one that is set
+LOG_FOLDERS = (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"))  # rcl uses the first one that is set
 
 
-def prepare(*, alone: bool) -> None:
-    """Check the environment, and set what it leaves open; to be called before ROS is imported.
+def prepare(*, local_only: bool) -> None:
+    """Check the environment and set what it leaves open; to be called before ROS is imported.
 
     Args:
-        alone: is all that takes part on this host? Then no other host sees it by accident.
+        local_only: all participants run on this host, so discovery is limited to it.
 
     Raises:
-        ParameterError: an environment in which ROS cannot start.
+        ParameterError: ROS cannot start in this environment.
     """
     check()
-    os.environ.setdefault(RANGE, "LOCALHOST" if alone else "SUBNET")
+    os.environ.setdefault(RANGE, "LOCALHOST" if local_only else "SUBNET")
     os.environ.setdefault(LINES, LINE_OF_NODE)
 
 
 def check() -> None:
-    """Check the environment, as every process that uses ROS must.
+    """Check the environment of a process that uses ROS.
 
     Raises:
-        ParameterError: an environment in which ROS cannot start, or its nodes cannot find each other.
+        ParameterError: ROS cannot start, or its nodes cannot find each other.
     """
     check_import()
     _check_domain()
@@ -48,10 +48,10 @@ def check() -> None:
     fastdds.use_profiles()
     fastdds.remove_leftovers()
     free_mb = fastdds.free_mb()
-    if free_mb < fastdds.ENOUGH_MB and fastdds.TRANSPORTS not in os.environ:
+    if free_mb < fastdds.RECOMMENDED_MB and fastdds.TRANSPORTS not in os.environ:
         fastdds.use_udp_only()
         _note(
-            f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.ENOUGH_MB}: messages "
+            f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "
             "travel over UDP alone"
         )
 
@@ -62,22 +62,19 @@ def check_import() -> None:
     Raises:
         ParameterError: shared memory is full, or the chosen middleware is not installed.
     """
-    if fastdds.free_mb() < fastdds.LEAST_MB:
+    if fastdds.free_mb() < fastdds.MIN_MB:
         fastdds.remove_leftovers()
-        if (free_mb := fastdds.free_mb()) < fastdds.LEAST_MB:
+        if (free_mb := fastdds.free_mb()) < fastdds.MIN_MB:
             raise ParameterError(
                 f"{fastdds.SHARED_MEMORY} is full ({free_mb:.2f} MB free), and ROS does not start; expected "
-                f"{fastdds.ENOUGH_MB} MB"
+                f"{fastdds.RECOMMENDED_MB} MB"
             )
     name = os.environ.get("RMW_IMPLEMENTATION")
     if not name:
         return
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    packages = [Path(prefix, "share", name) for prefix in prefixes if prefix]
-    is_name = name.isascii() and name.isidentifier()
-    if not is_name or not (
-        importlib.util.find_spec(name) is not None or any(package.is_dir() for package in packages)
-    ):
+    is_package = any(Path(prefix, "share", name).is_dir() for prefix in prefixes if prefix)
+    if not (name.isascii() and name.isidentifier() and (importlib.util.find_spec(name) or is_package)):
         raise ParameterError(
             f"RMW_IMPLEMENTATION is {name!r}, which is not installed; expected one that is, such as "
             "rmw_fastrtps_cpp, or the variable unset"
@@ -87,7 +84,7 @@ def check_import() -> None:
 def _check_domain() -> None:
     domain = os.environ.get("ROS_DOMAIN_ID")
     if not domain:
-        return  # ROS takes an empty one as unset
+        return  # ROS treats an empty one as unset
     found = NUMBER.fullmatch(domain)
     number = -1 if found is None else int(domain, 16 if found[1] else 8 if found[2] else 10)
     if not 0 <= number <= DOMAIN_MAX:
@@ -98,18 +95,17 @@ def _check_range() -> None:
     value = os.environ.get(RANGE)
     if not value:
         os.environ.pop(RANGE, None)
-    elif value == "OFF":
-        raise ParameterError(f"{RANGE} is OFF: nodes do not find each other; expected {' or '.join(RANGES)}")
     elif value not in RANGES:
-        raise ParameterError(f"{RANGE} is {value!r}; expected {' or '.join(RANGES)}")
+        off = ": nodes do not find each other" if value == "OFF" else ""
+        raise ParameterError(f"{RANGE} is {value!r}{off}; expected {' or '.join(RANGES)}")
 
 
 def _check_log_folder() -> None:
-    """Make the folder for ROS's log files, where rcl would look for it; without a home, somewhere else."""
+    """Create the folder for ROS's log files where rcl expects it; if the home has none, a temporary one."""
     for variable, below in LOG_FOLDERS:
         if value := os.environ.get(variable):
             folder = Path(os.path.expanduser(value), below)
-            if (why := _cannot_write(folder)) is not None:
+            if (why := _write_error(folder)) is not None:
                 raise ParameterError(
                     f"{variable} is {value!r}: {why}; expected a folder for log files that can be made and "
                     "written"
@@ -117,7 +113,7 @@ def _check_log_folder() -> None:
             os.environ["ROS_LOG_DIR"] = str(folder)  # rcl expands no ~ without HOME
             return
     folder = Path(os.path.expanduser("~"), ".ros", "log")
-    if (why := _cannot_write(folder)) is not None:
+    if (why := _write_error(folder)) is not None:
         folder = Path(tempfile.mkdtemp(prefix="uav_dc_ros_log_"))
         _note(f"no log files in the home folder ({why}): they are in {folder}")
     elif os.environ.get("HOME"):
@@ -125,8 +121,8 @@ def _check_log_folder() -> None:
     os.environ["ROS_LOG_DIR"] = str(folder)
 
 
-def _cannot_write(folder: Path) -> str | None:
-    """Why no file can be made in a folder, which is made if need be; None: it can."""
+def _write_error(folder: Path) -> str | None:
+    """Create a folder and a file in it: the error, or None."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -136,6 +132,5 @@ def _cannot_write(folder: Path) -> str | None:
 
 
 def _note(text: str) -> None:
-    """Print a line for the user, if there is anything to print it on."""
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError):  # standard error may be closed, or None
         print(f"note: {text}", file=sys.stderr)

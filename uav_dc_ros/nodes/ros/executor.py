@@ -1,9 +1,9 @@
 """An executor that handles what is ready straight from the wait set.
 
 rclpy's SingleThreadedExecutor makes a task, a coroutine and three guard triggers of every callback, and wakes
-itself once more for each; in a lockstep of small messages that is more than the messages themselves take.
-rclpy's EventsExecutor would be the one to use, but it is experimental, and called no callback in the wheels
-of 7.1.6. `benchmarks/lockstep.py` measures this one beside rclpy's own.
+itself once more for each; in a lockstep of small messages that takes longer than the messages. rclpy's
+EventsExecutor is experimental, and called no callback in the wheels of 7.1.6. `benchmarks/lockstep.py`
+compares this executor with rclpy's own.
 """
 
 import gc
@@ -20,94 +20,102 @@ from rclpy.utilities import get_default_context
 
 from uav_dc_ros.nodes.ros import rclpy_private
 
-TURN_MAX, TURN_MAX_S = 100, 0.2  # messages of one topic, and their time, before the others get their turn
-# Quiet is what was so in as many turns: on a busy computer the middleware's thread may have had no time yet.
+# Limits of one topic's messages in a turn, by number and time, so that the other topics are handled, too.
+TURN_MAX, TURN_MAX_S = 100, 0.2
+# Turns without a message that count as quiet: on a busy computer the middleware's thread may be delayed.
 QUIET_TURNS = 10
-BUSY_S = 0.003  # while messages keep coming, timers and services are looked at this often
+BUSY_S = 0.003  # while messages keep coming, timers and services are checked this often
 BUSY_NS = round(BUSY_S * 1e9)
 
 
 class DirectExecutor:
-    """One thread, in which callbacks run one after the other: timers, subscriptions, services, clients.
+    """Runs callbacks one after the other in one thread: timers, subscriptions, services, clients.
 
-    Callbacks may be plain functions only. Event callbacks of publishers and subscriptions are not handled:
-    `qos.incompatible` looks for peers that do not match.
+    Callbacks are plain functions. Event callbacks of publishers and subscriptions are not handled:
+    `qos.incompatible` finds peers that do not match.
 
     Args:
-        rest_s: pause after each turn that handled all there was, seconds. Who need not answer at once takes
-            what came meanwhile in one turn, and leaves the cores to those who must.
-        context: of ROS; None: the process's own.
+        pause_s: pause after each turn that handled all messages, seconds. A node that need not respond at
+            once handles the messages of the pause in one turn, and leaves the cores to the other nodes.
+        context: ROS context; None: the default one.
     """
 
-    def __init__(self, rest_s: float = 0.0, context: Context | None = None) -> None:
-        self.rest_s = rest_s
-        self._at_once = TURN_MAX if rest_s else 1
-        self._behind = False  # did messages wait for another turn
+    def __init__(self, pause_s: float = 0.0, context: Context | None = None) -> None:
+        self.pause_s = pause_s
+        self._messages_max = TURN_MAX if pause_s else 1  # of a topic in a turn
+        self._is_behind = False  # messages wait for the next turn
         self._context: Any = context or get_default_context()
         self._guard = GuardCondition(callback=None, callback_group=None, context=self._context)
         self._nodes: list[Node] = []
         self._wait_set: Any = None
-        self._few: Any = None  # a wait set for subscriptions alone
-        self._subscriptions: list[Any] = []  # as of the last look at everything
+        self._subscriptions_wait_set: Any = None
+        self._subscriptions: list[Any] = []  # as of the last full wait
+        self._handlers: dict[str, Callable[[Any], None]] = {  # in the order in which they run
+            "timer": _call_timer,
+            "subscription": self._take_messages,
+            "service": _serve,
+            "client": _complete,
+        }
         self._capacity: tuple[int, ...] = ()
-        self._looked_s = 0.0  # when everything was last looked at
-        self._heard_s = 0.0  # when a message was last handled
+        self._full_wait_s = 0.0  # time of the last full wait
+        self._received_s = 0.0  # time of the last message
 
     def add_node(self, node: Node) -> None:
         """Handle a node's callbacks from now on."""
         self._nodes.append(node)
 
     def wake(self) -> None:
-        """End the wait of `spin`, from any thread, so that it looks at its condition."""
+        """End the wait of `spin`, from any thread, so that it checks its condition."""
         self._guard.trigger()
 
     def spin(self, stop: Callable[[], bool], quiet_s: float | None = None) -> None:
-        """Handle what comes until `stop` holds, or no message came for `quiet_s` seconds.
+        """Run callbacks until `stop` holds, or no message came for `quiet_s` seconds.
 
         Raises:
-            Exception: whatever a callback raises.
+            Exception: any that a callback raises.
         """
-        heard_s = self._heard_s = time.monotonic()
+        received_s = self._received_s = time.monotonic()
         quiet_turns = 0
         with self._context.handle:
             while not stop():
                 self._turn(None if quiet_s is None else quiet_s / QUIET_TURNS)
                 if quiet_s is not None:
-                    quiet_turns = quiet_turns + 1 if heard_s == self._heard_s else 0
-                    heard_s = self._heard_s
-                    if quiet_turns >= QUIET_TURNS and time.monotonic() - heard_s > quiet_s:
+                    quiet_turns = quiet_turns + 1 if received_s == self._received_s else 0
+                    received_s = self._received_s
+                    if quiet_turns >= QUIET_TURNS and time.monotonic() - received_s > quiet_s:
                         return
-                if self.rest_s and not self._behind and quiet_s is None:  # to wait for quiet is a rest
-                    time.sleep(self.rest_s)
-                self._behind = False
+                elif self.pause_s and not self._is_behind:
+                    time.sleep(self.pause_s)
+                self._is_behind = False
 
     def spin_once(self, timeout_s: float) -> None:
-        """Handle what is ready, or becomes so within `timeout_s` seconds."""
+        """Run the callbacks that are ready, or become so within `timeout_s` seconds."""
         with self._context.handle:
             self._turn(timeout_s)
 
     def _turn(self, timeout_s: float | None) -> None:
-        """Wait for what comes within `timeout_s` seconds, and handle all that is ready.
+        """Wait for at most `timeout_s` seconds, and run all callbacks that are ready.
 
-        Each entity in a wait costs time, and most of a node's are services that hardly anybody calls. So
-        while messages keep coming, only subscriptions are waited for, until that has been so for `BUSY_S`.
+        Each entity in a wait set costs time, and most of a node's are services that are rarely called. So
+        while messages keep coming, it waits for subscriptions alone, for at most `BUSY_S`.
         """
-        busy = self._subscriptions and time.monotonic() - self._looked_s < BUSY_S
-        if busy and self._take_what_comes():
+        is_busy = self._subscriptions and time.monotonic() - self._full_wait_s < BUSY_S
+        if is_busy and self._wait_for_messages():
             return
-        self._look_at_all(timeout_s)
-        self._looked_s = time.monotonic()
+        self._wait_for_all(timeout_s)
+        self._full_wait_s = time.monotonic()
         subscriptions = [entity for node in self._nodes for entity in node.subscriptions]
         if len(subscriptions) > len(self._subscriptions):
-            self._few = rclpy_private.wait_set(self._context, len(subscriptions), 1, 0, 0, 0)
+            size = len(subscriptions)
+            self._subscriptions_wait_set = rclpy_private.wait_set(self._context, size, 1, 0, 0, 0)
         self._subscriptions = subscriptions
 
-    def _take_what_comes(self) -> bool:
-        """Wait for messages, and handle them; False if none came within `BUSY_S`.
+    def _wait_for_messages(self) -> bool:
+        """Wait for messages and handle them; False if none came within `BUSY_S`.
 
-        Whoever wakes us has ended this wait: no other may follow before `spin` has looked at its condition.
+        True also after `wake`, which ends this wait: `spin` has to check its condition before the next one.
         """
-        wait_set = self._few
+        wait_set = self._subscriptions_wait_set
         wait_set.clear_entities()
         for subscription in self._subscriptions:
             wait_set.add_subscription(subscription.handle)
@@ -120,34 +128,28 @@ class DirectExecutor:
             self._take_messages(subscription)
         return bool(ready) or wait_set.is_ready("guard_condition", 0)
 
-    def _look_at_all(self, timeout_s: float | None) -> None:
-        """Wait for anything, and handle it."""
-        timers = [timer for node in self._nodes for timer in node.timers]
-        subscriptions = [subscription for node in self._nodes for subscription in node.subscriptions]
-        services = [service for node in self._nodes for service in node.services]
-        clients = [client for node in self._nodes for client in node.clients]
-        wait_set = self._emptied(len(subscriptions), 1, len(timers), len(clients), len(services))
-        timer_at = [wait_set.add_timer(timer.handle) for timer in timers]
-        subscription_at = [wait_set.add_subscription(entity.handle) for entity in subscriptions]
-        service_at = [wait_set.add_service(entity.handle) for entity in services]
-        client_at = [wait_set.add_client(entity.handle) for entity in clients]
+    def _wait_for_all(self, timeout_s: float | None) -> None:
+        entities = {
+            kind: [entity for node in self._nodes for entity in getattr(node, f"{kind}s")]
+            for kind in self._handlers
+        }
+        count = {kind: len(found) for kind, found in entities.items()}
+        wait_set = self._empty_wait_set(
+            count["subscription"], 1, count["timer"], count["client"], count["service"]
+        )
+        added = [
+            (kind, getattr(wait_set, f"add_{kind}")(entity.handle), entity)
+            for kind, found in entities.items()
+            for entity in found
+        ]
         wait_set.add_guard_condition(self._guard.handle)
         wait_set.wait(-1 if timeout_s is None else round(timeout_s * 1e9))
-        # All that is ready is noted before any callback may change what there is.
-        ready = [
-            *((_call_timer, timers[i]) for i, at in enumerate(timer_at) if wait_set.is_ready("timer", at)),
-            *(
-                (self._take_messages, subscriptions[i])
-                for i, at in enumerate(subscription_at)
-                if wait_set.is_ready("subscription", at)
-            ),
-            *((_serve, services[i]) for i, at in enumerate(service_at) if wait_set.is_ready("service", at)),
-            *((_answer, clients[i]) for i, at in enumerate(client_at) if wait_set.is_ready("client", at)),
-        ]
+        # All that is ready is listed before a callback may create or destroy entities.
+        ready = [(self._handlers[kind], entity) for kind, at, entity in added if wait_set.is_ready(kind, at)]
         for handle, entity in ready:
             try:
                 handle(entity)
-            except InvalidHandle:  # an earlier callback of this turn has destroyed it
+            except InvalidHandle:  # destroyed by an earlier callback of this turn
                 continue
 
     def _take_messages(self, subscription: Any) -> None:
@@ -155,22 +157,22 @@ class DirectExecutor:
         with_info = rclpy_private.takes_info(subscription)
         until_s = time.monotonic() + TURN_MAX_S
         with handle:  # raises InvalidHandle, if it was destroyed since it became ready
-            for _ in range(self._at_once):
+            for _ in range(self._messages_max):
                 taken = handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is None:
                     return
-                self._heard_s = time.monotonic()
+                self._received_s = time.monotonic()
                 if with_info:
                     subscription.callback(*taken)
                 else:
                     subscription.callback(taken[0])
-                if self._heard_s > until_s:
+                if self._received_s > until_s:
                     break
-        self._behind = True
+        self._is_behind = True
 
-    def _emptied(self, *capacity: int) -> Any:
-        """The wait set, empty, with room for subscriptions, guards, timers, clients, services."""
-        if any(has < wants for has, wants in zip(self._capacity or (0,) * 5, capacity, strict=True)):
+    def _empty_wait_set(self, *capacity: int) -> Any:
+        """The wait set, emptied, with room for subscriptions, guards, timers, clients, services."""
+        if any(has < needed for has, needed in zip(self._capacity or (0,) * 5, capacity, strict=True)):
             self._capacity = capacity
             self._wait_set = rclpy_private.wait_set(self._context, *capacity)
         self._wait_set.clear_entities()
@@ -192,7 +194,7 @@ def _serve(service: Any) -> None:
         service.send_response(service.callback(request, service.srv_type.Response()), header)
 
 
-def _answer(client: Any) -> None:
+def _complete(client: Any) -> None:
     with client.handle:
         header, response = client.handle.take_response(client.srv_type.Response)
     if header is None:
@@ -200,7 +202,7 @@ def _answer(client: Any) -> None:
     try:
         future = client.get_pending_request(header.request_id.sequence_number)
     except KeyError:
-        return  # nobody waits for it any more
+        return  # the request was removed
     future.set_result(response)
 
 

@@ -1,9 +1,8 @@
-"""The middleware's settings, as in fastdds.xml, unless the user has others; and its shared memory.
+"""The middleware's settings (fastdds.xml, unless the user has others), and its shared memory.
 
-Fast DDS passes messages between processes of a host through files in /dev/shm: for each participant a
-segment of half a megabyte, and a port for each place that it listens at. Until it ends, the owner of each
-holds a lock on the file of the same name with `_el` (exclusive) or `_sl` (shared) behind it. A process that
-is killed leaves its files, and nothing else removes them.
+Fast DDS passes messages between processes of a host through files in /dev/shm: a segment of half a megabyte
+for each participant, and a port for each endpoint at which it receives. Their owner locks the file of the
+same name plus `_el` (exclusive) or `_sl` (shared) until it ends. A process that is killed leaves its files.
 """
 
 import contextlib
@@ -18,10 +17,10 @@ from pathlib import Path
 NAMES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 SHARED_MEMORY = Path("/dev/shm")
-ENOUGH_MB = 16  # for a dozen participants with their ports; a full one ends a process by SIGBUS
-LEAST_MB = 0.1  # LTTng's pages, which rclpy's libraries touch when they are loaded
+RECOMMENDED_MB = 16  # for a dozen participants with their ports; SIGBUS ends a process once it is full
+MIN_MB = 0.1  # LTTng's pages, which rclpy's libraries touch when they are loaded
 OWNED = re.compile(r"(?P<owned>(?:fastrtps|fastdds)_(?:port\d{1,5}|[0-9a-f]{16}))(?P<lock>_el|_sl)?")
-# A file is locked a moment after it is made, and to look whether it is locks it. Younger ones are let alone.
+# A file is locked a moment after it is created, and a test of the lock locks it. Younger ones are skipped.
 YOUNG_S = 2.0
 
 
@@ -32,12 +31,12 @@ def use_profiles() -> None:
 
 
 def use_udp_only() -> None:
-    """Have this process and its children use no shared memory; to be called before ROS is initialised."""
+    """Use no shared memory in this process and its children; to be called before ROS is initialised."""
     os.environ[TRANSPORTS] = "UDPv4"
 
 
 def free_mb() -> float:
-    """Megabytes of shared memory that are free; infinite, where there is none to be full."""
+    """Free shared memory, megabytes; infinite where there is none."""
     try:
         found = os.statvfs(SHARED_MEMORY)
     except OSError:
@@ -46,10 +45,9 @@ def free_mb() -> float:
 
 
 def remove_leftovers() -> int:
-    """Remove the shared memory of processes that have ended; returns how many segments and ports that was.
+    """Remove segments and ports of processes that have ended; returns their number.
 
-    What the living use stays. A port outlives the process that listened at it as long as others have it open
-    to send: whoever listens there next is to find the same one.
+    Those in use stay. A port outlives its owner while others have it open to send: its next owner uses it.
     """
     try:
         names = os.listdir(SHARED_MEMORY)
@@ -59,8 +57,8 @@ def remove_leftovers() -> int:
     for name in names:
         if found := OWNED.fullmatch(name):
             locks.setdefault(found["owned"], []).extend([name] if found["lock"] else [])
-    left = [owned for owned, its in locks.items() if _is_left(owned, its)]
-    removed = set(left) - _in_use() if left else set()
+    left = {owned for owned, its in locks.items() if _is_left(owned, its)}
+    removed = left - _mapped() if left else left
     for owned in removed:
         for name in (owned, *locks[owned], f"sem.{owned}_mutex"):
             with contextlib.suppress(OSError):
@@ -69,7 +67,7 @@ def remove_leftovers() -> int:
 
 
 def _is_left(owned: str, locks: list[str]) -> bool:
-    """Has the owner of a segment or port ended. Files of another user cannot be opened: they stay."""
+    """Whether the owner has ended. Files of another user cannot be opened: they stay."""
     files = [SHARED_MEMORY / name for name in locks or [owned]]
     try:
         if any(time.time() - file.stat().st_mtime < YOUNG_S for file in files):
@@ -79,22 +77,17 @@ def _is_left(owned: str, locks: list[str]) -> bool:
         return False
 
 
-def _in_use() -> set[str]:
-    """Names of the shared memory that a process has mapped."""
-    used = set()
+def _mapped() -> set[str]:
+    """Names of the shared memory that processes have mapped."""
+    mapped = set()
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has ended, or is another user's, and so is its memory
             for line in (process / "maps").read_text(errors="replace").splitlines():
-                used.update([Path(line).name] if f" {SHARED_MEMORY}/" in line else [])
-    return used
+                mapped.update([Path(line).name] if f" {SHARED_MEMORY}/" in line else [])
+    return mapped
 
 
 def _is_locked(path: Path) -> bool:
-    """Does a living process hold a lock on a file.
-
-    Raises:
-        OSError: the file is gone, or another user's.
-    """
     with path.open("rb+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

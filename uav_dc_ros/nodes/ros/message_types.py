@@ -1,4 +1,4 @@
-"""Message types of any ROS package that is installed: their classes, and their definitions as text."""
+"""Message types of any installed ROS package: their classes, and their definitions as text."""
 
 import importlib
 import importlib.util
@@ -8,13 +8,12 @@ from typing import Any
 
 NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 _BASIC = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}  # IDL's: .msg's
-_SEPARATOR = "=" * 80
 
 
 def find(type: str) -> Any:
     """The Python class of a message type, such as `std_msgs/msg/String`; None if it is not installed.
 
-    Names come from the network, or out of bags: nothing is imported but packages that hold messages.
+    Names come from the network, or out of bags: only packages that hold messages are imported.
     """
     matched = NAME.fullmatch(type)
     if matched is None:
@@ -32,33 +31,34 @@ def find(type: str) -> Any:
 
 
 def definition(type: str) -> bytes:
-    """A message type that is installed, with all types inside it, in the encoding `ros2msg`.
+    """The definition of an installed message type and of all types inside it, in the encoding `ros2msg`.
 
-    Of a type that ROS 2 itself has, this is its text; of another one, what its class tells: names and types
-    of all fields, but neither constants nor defaults, which nobody needs to read its messages.
+    For the types of ROS 2 itself it is their text. For others it holds the names and types of all fields,
+    from the class, but neither constants nor defaults, which are not needed to decode messages.
 
     Raises:
         LookupError: it, or a type inside it, is not installed.
     """
-    from uav_dc_ros.bags import message_definitions  # brings rosbags, which only few need, and late
+    from uav_dc_ros.bags import message_definitions  # imports rosbags, which few callers need
 
     if type in message_definitions.TYPESTORE.fielddefs:
         return message_definitions.definition(type)
     texts: dict[str, str] = {}
     _describe(type, texts)
     own = texts.pop(type)
-    others = (f"{_SEPARATOR}\nMSG: {_short(name)}\n{text}" for name, text in texts.items())
+    others = (f"{'=' * 80}\nMSG: {_short(name)}\n{text}" for name, text in texts.items())
     return "".join([own, *others]).encode()
 
 
 def _describe(type: str, texts: dict[str, str]) -> None:
-    """Enter the fields of a type, and of all types inside it."""
+    """Add the fields of a type, and of all types inside it, to `texts`."""
     found = find(type)
     if found is None:
         raise LookupError(type)
     names = found.get_fields_and_field_types()
-    lines = [f"{_text(kind)} {name}" for name, kind in zip(names, found.SLOT_TYPES, strict=False)]
-    texts[type] = "".join(f"{line}\n" for line in lines)
+    texts[type] = "".join(
+        f"{_field_type(kind)} {name}\n" for name, kind in zip(names, found.SLOT_TYPES, strict=False)
+    )
     for kind in found.SLOT_TYPES[: len(names)]:
         element = getattr(kind, "value_type", kind)
         if hasattr(element, "namespaced_name"):
@@ -67,9 +67,9 @@ def _describe(type: str, texts: dict[str, str]) -> None:
                 _describe(inner, texts)
 
 
-def _text(kind: Any) -> str:
+def _field_type(kind: Any) -> str:
     """A field's type, as .msg files write it."""
-    from rosidl_parser import definition as idl  # type: ignore[import-untyped]  # a fifth of a second
+    from rosidl_parser import definition as idl  # type: ignore[import-untyped]  # its import takes 0.2 s
 
     match kind:
         case idl.BasicType():
@@ -80,11 +80,11 @@ def _text(kind: Any) -> str:
             bound = f"<={kind.maximum_size}" if kind.has_maximum_size() else ""
             return ("wstring" if isinstance(kind, idl.AbstractWString) else "string") + bound
         case idl.Array():
-            return f"{_text(kind.value_type)}[{kind.size}]"
+            return f"{_field_type(kind.value_type)}[{kind.size}]"
         case idl.BoundedSequence():
-            return f"{_text(kind.value_type)}[<={kind.maximum_size}]"
+            return f"{_field_type(kind.value_type)}[<={kind.maximum_size}]"
         case _:
-            return f"{_text(kind.value_type)}[]"
+            return f"{_field_type(kind.value_type)}[]"
 
 
 def _short(type: str) -> str:

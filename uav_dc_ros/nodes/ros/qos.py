@@ -41,10 +41,9 @@ MESSAGE_TYPES: dict[str, type] = {
     topics.DIAGNOSTICS: DiagnosticArray,
     topics.CLOCK: Clock,
 }
-# Messages kept by a subscription that acts on them: a burst of rubbish must not push out a real one.
-NEWEST = 100
-HISTORY_BYTES = 64 * 2**20  # that a publisher keeps of one topic for those who come late
-HISTORY_LEAST = 10  # messages, however large
+NEWEST = 100  # depth of a subscription: a burst of invalid messages must not displace a valid one
+HISTORY_BYTES = 64 * 2**20  # that a publisher keeps of one topic for late subscribers
+HISTORY_MIN = 10  # messages, however large
 UNKNOWN = "UNKNOWN_"  # in a name that the graph does not know yet
 OVERRIDES = QoSOverridingOptions(
     [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY]
@@ -58,34 +57,30 @@ def type_name(message: Any) -> str:
 
 
 def offered(topic: Topic, message_bytes: int = 0) -> QoSProfile:
-    """The QoS that a topic's publisher offers, from its row; of large messages it keeps fewer."""
+    """The QoS that a topic's publisher offers; the larger its messages, the fewer it keeps."""
     fitting = HISTORY_BYTES // message_bytes if message_bytes else topic.depth
     return QoSProfile(
-        depth=min(topic.depth, max(fitting, HISTORY_LEAST)),
+        depth=min(topic.depth, max(fitting, HISTORY_MIN)),
         reliability=ReliabilityPolicy.RELIABLE if topic.reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
         **({} if topic.lease_s is None else {"liveliness_lease_duration": Duration(seconds=topic.lease_s)}),
     )
 
 
-def requested(topic: Topic, *, all: bool) -> QoSProfile:
-    """The QoS that a subscription asks for; `all` as in the node table's `hears_all`."""
-    profile = offered(replace(topic, lease_s=None))  # who wants a lease is deaf to those without
+def requested(topic: Topic, *, keep_all: bool) -> QoSProfile:
+    """The QoS that a subscription requests; `keep_all` as in the node table's `keeps_all`."""
+    profile = offered(replace(topic, lease_s=None))  # a lease would not match publishers without one
     profile.depth = NEWEST
     if not topic.requests_reliable:
         profile.reliability = ReliabilityPolicy.BEST_EFFORT
-    if all:
+    if keep_all:
         profile.history = HistoryPolicy.KEEP_ALL
     return profile
 
 
 @contextmanager
 def overridden(topic: str) -> Iterator[None]:
-    """Make a publisher or subscription whose QoS parameters may have been given.
-
-    Raises:
-        ParameterError: a policy that does not exist, or a value of another type.
-    """
+    """Create a publisher or subscription in this context: raises ParameterError for an invalid override."""
     try:
         yield
     except (RuntimeError, InvalidParameterTypeException) as error:
@@ -95,44 +90,44 @@ def overridden(topic: str) -> Iterator[None]:
 def incompatible(
     node: Node, publishers: Iterable[Publisher], subscriptions: Iterable[Subscription]
 ) -> Iterator[tuple[str, str, str]]:
-    """Peers that a node cannot talk to: topic, the peer's full name, what does not match (type or QoS).
+    """Peers that do not match: topic, the peer's full name, what does not match (type or QoS).
 
-    The middleware reports that some peer does not match, and which policy; only the graph knows who.
+    The middleware reports that some peer does not match, and which policy; only the graph knows which peer.
     """
     for publisher in publishers:
         if node.count_subscribers(publisher.topic_name) != publisher.get_subscription_count():
             for end in node.get_subscriptions_info_by_topic(publisher.topic_name):
-                yield from _mismatch(publisher, end, _told(publisher.qos_profile), end.qos_profile)
+                yield from _mismatch(publisher, end, _in_graph(publisher.qos_profile), end.qos_profile)
     for subscription in subscriptions:
         if node.count_publishers(subscription.topic_name) != subscription.get_publisher_count():
             for end in node.get_publishers_info_by_topic(subscription.topic_name):
-                yield from _mismatch(subscription, end, end.qos_profile, _told(subscription.qos_profile))
+                yield from _mismatch(subscription, end, end.qos_profile, _in_graph(subscription.qos_profile))
 
 
 def full_name(end: TopicEndpointInfo) -> str:
-    """Full name of the node behind a publisher or subscription."""
+    """Full name of an endpoint's node."""
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 
-def _told(profile: QoSProfile) -> QoSProfile:
-    """A profile as the graph tells it: a duration of zero, which stands for none, is infinite there."""
-    told = copy.copy(profile)
+def _in_graph(profile: QoSProfile) -> QoSProfile:
+    """A profile as in the graph, where a duration of zero (none) is infinite."""
+    profile = copy.copy(profile)
     for name in ("deadline", "lifespan", "liveliness_lease_duration"):
         if getattr(profile, name) == Duration():
-            setattr(told, name, Infinite)
-    return told
+            setattr(profile, name, Infinite)
+    return profile
 
 
 def _mismatch(
-    ours: Publisher | Subscription, end: TopicEndpointInfo, offer: QoSProfile, request: QoSProfile
+    endpoint: Publisher | Subscription, peer: TopicEndpointInfo, offer: QoSProfile, request: QoSProfile
 ) -> Iterator[tuple[str, str, str]]:
-    peer = full_name(end)
-    if UNKNOWN in peer:
-        return  # found so lately that nobody knows its name yet
-    kind = type_name(ours.msg_type)
-    if end.topic_type != kind:
-        yield ours.topic_name, peer, f"its type is {end.topic_type}; expected {kind}"
+    name = full_name(peer)
+    if UNKNOWN in name:
+        return  # discovered a moment ago: its name follows
+    kind = type_name(endpoint.msg_type)
+    if peer.topic_type != kind:
+        yield endpoint.topic_name, name, f"its type is {peer.topic_type}; expected {kind}"
         return
     compatibility, reason = qos_check_compatible(offer, request)
     if compatibility == QoSCompatibility.ERROR:
-        yield ours.topic_name, peer, f"its QoS: {reason.removeprefix('ERROR: ')}"
+        yield endpoint.topic_name, name, f"its QoS: {reason.removeprefix('ERROR: ')}"

@@ -1,6 +1,6 @@
-"""rclpy's private API, as far as it is in use. A test of its own uses all of it, and tells what changed.
+"""The private API of rclpy that is in use. Its test uses all of it, and shows what a new version changed.
 
-It is also why the extra `ros` has an upper bound.
+It is why the extra `ros` has an upper bound.
 """
 
 from collections.abc import Callable
@@ -14,22 +14,27 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 RCLError: type[Exception] = _rclpy.RCLError  # an error of the library below rclpy
+# Errors of `rclpy.init` for invalid arguments.
+INIT_ERRORS: tuple[type[Exception], ...] = (
+    *(_rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError),
+    RCLError,
+)
 
 
 def wait_set(context: Any, subscriptions: int, guards: int, timers: int, clients: int, services: int) -> Any:
-    """A wait set, empty, with room for so many of each."""
+    """An empty wait set with a capacity for each kind."""
     return _rclpy.WaitSet(subscriptions, guards, timers, clients, services, 0, context.handle)
 
 
 def takes_info(subscription: Any) -> bool:
-    """Does the callback of a subscription take a message's info, too."""
+    """Whether a subscription's callback takes the message info, too."""
     return bool(subscription._callback_type is Subscription.CallbackType.WithMessageInfo)
 
 
-def overrides(node: Node) -> dict[str, rclpy.Parameter]:
-    """Parameters that were given to a node, by name; what is changed here, it declares changed."""
-    given: dict[str, rclpy.Parameter] = node._parameter_overrides
-    return given
+def parameter_overrides(node: Node) -> dict[str, rclpy.Parameter]:
+    """A node's parameter overrides by name; a change of this dict changes what the node declares."""
+    overrides: dict[str, rclpy.Parameter] = node._parameter_overrides
+    return overrides
 
 
 def state(node: LifecycleNode) -> str:
@@ -37,20 +42,17 @@ def state(node: LifecycleNode) -> str:
     return str(node._state_machine.current_state[1])
 
 
-def answer_transitions(node: LifecycleNode, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Have requests for transitions answered by `answer`; returns what answered them until now."""
-    before: Callable[[Any, Any], Any] = node._service_change_state.callback
-    node._service_change_state.callback = answer
-    return before
+def replace_change_state(
+    node: LifecycleNode, callback: Callable[[Any, Any], Any]
+) -> Callable[[Any, Any], Any]:
+    """Replace the callback of the service `change_state`; returns the former one."""
+    former: Callable[[Any, Any], Any] = node._service_change_state.callback
+    node._service_change_state.callback = callback
+    return former
 
 
 class EventCount:
-    """What the middleware counts of a subscription: lost messages, living publishers.
-
-    Args:
-        subscription: of a node.
-        kind: what is counted.
-    """
+    """An event count of the middleware for a subscription: lost messages, or live publishers."""
 
     def __init__(self, subscription: Any, kind: QoSSubscriptionEventType) -> None:
         try:
@@ -59,14 +61,14 @@ class EventCount:
             self._event = None
 
     def take(self) -> Any:
-        """The counts now; None with a middleware that does not count, and after `close`."""
+        """The event status; None after `close`, or if the middleware does not support it."""
         if self._event is None:
             return None
         with self._event:
             return self._event.take_event()
 
     def close(self) -> None:
-        """Count no more."""
+        """Stop counting."""
         if self._event is not None:
             self._event.destroy_when_not_in_use()
             self._event = None
