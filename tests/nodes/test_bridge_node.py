@@ -158,7 +158,7 @@ def test_what_fails_to_start_is_closed(made: Made, monkeypatch: pytest.MonkeyPat
         raise VehicleError("after it was opened")
 
     with monkeypatch.context() as patch:
-        patch.setattr(made.node, "_refuse_unknown", refuse)
+        patch.setattr(made.node, "_reject_unknown", refuse)
         made.node.trigger_activate()
     assert (made.node.state, made.vehicle.opened, made.vehicle.closed) == ("inactive", 2, 2)
     made.node.trigger_activate()
