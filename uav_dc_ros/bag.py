@@ -12,20 +12,14 @@ from uav_dc_ros.errors import ParameterError
 
 PROG = "python -m uav_dc_ros.bag"
 DESCRIPTION = "Record, play, recover, verify and explain bags."
-# Module of each verb, with `add_options(parser)` and `run(options) -> exit status`, and what it does.
+# Module and description by verb; the module has `add_options(parser)` and `run(options) -> exit status`.
 VERBS = {
     "record": ("uav_dc_ros.nodes.record.bag_record", "record topics into a new bag"),
     "play": ("uav_dc_ros.nodes.play.bag_play", "publish a bag's messages again, with their timing and QoS"),
     "info": ("uav_dc_ros.recordings.info.command", "show what a bag holds, and whether it is complete"),
     "recover": ("uav_dc_ros.bags.salvage.recover", "make a whole bag of what a killed recorder left"),
-    "verify": (
-        "uav_dc_ros.recordings.verify.command",
-        "recompute everything that a bag holds of its missions",
-    ),
-    "report": (
-        "uav_dc_ros.recordings.report",
-        "write a page about missions, or compare several bags",
-    ),
+    "verify": ("uav_dc_ros.recordings.verify.command", "recompute everything that a bag holds of its missions"),
+    "report": ("uav_dc_ros.recordings.report", "write a page about missions, or compare several bags"),
     "export": (
         "uav_dc_ros.recordings.export.command",
         "write missions as tables, or as transitions to learn from",
@@ -34,26 +28,26 @@ VERBS = {
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command, and exit."""
-    given = sys.argv[1:] if arguments is None else arguments
-    wanted = given[0] if given else "--help"
+    """Run a verb, and exit with its status."""
+    words = sys.argv[1:] if arguments is None else arguments
+    verb = words[0] if words else "--help"
 
     def command() -> int:
-        if wanted == "--version":
+        if verb == "--version":
             print(__version__)
             return 0
-        if wanted in ("-h", "--help"):
+        if verb in ("-h", "--help"):
             print(_help())
             return 0
-        if wanted not in VERBS:
-            raise ParameterError(f"{wanted!r}; expected a verb: {', '.join(VERBS)}")
-        module, does = VERBS[wanted]
-        verb = importlib.import_module(module)
-        parser = cli.Parser(prog=f"{PROG} {wanted}", description=does[0].upper() + does[1:] + ".")
-        verb.add_options(parser)
-        return int(verb.run(parser.parse_args(given[1:])))
+        if verb not in VERBS:
+            raise ParameterError(f"{verb!r}; expected a verb: {', '.join(VERBS)}")
+        module_name, does = VERBS[verb]
+        module = importlib.import_module(module_name)
+        parser = cli.Parser(prog=f"{PROG} {verb}", description=does[0].upper() + does[1:] + ".")
+        module.add_options(parser)
+        return int(module.run(parser.parse_args(words[1:])))
 
-    cli.run(command, f"{PROG} {wanted}" if wanted in VERBS else PROG)
+    cli.run(command, f"{PROG} {verb}" if verb in VERBS else PROG)
 
 
 def _help() -> str:

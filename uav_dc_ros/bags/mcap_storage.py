@@ -1,6 +1,5 @@
-"""MCAP files as storage of a bag: by their index, or without one as far as they go."""
+"""MCAP files as storage of a bag, read by their index, or scanned without one."""
 
-import heapq
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -13,37 +12,38 @@ from mcap.records import Channel, Message, Metadata, Schema
 from mcap.summary import Summary
 
 from uav_dc_ros.bags.metadata import Part
-from uav_dc_ros.bags.records import CDR, COMPRESSIONS, FRAME, MAGIC, TIME_MAX_NS, plain
+from uav_dc_ros.bags.records import CDR, CHUNK_COMPRESSIONS, HEADER, MAGIC, TIME_MAX_NS, decompress_payload
 from uav_dc_ros.bags.salvage.scan import Scan, has_end, metadata_records
 from uav_dc_ros.bags.storage import (
     RECOVER,
     BagMessage,
     RecordedTopic,
     Storage,
-    damage,
-    foreign,
+    damage_errors,
+    describe_foreign,
     goes_back_ns,
-    reading,
+    merge_topic,
+    read_errors,
+    sorted_within,
 )
 from uav_dc_ros.errors import BagDamagedError, BagError
 
-WAITING_BYTES = 64 * 2**20  # of messages that wait for earlier ones; a clock that jumped is not waited for
-MESSAGE_BYTES = 400  # that a message takes beside its data
+WAITING_BYTES = 64 * 2**20  # of messages that wait for earlier ones
 
 
 def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False, repeats: bool = True) -> Storage:
-    """An MCAP file.
+    """Open an MCAP file.
 
     Args:
         path: the file.
-        closing: closes it.
-        torn: read it as far as it goes, if it has no end or is damaged: once more for what it holds.
-        repeats: give the latched messages at its head that an earlier file of the bag holds already?
+        closing: closes the file.
+        torn: scan the file as far as possible, if it has no end or is damaged.
+        repeats: keep the latched messages at its head that an earlier part of the bag has.
 
     Raises:
-        BagError: no MCAP file. Without `torn`: one without its end, or a damaged one.
+        BagError: not an MCAP file. Without `torn`: a file without its end, or a damaged one.
     """
-    with reading(path):
+    with read_errors(path):
         file = closing.enter_context(path.open("rb"))
         scan = Scan(path, file)
         whole = has_end(file)
@@ -52,31 +52,31 @@ def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False, repeats: bo
     if not scan.size:
         raise BagError(f"{path} is empty; expected an MCAP file")
     if not MAGIC.startswith(scan.magic):
-        raise BagError(f"{path} {foreign(scan.magic)}")
+        raise BagError(f"{path} {describe_foreign(scan.magic)}")
     if not whole:
         raise BagDamagedError(
             f"{path} has no end: its recorder was killed, or still writes it; expected a whole bag, as "
             f"{RECOVER} makes of it"
         )
-    with damage(path):
+    with damage_errors(path):
         file.seek(0)
         reader = SeekingReader(file, validate_crcs=True)
         summary = reader.get_summary()
     if summary is not None and _is_index(summary):
         return _open_indexed(path, file, reader, summary, repeats=repeats)
-    found = _open_scanned(scan, file, repeats=repeats)
+    storage = _open_scanned(scan, file, repeats=repeats)
     if scan.lost_bytes:
-        raise BagDamagedError(f"{path} is damaged: {scan.lost_bytes} bytes; {RECOVER} brings back the others")
-    return found
+        raise BagDamagedError(f"{path} is damaged: {scan.lost_bytes} bytes; {RECOVER} recovers the others")
+    return storage
 
 
 def _is_index(summary: Summary) -> bool:
-    """Whether every message can be found by a summary: MCAP leaves it to the writer what is in there."""
+    """Whether every message is found by a summary, whose contents MCAP leaves to the writer."""
     statistics, channels = summary.statistics, summary.channels
     return (
         statistics is not None
         and statistics.chunk_count == len(summary.chunk_indexes)
-        and bool(statistics.chunk_count or not statistics.message_count)  # none lies outside of chunks
+        and bool(statistics.chunk_count or not statistics.message_count)  # none is outside of chunks
         and statistics.channel_message_counts.keys() <= channels.keys()
         and all(index.message_index_offsets.keys() <= channels.keys() for index in summary.chunk_indexes)
         and all(channel.schema_id in (0, *summary.schemas) for channel in channels.values())
@@ -86,24 +86,24 @@ def _is_index(summary: Summary) -> bool:
 def _open_indexed(
     path: Path, file: IO[bytes], reader: SeekingReader, summary: Summary, *, repeats: bool
 ) -> Storage:
-    """A finished MCAP file, by its index."""
     statistics = summary.statistics
     assert statistics is not None, "it is an index"
-    told = Part(path.name)
-    with damage(path):
+    part = Part(path.name)
+    with damage_errors(path):
         for metadata in _metadata(path, file, reader, summary):
-            told.learn(metadata.name, metadata.metadata)
+            part.add_metadata(metadata.name, metadata.metadata)
         library = reader.get_header().library
     for index in summary.chunk_indexes:
-        if index.compression not in COMPRESSIONS:
+        if index.compression not in CHUNK_COMPRESSIONS:
             raise BagError(
-                f"{path}: unsupported compression type {index.compression!r}; expected one of {COMPRESSIONS}"
+                f"{path}: unsupported compression type {index.compression!r}; expected one of "
+                f"{CHUNK_COMPRESSIONS}"
             )
-    left_out = {} if repeats else told.repeated
+    left_out = {} if repeats else part.repeated
     topics: dict[str, RecordedTopic] = {}
     for channel in summary.channels.values():
         count = statistics.channel_message_counts.get(channel.id, 0)
-        _enter(topics, channel, summary.schemas.get(channel.schema_id), count)
+        merge_topic(topics, _topic(channel, summary.schemas.get(channel.schema_id), count))
     for name, n in left_out.items():
         if name in topics:
             topics[name].count -= n
@@ -111,18 +111,19 @@ def _open_indexed(
     compressed: set[str] = set()
 
     def read(
-        topics: Collection[str] | None, start_ns: int | None, end_ns: int | None, *, sort: bool
+        topics: Collection[str] | None, start_ns: int | None, end_ns: int | None, *, sort: bool = True
     ) -> Iterator[BagMessage]:
         stream = reader.iter_messages(topics, starting_at=start_ns, ending_before=end_ns, log_time_order=sort)
         while True:
-            with damage(path):
-                found = next(stream, None)
-            if found is None:
+            with damage_errors(path):
+                item = next(stream, None)
+            if item is None:
                 return
-            schema, channel, message = found
+            schema, channel, message = item
             if message.sequence == 0 and channel.topic in left_out:
                 continue
-            data = plain(message.data) if channel.message_encoding == CDR else message.data
+            is_cdr = channel.message_encoding == CDR
+            data = decompress_payload(message.data) if is_cdr else message.data
             if data is not message.data:
                 compressed.add(channel.topic)
             yield _message(channel.topic, schema.name if schema else "", message, data)
@@ -132,7 +133,7 @@ def _open_indexed(
 
     def log_goes_back_ns() -> int:
         if all(chunk.message_index_offsets for chunk in summary.chunk_indexes):
-            with suppress(ValueError), reading(path):
+            with suppress(ValueError), read_errors(path):
                 return goes_back_ns(_indexed_times(file, summary))
         return goes_back_ns((message.topic, message.log_time_ns) for message in recorded(None))
 
@@ -141,11 +142,11 @@ def _open_indexed(
         topics=list(topics.values()),
         first_ns=min(statistics.message_start_time, TIME_MAX_NS),
         last_ns=min(statistics.message_end_time, TIME_MAX_NS),
-        messages=lambda topics, start_ns, end_ns: read(topics, start_ns, end_ns, sort=True),
+        messages=read,
         recorded=recorded,
         goes_back_ns=log_goes_back_ns,
-        about=told.about,
-        dropped=told.dropped,
+        about=part.about,
+        dropped=part.dropped,
         repeated=left_out,
         library=library,
         compressed=compressed,
@@ -153,47 +154,50 @@ def _open_indexed(
 
 
 def _metadata(path: Path, file: IO[bytes], reader: SeekingReader, summary: Summary) -> Iterator[Metadata]:
-    """The metadata records of a file, by their index, if it tells of them all; it is optional, too."""
-    counted = summary.statistics.metadata_count if summary.statistics is not None else 0
-    if counted and counted == len(summary.metadata_indexes):
+    """The metadata records, by their index if it has all of them."""
+    count = summary.statistics.metadata_count if summary.statistics is not None else 0
+    if count and count == len(summary.metadata_indexes):
         return reader.iter_metadata()
     return metadata_records(path, file)
 
 
 def _indexed_times(file: IO[bytes], summary: Summary) -> Iterator[tuple[int, int]]:
-    """Channel and log time (ns) of each message, those of a channel in their order, by the chunks' indexes.
+    """Channel and log time of each message, in order within a channel, by the message indexes.
 
     Raises:
-        ValueError: they are not what they say.
+        ValueError: a message index is invalid.
     """
     for chunk in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
         for channel, offset in chunk.message_index_offsets.items():
             file.seek(offset)
-            opcode, length = FRAME.unpack(file.read(FRAME.size).ljust(FRAME.size))
+            opcode, length = HEADER.unpack(file.read(HEADER.size).ljust(HEADER.size))
             if opcode != Opcode.MESSAGE_INDEX or length > chunk.message_index_length:
-                raise ValueError("no index of messages")
-            pairs = np.frombuffer(file.read(length)[6:], "<u8").reshape(-1, 2)  # log time, place
-            for time_ns in pairs[pairs[:, 1].argsort(), 0].tolist():
+                raise ValueError("no message index")
+            entries = np.frombuffer(file.read(length)[6:], "<u8").reshape(-1, 2)  # log time, offset
+            for time_ns in entries[entries[:, 1].argsort(), 0].tolist():
                 yield channel, time_ns
 
 
 def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
-    """An MCAP file as far as it goes: read once for what it holds, and again for its messages."""
+    """Read a file once for its contents; each iteration over messages scans it again."""
     path = scan.path
+
+    def recorded(topics: Collection[str] | None) -> Iterator[BagMessage]:
+        return _scanned(Scan(path, file), left_out, topics)
 
     def messages(
         topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[BagMessage]:
-        return _sorted(_scanned(Scan(path, file), left_out, topics), scan.lag_ns, start_ns, end_ns)
+        return _sorted(recorded(topics), scan.lag_ns, start_ns, end_ns)
 
     schemas: dict[int, Schema] = {}
     topics: dict[str, RecordedTopic] = {}
-    with reading(path):
+    with read_errors(path):
         for record in scan:
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
-                _enter(topics, record, schemas.get(record.schema_id), 0)
+                merge_topic(topics, _topic(record, schemas.get(record.schema_id), 0))
         ended = has_end(file)
     left_out = {} if repeats else scan.part.repeated
     for name, count in scan.part.counts.items():
@@ -204,7 +208,7 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
         first_ns=scan.part.first_ns or 0,
         last_ns=scan.part.last_ns,
         messages=messages,
-        recorded=lambda topics: _scanned(Scan(path, file), left_out, topics),
+        recorded=recorded,
         goes_back_ns=lambda: scan.goes_back_ns,
         about=scan.part.about,
         dropped=scan.part.dropped,
@@ -217,9 +221,8 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
     )
 
 
-def _enter(topics: dict[str, RecordedTopic], channel: Channel, schema: Schema | None, count: int) -> None:
-    """Enter a channel; there may be several of a topic, one for each of its publishers."""
-    made = RecordedTopic(
+def _topic(channel: Channel, schema: Schema | None, count: int) -> RecordedTopic:
+    return RecordedTopic(
         name=channel.topic,
         type=schema.name if schema else "",
         definition=schema.data if schema else b"",
@@ -228,30 +231,20 @@ def _enter(topics: dict[str, RecordedTopic], channel: Channel, schema: Schema | 
         offered_qos=channel.metadata.get("offered_qos_profiles", ""),
         count=count,
     )
-    known = topics.setdefault(channel.topic, made)
-    if known is not made:
-        known.join(made)
 
 
 def _message(topic: str, type: str, message: Message, data: bytes) -> BagMessage:
-    return BagMessage(
-        topic, type, data, min(message.log_time, TIME_MAX_NS), min(message.publish_time, TIME_MAX_NS)
-    )
+    log_time_ns, publish_time_ns = min(message.log_time, TIME_MAX_NS), min(message.publish_time, TIME_MAX_NS)
+    return BagMessage(topic, type, data, log_time_ns, publish_time_ns)
 
 
 def _scanned(scan: Scan, left_out: Collection[str], topics: Collection[str] | None) -> Iterator[BagMessage]:
-    """Messages of a file that has no index to read it by, as they lie there.
-
-    Args:
-        scan: of the file, new.
-        left_out: topics whose repeated messages are left out.
-        topics: which; None: all.
-    """
+    """Messages of some topics (None: all) in the order of the file, without repeated ones of `left_out`."""
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
     records = iter(scan)
     while True:
-        with reading(scan.path):
+        with read_errors(scan.path):
             record = next(records, None)
         if record is None:
             return
@@ -269,24 +262,22 @@ def _scanned(scan: Scan, left_out: Collection[str], topics: Collection[str] | No
 def _sorted(
     messages: Iterator[BagMessage], lag_ns: int, start_ns: int | None, end_ns: int | None
 ) -> Iterator[BagMessage]:
-    """Messages between two times in the order of their log times.
+    """Messages between two log times, sorted by log time.
 
     Args:
-        messages: as they lie in a file.
-        lag_ns: how much earlier than one before it a message may be, nanoseconds.
-        start_ns, end_ns: which.
+        messages: in the order of a file.
+        lag_ns: the longest step back in log time from any earlier message.
+        start_ns, end_ns: first log time, and end (excluded).
     """
-    waiting: list[tuple[int, int, BagMessage]] = []  # log time, number in the file
-    waiting_bytes = newest_ns = 0
-    for n, message in enumerate(messages):
-        time_ns = message.log_time_ns
-        newest_ns = max(newest_ns, time_ns)
-        if (start_ns is None or time_ns >= start_ns) and (end_ns is None or time_ns < end_ns):
-            heapq.heappush(waiting, (time_ns, n, message))
-            waiting_bytes += len(message.data) + MESSAGE_BYTES
-        while waiting and (waiting[0][0] <= newest_ns - lag_ns or waiting_bytes > WAITING_BYTES):
-            *_, first = heapq.heappop(waiting)
-            waiting_bytes -= len(first.data) + MESSAGE_BYTES
-            yield first
-    while waiting:
-        yield heapq.heappop(waiting)[2]
+    newest_ns = 0
+
+    def in_range() -> Iterator[tuple[int, BagMessage]]:
+        nonlocal newest_ns
+        for message in messages:
+            time_ns = message.log_time_ns
+            newest_ns = max(newest_ns, time_ns)
+            if (start_ns is None or time_ns >= start_ns) and (end_ns is None or time_ns < end_ns):
+                yield time_ns, message
+
+    for _, message in sorted_within(in_range(), WAITING_BYTES, lambda time_ns: time_ns <= newest_ns - lag_ns):
+        yield message

@@ -1,45 +1,52 @@
-"""ROS message types as text, for files and protocols that bring their own: no ROS installation is needed."""
+"""Definitions of ROS message types as text, for files and protocols that contain them; needs no ROS."""
 
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from functools import cache
+from typing import TYPE_CHECKING
 
 from uav_dc_ros.errors import BagError
 
-TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
-ENCODING = "ros2msg"  # of the text, as MCAP and Foxglove call it
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+ENCODING = "ros2msg"  # of the text, in MCAP and Foxglove
+
+
+@cache
+def typestore() -> "Typestore":
+    """The types of ROS 2 Jazzy; the first call takes a fifth of a second."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def definition(type: str) -> bytes:
-    """A message type with all types inside it, in the encoding `ros2msg`.
-
-    Args:
-        type: such as `std_msgs/msg/String`.
+    """A message type such as `std_msgs/msg/String` with all types inside it, in the encoding `ros2msg`.
 
     Raises:
-        BagError: ROS 2 has no such type.
+        BagError: ROS 2 Jazzy has no such type.
     """
-    if type not in TYPESTORE.fielddefs:
+    if type not in typestore().fielddefs:
         raise BagError(f"{type!r}; expected a type of ROS 2 Jazzy")
-    text, _ = TYPESTORE.generate_msgdef(type, ros_version=2)
+    text, _ = typestore().generate_msgdef(type, ros_version=2)
     return text.encode()
 
 
-def is_defined_so(type: str, encoding: str, definition: bytes) -> bool:
-    """Whether a definition, as a bag brings it, is that of ROS 2 Jazzy, field by field.
+def matches_jazzy(type: str, encoding: str, definition: bytes) -> bool:
+    """Whether a recorded definition has the fields of ROS 2 Jazzy's; True without one to compare.
 
     Args:
         type: such as `std_msgs/msg/String`.
-        encoding: `ros2msg` or `ros2idl`; a definition in another one, or none at all, is not judged.
+        encoding: `ros2msg` and `ros2idl` are compared.
         definition: the text, with all types inside it.
     """
     if not definition or encoding not in ("ros2msg", "ros2idl"):
         return True
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
     try:
-        text = definition.decode().replace("\r\n", "\n")  # as of a checkout on Windows
-        told = get_types_from_msg(text, type) if encoding == "ros2msg" else get_types_from_idl(text)
+        text = definition.decode().replace("\r\n", "\n")  # of a checkout on Windows
+        recorded = get_types_from_msg(text, type) if encoding == "ros2msg" else get_types_from_idl(text)
     except Exception:  # of UTF-8, rosbags: no definition
         return False
-    # Constants are not in the messages.
-    return all(
-        name in TYPESTORE.fielddefs and TYPESTORE.fielddefs[name][1] == fields
-        for name, (_, fields) in told.items()
-    )
+    jazzy = typestore().fielddefs  # constants are not compared: messages do not contain them
+    return all(name in jazzy and jazzy[name][1] == fields for name, (_, fields) in recorded.items())

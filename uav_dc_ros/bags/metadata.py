@@ -1,4 +1,4 @@
-"""What a part of a bag holds, and metadata.yaml over all parts of a bag, as rosbag2 of Jazzy writes it."""
+"""The contents of a part of a bag, and metadata.yaml over all parts, in the format of rosbag2 of Jazzy."""
 
 import json
 import time
@@ -17,29 +17,28 @@ from ruamel.yaml.error import YAMLError
 from uav_dc_ros import files
 from uav_dc_ros.errors import BagError, UavDcError
 
-METADATA_NAME = "uav_dc_ros"  # of our record inside an MCAP file: what the bag is about
-LOST = "lost_bytes"  # its key for what recovering a part could not use
-# Messages at the head of a file that an earlier file of the bag holds already, by topic; their sequence is 0.
-REPEATED_NAME = "uav_dc_ros_repeated"
-DROPPED_NAME = "uav_dc_ros_dropped"  # messages that were lost while a file was written, by topic
-FILE_NAME = "metadata.yaml"
+# Names of this package's metadata records in an MCAP file.
+ABOUT_RECORD = "uav_dc_ros"  # the bag's description, text by key
+REPEATED_RECORD = "uav_dc_ros_repeated"  # messages at the head that an earlier part has, by topic; sequence 0
+DROPPED_RECORD = "uav_dc_ros_dropped"  # messages lost while the part was recorded, by topic
+LOST_BYTES_KEY = "lost_bytes"  # of ABOUT_RECORD: bytes of the source that could not be recovered
+METADATA_FILE = "metadata.yaml"
 
 
 @dataclass
 class Part:
-    """What one MCAP file of a bag holds.
+    """The contents of one MCAP file of a bag.
 
     Attributes:
-        name: its file's name.
-        about: what the bag is about, text by key.
+        name: file name.
+        about: description of the bag, text by key.
         topics: `topic_metadata` of metadata.yaml by topic.
         counts: messages by topic.
-        published_ns: latest publish time by topic, of topics with messages, nanoseconds since the epoch.
-        first_ns: earliest log time; None without messages.
-        last_ns: latest log time.
-        repeated: messages by topic that repeat latched ones of earlier parts; `counts` has them, too.
-        dropped: messages by topic that were published but never reached the recorder; None: nobody counted.
-        latest: last message and its publish time by topic, of latched topics; only what was read has it.
+        published_ns: latest publish time by topic with messages.
+        first_ns, last_ns: earliest and latest log time; None and 0 without messages.
+        repeated: messages by topic that repeat latched ones of earlier parts; included in `counts`.
+        dropped: published messages by topic that the recorder lost; None: not counted.
+        latest: last message and its publish time by latched topic; only of a part that was read.
     """
 
     name: str
@@ -58,25 +57,25 @@ class Part:
         """Messages of all topics."""
         return sum(self.counts.values())
 
-    def announce(self, topic: str, type: str, encoding: str, channel: Mapping[str, str]) -> None:
-        """Enter a topic; a second time changes nothing.
+    def add_topic(self, topic: str, type: str, encoding: str, channel: Mapping[str, str]) -> None:
+        """Add a topic; a known one stays as it is.
 
         Args:
             topic: full name.
             type: ROS 2 message type.
-            encoding: of its messages, such as `cdr`.
-            channel: metadata of its MCAP channel; the keys are rosbag2's.
+            encoding: of the messages, such as `cdr`.
+            channel: rosbag2's metadata of the MCAP channel.
 
         Raises:
-            BagError: the channel's QoS is not what rosbag2 writes.
+            BagError: the channel's QoS is not in rosbag2's format.
         """
         if topic in self.topics:
             return
-        offers = channel.get("offered_qos_profiles", "")
+        offered = channel.get("offered_qos_profiles", "")
         try:
-            qos = dump_qos_v9(parse_qos(offers))
+            qos = dump_qos_v9(parse_qos(offered))
         except (ReaderError, KeyError, TypeError, AttributeError):
-            raise BagError(f"QoS of topic {topic} is {offers!r}; expected rosbag2's YAML") from None
+            raise BagError(f"QoS of topic {topic} is {offered!r}; expected rosbag2's YAML") from None
         self.topics[topic] = {
             "name": topic,
             "type": type,
@@ -86,38 +85,42 @@ class Part:
         }
         self.counts[topic] = 0
 
-    def learn(self, name: str, content: Mapping[str, str]) -> None:
-        """Enter a metadata record; those of others say nothing here."""
-        if name == METADATA_NAME:
+    def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
+        """Add a metadata record; records of other software are ignored."""
+        if name == ABOUT_RECORD:
             self.about |= content
-        elif name == REPEATED_NAME:
-            self.repeated |= _numbers(content)
-        elif name == DROPPED_NAME:
-            self.dropped = (self.dropped or {}) | _numbers(content)
+        elif name == REPEATED_RECORD:
+            self.repeated |= _counts(content)
+        elif name == DROPPED_RECORD:
+            self.dropped = (self.dropped or {}) | _counts(content)
 
-    def count(self, topic: str, *, log_time_ns: int, publish_time_ns: int) -> None:
-        """Enter a message of a topic that was announced; times in nanoseconds since the epoch."""
+    def add_message(self, topic: str, *, log_time_ns: int, publish_time_ns: int) -> None:
+        """Count a message of a known topic."""
         self.counts[topic] += 1
         self.published_ns[topic] = max(publish_time_ns, self.published_ns.get(topic, publish_time_ns))
         self.first_ns = log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
         self.last_ns = max(self.last_ns, log_time_ns)
 
 
-def is_latched(row: Mapping[str, Any]) -> bool:
-    """Whether all publishers of a topic, by its row of metadata.yaml, offer old messages to newcomers."""
-    offers = row["offered_qos_profiles"]
-    return bool(offers) and all(offer["durability"] == "transient_local" for offer in offers)
+def _counts(content: Mapping[str, str]) -> dict[str, int]:
+    return {topic: int(count) for topic, count in content.items() if count.isdecimal()}
 
 
-def total(parts: Sequence[Part]) -> Part:
-    """All parts as one, nameless.
+def is_latched(topic: Mapping[str, Any]) -> bool:
+    """Whether all publishers of a topic, by its `topic_metadata`, are transient local."""
+    offered = topic["offered_qos_profiles"]
+    return bool(offered) and all(profile["durability"] == "transient_local" for profile in offered)
 
-    A topic appears once, as the first part with messages of it has it: rosbags reads only messages whose
-    channel offers exactly the QoS that metadata.yaml tells, and a topic without messages loses none.
+
+def merged(parts: Sequence[Part]) -> Part:
+    """All parts as one, without a name.
+
+    A topic has the metadata of the first part with messages of it: rosbags skips the messages of a channel
+    whose QoS differs from that in metadata.yaml.
     """
     whole = Part("")
     for part in parts:
-        whole.about = part.about | whole.about  # what was said first stays
+        whole.about = part.about | whole.about  # the first value stays
         for topic, row in part.topics.items():
             if not whole.counts.get(topic) and (part.counts[topic] or row["offered_qos_profiles"]):
                 whole.topics[topic] = row
@@ -125,9 +128,9 @@ def total(parts: Sequence[Part]) -> Part:
             whole.counts[topic] = whole.counts.get(topic, 0) + part.counts[topic]
             whole.repeated[topic] = whole.repeated.get(topic, 0) + part.repeated.get(topic, 0)
         if part.dropped is not None:
-            lost = Counter(whole.dropped or {})
-            lost.update(part.dropped)
-            whole.dropped = dict(lost)
+            dropped = Counter(whole.dropped or {})
+            dropped.update(part.dropped)
+            whole.dropped = dict(dropped)
         whole.latest |= part.latest
         for topic, published_ns in part.published_ns.items():
             whole.published_ns[topic] = max(published_ns, whole.published_ns.get(topic, published_ns))
@@ -138,9 +141,10 @@ def total(parts: Sequence[Part]) -> Part:
 
 
 def information(parts: Sequence[Part]) -> dict[str, Any]:
-    """The content of metadata.yaml, version 9 (Jazzy), over some parts."""
-    whole = total(parts)
+    """The content of metadata.yaml, version 9 (Jazzy)."""
+    whole = merged(parts)
     start_ns = time.time_ns() if whole.first_ns is None else whole.first_ns
+    dropped = {} if whole.dropped is None else {"dropped": json.dumps(whole.dropped, sort_keys=True)}
     return {
         "version": 9,
         "storage_identifier": "mcap",
@@ -153,18 +157,13 @@ def information(parts: Sequence[Part]) -> dict[str, Any]:
         "compression_mode": "",
         "relative_file_paths": [part.name for part in parts],
         "files": [{"path": part.name, **_times(part, start_ns)} for part in parts],
-        "custom_data": whole.about
-        | ({} if whole.dropped is None else {"dropped": json.dumps(whole.dropped, sort_keys=True)}),
+        "custom_data": whole.about | dropped,
         "ros_distro": "jazzy",
     }
 
 
-def _numbers(content: Mapping[str, str]) -> dict[str, int]:
-    return {topic: int(count) for topic, count in content.items() if count.isdecimal()}
-
-
-def _times(part: Part, otherwise_ns: int) -> dict[str, Any]:
-    start_ns = otherwise_ns if part.first_ns is None else part.first_ns
+def _times(part: Part, default_ns: int) -> dict[str, Any]:
+    start_ns = default_ns if part.first_ns is None else part.first_ns
     return {
         "duration": {"nanoseconds": max(0, part.last_ns - start_ns)},
         "starting_time": {"nanoseconds_since_epoch": start_ns},
@@ -173,48 +172,45 @@ def _times(part: Part, otherwise_ns: int) -> dict[str, Any]:
 
 
 def write_metadata(folder: Path, parts: Sequence[Part]) -> None:
-    """Write metadata.yaml in one move.
+    """Write metadata.yaml.
 
     Raises:
-        BagError: the disk is full, or gone.
+        BagError: the disk is full or gone.
     """
     text = to_yaml({"rosbag2_bagfile_information": information(parts)}) + "\n"
     try:
-        files.write(folder / FILE_NAME, text.encode())
+        files.write(folder / METADATA_FILE, text.encode())
     except UavDcError as error:
         raise BagError(str(error)) from None
 
 
 def read_metadata(folder: Path) -> dict[str, Any] | None:
-    """What metadata.yaml says; None if it is missing, or says nothing of a bag.
+    """The content of metadata.yaml; None if the file is missing or does not describe a bag.
 
     Raises:
-        BagError: it is there, and cannot be read.
+        BagError: the file cannot be read.
     """
     try:
-        told = YAML(typ="safe").load(folder / FILE_NAME)["rosbag2_bagfile_information"]
+        content = YAML(typ="safe").load(folder / METADATA_FILE)["rosbag2_bagfile_information"]
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise BagError(f"{folder / FILE_NAME} cannot be read: {error.strerror}") from None
+        raise BagError(f"{folder / METADATA_FILE} cannot be read: {error.strerror}") from None
     except (ValueError, YAMLError, KeyError, TypeError, RecursionError):
         return None
-    return told if isinstance(told, dict) else None
+    return content if isinstance(content, dict) else None
 
 
-def is_told(folder: Path, parts: Sequence[Part]) -> bool:
-    """Whether metadata.yaml tells these parts, and as many messages of each topic."""
-    told = read_metadata(folder)
-    if told is None:
-        return False  # it is to be written
+def matches_metadata(folder: Path, parts: Sequence[Part]) -> bool:
+    """Whether metadata.yaml lists exactly these parts and their messages by topic."""
+    content = read_metadata(folder) or {}
     try:
-        counts = {
-            row["topic_metadata"]["name"]: row["message_count"] for row in told["topics_with_message_count"]
-        }
-        names = [Path(name).name for name in told["relative_file_paths"]]  # some writers put folders before
+        rows = content["topics_with_message_count"]
+        counts = {row["topic_metadata"]["name"]: row["message_count"] for row in rows}
+        names = [Path(name).name for name in content["relative_file_paths"]]  # may have folders before it
     except (KeyError, TypeError):
         return False
-    return names == [part.name for part in parts] and counts == total(parts).counts
+    return names == [part.name for part in parts] and counts == merged(parts).counts
 
 
 def to_yaml(value: Any) -> str:

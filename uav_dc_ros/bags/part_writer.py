@@ -1,4 +1,4 @@
-"""One MCAP file of a bag while it is written, and where the files of a bag lie."""
+"""One MCAP file of a bag while it is written, and the lock and the files of a bag's folder."""
 
 import contextlib
 import fcntl
@@ -6,7 +6,6 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from mcap.writer import CompressionType, Writer
@@ -15,23 +14,18 @@ from uav_dc_ros import __version__
 from uav_dc_ros.bags.metadata import Part, information, to_yaml
 from uav_dc_ros.errors import BagError
 
-CHUNK_BYTES = 128 * 1024  # small: a chunk that was not finished is what a killed writer loses
-MCAP = ".mcap"
+CHUNK_BYTES = 128 * 1024  # a killed writer loses its unfinished chunk
 _NUMBER = re.compile(r"_(\d+)\.\w+$")
 
 
-def number(path: Path) -> int:
-    """The number of a part by its name, `<bag>_<number>.mcap`; -1 without one."""
-    found = _NUMBER.search(path.name)
+def part_number(name: str) -> int:
+    """The number in a file name `<bag>_<number>.mcap`; -1 without one."""
+    found = _NUMBER.search(name)
     return int(found[1]) if found else -1
 
 
-def part_paths(folder: Path, suffix: str = MCAP) -> list[Path]:
-    """The storage files of a bag in the order of their numbers; hidden files are none of them.
-
-    Args:
-        folder: the bag's.
-        suffix: of the files.
+def part_paths(folder: Path, suffix: str = ".mcap") -> list[Path]:
+    """The storage files of a bag in the order of their numbers, without hidden files.
 
     Raises:
         BagError: the folder cannot be read.
@@ -40,16 +34,16 @@ def part_paths(folder: Path, suffix: str = MCAP) -> list[Path]:
         paths = [path for path in folder.iterdir() if path.suffix == suffix and not path.name.startswith(".")]
     except OSError as error:
         raise BagError(f"bag {folder} cannot be read: {error.strerror}") from None
-    return sorted(paths, key=lambda path: (number(path), path.name))
+    return sorted(paths, key=lambda path: (part_number(path.name), path.name))
 
 
 class FolderLock:
-    """Held while a bag is written or mended; the kernel opens it when the process ends, however it ends.
+    """Held while a bag is written or repaired; the kernel releases it when the process ends.
 
-    Without it, mending would move a file away from under a recorder that still writes it.
+    It keeps a repair from replacing a file that a recorder still writes.
 
     Raises:
-        BagError: somebody else holds it, or there is no such folder.
+        BagError: another process holds it, or there is no such folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -61,37 +55,35 @@ class FolderLock:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.release()
-            raise BagError(f"bag {folder} is being written or mended; expected one at rest") from None
+            raise BagError(f"bag {folder} is being written or repaired; expected one at rest") from None
         except OSError:
-            pass  # a file system without locks (some network ones): there the user has to take care
+            pass  # some network file systems have no locks
 
     def release(self) -> None:
-        """Let the folder go. Twice does nothing more than once."""
+        """Release the lock; a second call does nothing."""
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)
 
     def __enter__(self) -> Self:
-        """Hold the lock in a `with` statement."""
+        """The lock."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Release the lock."""
         self.release()
 
 
 class PartWriter:
-    """Writes one MCAP file in chunks, and keeps count of what it holds.
+    """Writes one MCAP file in chunks, and records its contents in `part`.
 
     Args:
         path: the file; must not exist.
-        name: the part's name, where the file has a temporary one.
-        compression: of its chunks, one of `compression.COMPRESSIONS`.
-        chunk_bytes: size at which a chunk is finished, before compression.
+        name: the part's name, if the file has a temporary one.
+        compression: of the chunks, one of `bags.COMPRESSIONS`.
+        chunk_bytes: size of a finished chunk before compression.
 
-    Raises (all methods): OSError, which whoever owns the bag puts into words.
+    Raises (all methods): OSError, which the owner of the bag translates.
     """
 
     def __init__(
@@ -104,7 +96,7 @@ class PartWriter:
     ) -> None:
         self.part = Part(name or path.name)
         self._topics: dict[int, str] = {}  # by channel
-        self._types: dict[int, str] = {0: ""}  # by schema; channel without schema: 0, as MCAP has it
+        self._types: dict[int, str] = {0: ""}  # by schema; 0: without one
         self._file = path.open("xb")
         try:
             compressed = CompressionType[compression.upper()]
@@ -117,30 +109,35 @@ class PartWriter:
 
     @property
     def closed(self) -> bool:
-        """Whether it was finished or abandoned."""
+        """Whether the file was finished or abandoned."""
         return self._file.closed
 
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far, without the current chunk."""
+        return self._file.tell()
+
     def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
-        """Append a metadata record; ours are those that `Part.learn` knows."""
-        self.part.learn(name, content)
+        """Append a metadata record."""
+        self.part.add_metadata(name, content)
         self._mcap.add_metadata(name, dict(content))
         self._file.flush()
 
     def add_attachment(
         self, *, name: str, media_type: str, data: bytes, log_time_ns: int, create_time_ns: int
     ) -> None:
-        """Append an attachment; times in nanoseconds since the epoch."""
+        """Append an attachment."""
         self._mcap.add_attachment(create_time_ns, log_time_ns, name, media_type, data)
 
     def add_schema(self, type: str, encoding: str, definition: bytes) -> int:
-        """Append a message type; returns its number."""
+        """Append a message type; returns its schema id."""
         schema = self._mcap.register_schema(type, encoding, definition)
         self._types[schema] = type
         return schema
 
     def add_channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """Append a topic with rosbag2's metadata of it; returns the channel's number."""
-        self.part.announce(topic, self._types[schema], encoding, metadata)
+        """Append a topic with rosbag2's channel metadata; returns its channel id."""
+        self.part.add_topic(topic, self._types[schema], encoding, metadata)
         channel = self._mcap.register_channel(topic, encoding, schema, dict(metadata))
         self._topics[channel] = topic
         return channel
@@ -148,26 +145,21 @@ class PartWriter:
     def add_message(
         self, channel: int, data: bytes, *, log_time_ns: int, publish_time_ns: int, sequence: int
     ) -> None:
-        """Append a message; times in nanoseconds since the epoch."""
+        """Append a message."""
         self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
-        self._file.flush()  # a chunk that is finished is out of this process, whatever happens to it
-        self.part.count(self._topics[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
-
-    @property
-    def size(self) -> int:
-        """Bytes of the file by now, without the chunk that is being filled."""
-        return self._file.tell()
+        self._file.flush()  # a finished chunk survives a kill
+        self.part.add_message(self._topics[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
 
     def flush(self) -> None:
-        """Finish the chunk that is being filled, and hand it to the operating system."""
+        """Finish the current chunk, and write it to the operating system."""
         self._mcap.flush()  # type: ignore[no-untyped-call]
 
     def descriptor(self) -> int:
-        """A file descriptor for `os.fsync`, for the caller to close: it outlives the file object."""
+        """A duplicate file descriptor for `os.fsync`; the caller closes it."""
         return os.dup(self._file.fileno())
 
     def finish(self) -> None:
-        """End the file, on the disk, with rosbag2's record of what this part holds."""
+        """Write the end of the file, with rosbag2's metadata record of this part, and sync it to disk."""
         self._mcap.add_metadata("rosbag2", {"serialized_metadata": to_yaml(information([self.part]))})
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
@@ -175,6 +167,6 @@ class PartWriter:
         self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is: what was written until now stays."""
+        """Close the file without its end; its finished chunks stay."""
         with contextlib.suppress(OSError):
             self._file.close()

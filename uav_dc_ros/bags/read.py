@@ -1,10 +1,10 @@
-"""Read a whole bag, of any recorder, as a stream: message by message, a few chunks at a time in memory.
+"""Read a whole bag, of any recorder, as a stream, with a few chunks at a time in memory.
 
-Each part that our recorder writes repeats latched messages of earlier parts at its head, for who has no other
-part: of the parts of one folder they are left out, except of the first one there.
+A bag is a rosbag2 folder with MCAP or SQLite files, with or without metadata.yaml, or one such file. A bag of
+a killed recorder must be recovered first.
 
-A bag is a rosbag2 folder with MCAP or SQLite files, with or without metadata.yaml, or one such file. What a
-killed recorder left is recovered first.
+Each part of this package's recorder repeats latched messages of earlier parts at its head: they are left out,
+except in the first part of a folder and in a single file.
 """
 
 import heapq
@@ -16,7 +16,6 @@ from functools import cached_property
 from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from uav_dc_ros.bags import receive_order
@@ -27,7 +26,8 @@ from uav_dc_ros.bags.storage import (
     BagMessage,
     RecordedTopic,
     Storage,
-    reading,
+    merge_topic,
+    read_errors,
     storage_files,
 )
 
@@ -35,24 +35,25 @@ __all__ = ["BagMessage", "BagReader", "RecordedTopic"]
 
 
 class BagReader:
-    """A bag that is read; a context manager.
+    """Reads a bag; a context manager.
 
     Args:
         path: the bag's folder, or one of its files.
-        torn: read files that lack their end, or are damaged, as far as they go. They are read once more,
-            to know what they hold.
+        torn: read files without their end, or damaged ones, as far as possible. They are scanned once before
+            their messages are read.
 
     Attributes:
-        parts: its storage files, in their order.
-        storages: what each of them holds.
+        parts: storage files, in their order.
+        storages: contents of each of them.
         topics: by name.
-        about: what our recorder wrote about it, text by key; empty for a bag of another one.
-        dropped: messages by topic that were published, but lost before they were recorded; None: not counted.
-        first_ns, last_ns: log times of its first and last message, nanoseconds since the epoch; 0 without.
+        about: description by this package's recorder, text by key; empty for other bags.
+        dropped: published messages by topic that the recorder lost; None: not counted.
+        first_ns, last_ns: log times of the first and last message, nanoseconds since the epoch; 0 without
+            messages.
 
     Raises:
-        BagError: no bag; a part of it has no end, since its recorder was killed; it is damaged, or of a kind
-            that cannot be read.
+        BagError: no bag; a part without its end, since its recorder was killed; a damaged one, or one of an
+            unsupported kind.
     """
 
     def __init__(self, path: Path, *, torn: bool = False) -> None:
@@ -69,26 +70,21 @@ class BagReader:
             raise
         self.parts = tuple(part.path for part in self.storages)
         for part in self.storages:
-            self.about = part.about | self.about  # what was said first stays
+            self.about = part.about | self.about  # the first value stays
             if part.dropped is not None:
                 self.dropped = dict(Counter(self.dropped or {}) + Counter(part.dropped))
             for topic in part.topics:
-                if topic.name in self.topics:
-                    self.topics[topic.name].join(topic)
-                else:
-                    self.topics[topic.name] = replace(topic)
-        with_messages = [part for part in self.storages if any(topic.count for topic in part.topics)]
+                merge_topic(self.topics, replace(topic))
+        with_messages = [part for part in self.storages if _topics_with_messages(part)]
         self.first_ns = min((part.first_ns for part in with_messages), default=0)
         self.last_ns = max((part.last_ns for part in with_messages), default=0)
 
     def __enter__(self) -> Self:
-        """Read the bag in a `with` statement."""
+        """The reader."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close its files."""
+    def __exit__(self, *_: object) -> None:
+        """Close the files."""
         self._closing.close()
 
     @property
@@ -103,18 +99,18 @@ class BagReader:
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[BagMessage]:
-        """Messages in the order of their log times; equal times as they lie in the bag.
+        """Messages sorted by log time; those of equal times are in the order of the bag.
 
         Args:
-            topics: full names; all, unless told.
+            topics: full names; None: all.
             start_ns: earliest log time.
-            end_ns: log time before which all must lie.
+            end_ns: end of the log times (excluded).
 
         Raises:
             BagError: the bag is damaged there.
         """
         streams = [part.messages(topics, start_ns, end_ns) for part in self.storages]
-        # Parts follow each other; only where their times overlap do they have to be merged.
+        # Only parts whose times overlap are merged.
         while streams:
             together = 1
             end = self.storages[-len(streams)].last_ns
@@ -126,22 +122,24 @@ class BagReader:
 
     @cached_property
     def set_back_ns(self) -> int:
-        """By how much the clock was set back, at most, while the bag was recorded, nanoseconds; 0: never.
+        """By how much the recorder's clock was set back at most, nanoseconds; 0: never.
 
         Raises:
-            BagError: the bag is damaged there.
+            BagError: the bag is damaged somewhere.
         """
         goes_back_ns = max((part.goes_back_ns() for part in self.storages), default=0)
         if not self._is_side_by_side:
-            for before, after in pairwise(part for part in self.storages if _names(part)):
+            for before, after in pairwise(part for part in self.storages if _topics_with_messages(part)):
                 goes_back_ns = max(goes_back_ns, before.last_ns - after.first_ns)
-        return receive_order.set_back_ns(self._recorded(None)) if goes_back_ns > receive_order.LEAST_NS else 0
+        if goes_back_ns <= receive_order.MIN_SET_BACK_NS:
+            return 0
+        return receive_order.set_back_ns(self._recorded(None))
 
     def received(self, topics: Collection[str]) -> Iterator[tuple[int, BagMessage]]:
-        """Messages in the order of their receipt, each with how often the clock had been set back by then.
+        """Messages in the order of receipt, each with how often the clock had been set back before it.
 
-        That is the order of their log times, but for a clock that was set back: then it is that in which they
-        were recorded, as far as they lie no further apart than `receipt.WAITING_BYTES`.
+        It is the order of log times, unless the clock was set back: then it is the order of recording, as far
+        as messages are no further apart than `receive_order.WAITING_BYTES`.
 
         Raises:
             BagError: the bag is damaged there.
@@ -151,7 +149,7 @@ class BagReader:
         return receive_order.in_order(self._recorded(topics))
 
     def _recorded(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
-        """Messages in the order in which they were recorded."""
+        """Messages in the order of recording."""
         streams = [part.recorded(topics) for part in self.storages]
         if self._is_side_by_side:
             return heapq.merge(*streams, key=attrgetter("log_time_ns"))
@@ -159,18 +157,17 @@ class BagReader:
 
     @property
     def _is_side_by_side(self) -> bool:
-        """Whether its files hold different topics, as those of several recorders, not one after the other."""
-        names = [name for part in self.storages for name in _names(part)]
+        """Whether the files have different topics, as those of simultaneous recorders."""
+        names = [name for part in self.storages for name in _topics_with_messages(part)]
         return len(set(names)) == len(names)
 
     def _open(self, path: Path, torn: bool, *, repeats: bool) -> Storage:
-        with reading(path), path.open("rb") as file:
+        with read_errors(path), path.open("rb") as file:
             is_sqlite = file.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
         if is_sqlite:
             return open_sqlite(path, self._closing)
         return open_mcap(path, self._closing, torn=torn, repeats=repeats)
 
 
-def _names(part: Storage) -> list[str]:
-    """Topics with messages."""
+def _topics_with_messages(part: Storage) -> list[str]:
     return [topic.name for topic in part.topics if topic.count]

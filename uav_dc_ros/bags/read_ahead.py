@@ -1,7 +1,7 @@
-"""Read a bag's messages ahead of who plays them, in a thread: a few megabytes, whatever the bag's size.
+"""Read a bag's messages ahead in a thread, with a few megabytes of memory whatever the bag's size.
 
-A chunk of a bag is read, checked, decompressed and sorted as a whole. Whoever did so between two messages
-would be late with the second one.
+A chunk is read, checked, decompressed and sorted as a whole; between two messages of a replay, that would
+delay the second one.
 """
 
 import contextlib
@@ -10,52 +10,49 @@ import threading
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from uav_dc_ros.bags.read import BagMessage, BagReader
 
-BATCH = 256  # messages that are handed over at once
+BATCH = 256  # messages in a queue item
 BATCH_BYTES = 2**20
-BATCHES = 16  # read ahead
-FILL_S = 0.5  # to read that much at the start, at most
-LOOK_S = 0.1  # how soon the thread sees that nobody wants more
+BATCHES = 16  # in the queue
+FILL_S = 0.5  # longest time to fill the queue at the start
+STOP_CHECK_S = 0.1  # interval in which a blocked thread checks whether it must stop
 
 
 class ReadAhead:
-    """Iterates once over messages of a bag, as `BagReader.messages` has them; a context manager.
+    """Iterates once over the messages of `BagReader.messages`; a context manager.
 
     Args:
-        path: of the bag.
+        path: the bag's.
         topics: full names.
         start_ns: earliest log time.
-        end_ns: log time before which all must lie; None: to the end.
+        end_ns: end of the log times (excluded); None: the bag's end.
     """
 
     def __init__(self, path: Path, topics: Collection[str], *, start_ns: int, end_ns: int | None) -> None:
         self._path = path
-        self._wanted = (topics, start_ns, end_ns)
+        self._topics, self._start_ns, self._end_ns = topics, start_ns, end_ns
         self._batches: queue.Queue[list[BagMessage] | Exception | None] = queue.Queue(BATCHES)
         self._closed = False
         self._thread = threading.Thread(target=self._read, daemon=True)
 
     def __enter__(self) -> Self:
-        """Start to read; the first messages lie ready, so that reading does not compete with playing them."""
+        """Start to read, and fill the queue, so that reading does not compete with the replay."""
         self._thread.start()
         deadline_s = time.monotonic() + FILL_S
         while self._thread.is_alive() and not self._batches.full() and time.monotonic() < deadline_s:
             time.sleep(0.002)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop reading."""
         self._closed = True
         self._thread.join()
 
     def __iter__(self) -> Iterator[BagMessage]:
-        """Hand the messages out.
+        """The messages.
 
         Raises:
             BagError: the bag is damaged there.
@@ -66,28 +63,27 @@ class ReadAhead:
             yield from batch
 
     def _read(self) -> None:
-        topics, start_ns, end_ns = self._wanted
-        last: Exception | None = None
+        end: Exception | None = None
         try:
-            # A reader of its own: SQLite's may be used only in the thread that made it.
+            # A reader of its own: only the thread that opened a SQLite file may read it.
             with BagReader(self._path) as reader:
                 batch: list[BagMessage] = []
                 batch_bytes = 0
-                for message in reader.messages(topics, start_ns=start_ns, end_ns=end_ns):
+                for message in reader.messages(self._topics, start_ns=self._start_ns, end_ns=self._end_ns):
                     batch.append(message)
                     batch_bytes += len(message.data)
                     if len(batch) >= BATCH or batch_bytes >= BATCH_BYTES:
-                        self._hand_over(batch)
+                        self._put(batch)
                         batch, batch_bytes = [], 0
                     if self._closed:
                         return
-                self._hand_over(batch)
-        except Exception as error:  # whoever iterates is to see it
-            last = error
-        self._hand_over(last)
+                self._put(batch)
+        except Exception as error:  # raised where the messages are read
+            end = error
+        self._put(end)
 
-    def _hand_over(self, batch: list[BagMessage] | Exception | None) -> None:
+    def _put(self, item: list[BagMessage] | Exception | None) -> None:
         while not self._closed:
             with contextlib.suppress(queue.Full):
-                self._batches.put(batch, timeout=LOOK_S)
+                self._batches.put(item, timeout=STOP_CHECK_S)
                 return

@@ -1,73 +1,71 @@
-"""The order in which messages were received, also where the recorder's clock was set back meanwhile.
+"""The order in which messages were received, also if the recorder's clock was set back meanwhile.
 
-Log times tell it, as long as the clock goes forward: messages of different topics may lie in a file in
-another order, since a recorder writes down what waits topic by topic. Those of one topic lie in the order in
-which they were published; so where both their times go back, the clock was set back. Where the log time alone
-does, a message was lost and sent again, unless all that follow are received sooner than any before: then it
-was the clock of a recorder on another machine.
+While the clock goes forward, it is the order of log times: a recorder writes waiting messages topic by topic,
+so the order in a file may differ. Messages of one topic are in the order of publishing. If both their times
+go back, the clock was set back. If only the log time goes back, a message was lost and resent, unless all
+later messages have a shorter latency than any before: then the clock of a recorder on another machine was set
+back.
 """
 
-import heapq
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from uav_dc_ros.bags.storage import BagMessage
+from uav_dc_ros.bags.storage import BagMessage, sorted_within
 
-LEAST_NS = 1_000_000  # by which a clock is set back
-LEAST_APART_NS = 250_000_000  # by which that of the recorder alone is
+MIN_SET_BACK_NS = 1_000_000
+MIN_RECORDER_SET_BACK_NS = 250_000_000  # of the recorder's clock alone
 WAITING_BYTES = 16 * 2**20  # of messages that wait for earlier ones
-MESSAGE_BYTES = 400  # that a message takes beside its data
 
 
 class _Last(NamedTuple):
-    """The last message of a topic: how often the clock had been set back, and its times, ns.
+    """The last message of a topic: settings of the clock before it, its times, shortest latency since then."""
 
-    `latency_ns` is the shortest between two settings of the clock.
-    """
-
-    clock: int
+    setting: int
     log_ns: int
     publish_ns: int
-    latency_ns: int
+    min_latency_ns: int
 
 
 class _Clock:
-    """Tells of each message how often the clock had been set back when it was received.
+    """Counts how often the clock had been set back when each message was received.
 
     Attributes:
-        set_back_ns: by how much it was set back, at most.
+        set_back_ns: the longest step back.
     """
 
     def __init__(self) -> None:
         self.set_back_ns = 0
-        self._ends_ns = [0]  # latest log time between two settings
+        self._ends_ns = [0]  # latest log time by setting
         self._last: dict[str, _Last] = {}
 
     def setting(self, message: BagMessage) -> int:
-        """How often it had been set back by then."""
+        """How often the clock had been set back before the message."""
         _, _, _, log_ns, publish_ns = message
         ends_ns, latency_ns = self._ends_ns, log_ns - publish_ns
         last = self._last.get(message.topic)
-        clock, least_ns = len(ends_ns) - 1, latency_ns
+        setting, min_latency_ns = len(ends_ns) - 1, latency_ns
         if last is not None:
-            clock, least_ns = last.clock, min(last.latency_ns, latency_ns)
+            setting, min_latency_ns = last.setting, min(last.min_latency_ns, latency_ns)
             back_ns = last.log_ns - log_ns
-            both = back_ns > LEAST_NS and publish_ns < last.publish_ns
-            if both or (back_ns > LEAST_APART_NS and latency_ns < last.latency_ns - LEAST_APART_NS):
+            both = back_ns > MIN_SET_BACK_NS and publish_ns < last.publish_ns
+            shorter_ns = last.min_latency_ns - latency_ns
+            if both or min(back_ns, shorter_ns) > MIN_RECORDER_SET_BACK_NS:
                 self.set_back_ns = max(self.set_back_ns, back_ns)
-                clock, least_ns = clock + 1, latency_ns
-        # Others saw it set back: a topic that was silent meanwhile is where its time is nearer.
-        while clock < len(ends_ns) - 1 and abs(log_ns - ends_ns[clock + 1]) < abs(log_ns - ends_ns[clock]):
-            clock, least_ns = clock + 1, latency_ns
-        if clock == len(ends_ns):
+                setting, min_latency_ns = setting + 1, latency_ns
+        # Other topics went back: a topic without messages meanwhile belongs where its time is closest.
+        while setting < len(ends_ns) - 1 and abs(log_ns - ends_ns[setting + 1]) < abs(
+            log_ns - ends_ns[setting]
+        ):
+            setting, min_latency_ns = setting + 1, latency_ns
+        if setting == len(ends_ns):
             ends_ns.append(0)
-        ends_ns[clock] = max(ends_ns[clock], log_ns)
-        self._last[message.topic] = _Last(clock, log_ns, publish_ns, least_ns)
-        return clock
+        ends_ns[setting] = max(ends_ns[setting], log_ns)
+        self._last[message.topic] = _Last(setting, log_ns, publish_ns, min_latency_ns)
+        return setting
 
 
 def set_back_ns(recorded: Iterable[BagMessage]) -> int:
-    """By how much the clock was set back, at most, between messages in the order of recording; ns."""
+    """The longest step back of the clock between messages in the order of recording."""
     clock = _Clock()
     for message in recorded:
         clock.setting(message)
@@ -75,21 +73,12 @@ def set_back_ns(recorded: Iterable[BagMessage]) -> int:
 
 
 def in_order(recorded: Iterable[BagMessage]) -> Iterator[tuple[int, BagMessage]]:
-    """Messages in the order of their receipt, each with how often the clock had been set back by then.
+    """Messages in the order of receipt, each with how often the clock had been set back before it.
 
     Args:
-        recorded: messages as they were recorded, those of each topic in the order of their receipt.
+        recorded: messages in the order of recording; those of a topic are in the order of receipt.
     """
     clock = _Clock()
-    waiting: list[tuple[int, int, int, BagMessage]] = []  # how often it was set back, log time, number
-    waiting_bytes = 0
-    for n, message in enumerate(recorded):
-        heapq.heappush(waiting, (clock.setting(message), message.log_time_ns, n, message))
-        waiting_bytes += len(message.data) + MESSAGE_BYTES
-        while waiting_bytes > WAITING_BYTES:
-            setting, _, _, first = heapq.heappop(waiting)
-            waiting_bytes -= len(first.data) + MESSAGE_BYTES
-            yield setting, first
-    while waiting:
-        setting, _, _, first = heapq.heappop(waiting)
-        yield setting, first
+    keyed = (((clock.setting(message), message.log_time_ns), message) for message in recorded)
+    for (setting, _), message in sorted_within(keyed, WAITING_BYTES):
+        yield setting, message

@@ -1,4 +1,4 @@
-"""Files of rosbag2's SQLite storage, each by itself: what metadata.yaml says of them is not needed."""
+"""Files of rosbag2's SQLite storage, read without metadata.yaml."""
 
 import sqlite3
 from collections.abc import Collection, Iterator
@@ -6,38 +6,39 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from uav_dc_ros.bags.records import CDR, plain
-from uav_dc_ros.bags.storage import BagMessage, RecordedTopic, Storage, damage, goes_back_ns
+from uav_dc_ros.bags.records import CDR, decompress_payload
+from uav_dc_ros.bags.storage import (
+    BagMessage,
+    RecordedTopic,
+    Storage,
+    damage_errors,
+    goes_back_ns,
+    merge_topic,
+)
 
 ROWS = 1000  # read at a time
 
 
 def open_sqlite(path: Path, closing: ExitStack) -> Storage:
-    """A file of rosbag2's SQLite storage; only the thread that opened it may read it.
+    """Open a file of rosbag2's SQLite storage; only the same thread may read it.
 
     Raises:
-        BagError: it cannot be read, or is damaged.
+        BagError: the file cannot be read, or is damaged.
     """
-    # What a recorder that was killed left in a write-ahead log beside it is read, too; that needs a lock.
-    how = "mode=ro" if path.with_name(f"{path.name}-wal").exists() else "immutable=1"
-    with damage(path, ""):
-        database = sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True)
+    # The write-ahead log of a killed recorder is read, too; that needs a lock.
+    mode = "mode=ro" if path.with_name(f"{path.name}-wal").exists() else "immutable=1"
+    with damage_errors(path, ""):
+        database = sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)
         closing.callback(database.close)
         database.row_factory = sqlite3.Row
         rows = database.execute("SELECT * FROM topics ORDER BY id").fetchall()
-        counts = {
-            topic: (n, first_ns, last_ns)
-            for topic, n, first_ns, last_ns in database.execute(
-                "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id"
-            )
-        }
+        query = "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id"
+        counts = {topic: (n, first_ns, last_ns) for topic, n, first_ns, last_ns in database.execute(query)}
         topics = {row["id"]: _topic(row, counts.get(row["id"], (0,))[0]) for row in rows}
         by_name: dict[str, RecordedTopic] = {}
         for topic in topics.values():
-            known = by_name.setdefault(topic.name, topic)
-            if known is not topic:
-                known.join(topic)
-        _define(database, by_name)
+            merge_topic(by_name, topic)
+        _add_definitions(database, by_name)
         first_ns = min((int(first) for topic, (_, first, _) in counts.items() if topic in topics), default=0)
         last_ns = max((int(last) for topic, (_, _, last) in counts.items() if topic in topics), default=0)
 
@@ -46,24 +47,24 @@ def open_sqlite(path: Path, closing: ExitStack) -> Storage:
     def read(
         wanted: Collection[str] | None, start_ns: int | None, end_ns: int | None, order: str
     ) -> Iterator[BagMessage]:
-        ids = [id for id, topic in topics.items() if wanted is None or topic.name in wanted]
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({_marks(ids)})"
-        given = list(ids)
+        values = [id for id, topic in topics.items() if wanted is None or topic.name in wanted]
+        marks = ", ".join("?" * len(values))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks})"
         for limit, compare in ((start_ns, ">="), (end_ns, "<")):
             if limit is not None:
                 query += f" AND timestamp {compare} ?"
-                given.append(limit)
-        with damage(path, ""):
-            cursor = database.execute(f"{query} ORDER BY {order}", given)
+                values.append(limit)
+        with damage_errors(path, ""):
+            cursor = database.execute(f"{query} ORDER BY {order}", values)
         while True:
-            with damage(path, ""):
-                found = [_message(topics[row["topic_id"]], row, compressed) for row in cursor.fetchmany(ROWS)]
-            if not found:
+            with damage_errors(path, ""):
+                batch = [_message(topics[row["topic_id"]], row, compressed) for row in cursor.fetchmany(ROWS)]
+            if not batch:
                 return
-            yield from found
+            yield from batch
 
     def times() -> Iterator[tuple[int, int]]:
-        with damage(path, ""):
+        with damage_errors(path, ""):
             yield from database.execute("SELECT topic_id, timestamp FROM messages ORDER BY id")
 
     return Storage(
@@ -78,12 +79,8 @@ def open_sqlite(path: Path, closing: ExitStack) -> Storage:
     )
 
 
-def _marks(values: Collection[object]) -> str:
-    return ", ".join("?" * len(values))
-
-
 def _topic(row: sqlite3.Row, count: int) -> RecordedTopic:
-    """A row of the table `topics`; the oldest ones have no QoS."""
+    """A row of the table `topics`; the first versions have no QoS."""
     has_qos = "offered_qos_profiles" in tuple(row.keys())
     return RecordedTopic(
         name=_text(row["name"]),
@@ -95,14 +92,13 @@ def _topic(row: sqlite3.Row, count: int) -> RecordedTopic:
     )
 
 
-def _define(database: sqlite3.Connection, topics: dict[str, RecordedTopic]) -> None:
-    """Enter the definitions of the topics' types; older bags have none."""
+def _add_definitions(database: sqlite3.Connection, topics: dict[str, RecordedTopic]) -> None:
+    """Add the definitions of the topics' types; older bags have none."""
     table = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'message_definitions'"
     if not database.execute(table).fetchone():
         return
-    for row in database.execute(
-        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-    ):
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    for row in database.execute(query):
         for topic in topics.values():
             if topic.type == row["topic_type"]:
                 topic.encoding = _text(row["encoding"])
@@ -112,8 +108,8 @@ def _define(database: sqlite3.Connection, topics: dict[str, RecordedTopic]) -> N
 def _message(topic: RecordedTopic, row: sqlite3.Row, compressed: set[str]) -> BagMessage:
     data, time_ns = row["data"], row["timestamp"]
     if not isinstance(data, bytes) or not isinstance(time_ns, int):
-        raise ValueError(f"a message of {topic.name} is none")
-    payload = plain(data) if topic.serialization == CDR else data
+        raise ValueError(f"a message of {topic.name} has data or a time of the wrong type")
+    payload = decompress_payload(data) if topic.serialization == CDR else data
     if payload is not data:
         compressed.add(topic.name)
     return BagMessage(topic.name, topic.type, payload, time_ns, time_ns)
@@ -121,5 +117,5 @@ def _message(topic: RecordedTopic, row: sqlite3.Row, compressed: set[str]) -> Ba
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"{value!r} where text is expected")
+        raise ValueError(f"{value!r}; expected text")
     return value

@@ -1,5 +1,6 @@
-"""What the storage files of a bag have in common, where they lie, and what goes wrong while they are read."""
+"""What the storage files of a bag have in common, where they are, and their errors."""
 
+import heapq
 import re
 import sqlite3
 import stat
@@ -8,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import zstandard
 from mcap.exceptions import McapError
@@ -17,10 +18,10 @@ from uav_dc_ros.bags.part_writer import part_paths
 from uav_dc_ros.bags.salvage.scan import Damage
 from uav_dc_ros.errors import BagDamagedError, BagError
 
-SQLITE = ".db3"
 SQLITE_MAGIC = b"SQLite format 3\0"
 RECOVER = "python -m uav_dc_ros.bag recover"
-# What files that are no storage files begin with, and what they are.
+MESSAGE_BYTES = 400  # memory of a message beside its data
+# First bytes of files that are not MCAP files, and a description.
 FOREIGN = {
     b"\x28\xb5\x2f\xfd": "is compressed as a whole (zstd); expected it unpacked, as `zstd -d` does",
     b"\x04\x22\x4d\x18": "is compressed as a whole (lz4); expected it unpacked, as `lz4 -d` does",
@@ -31,24 +32,25 @@ FOREIGN = {
     SQLITE_MAGIC[:8]: "is SQLite storage, which needs no recovery; expected an MCAP file",
     b"#ROSBAG": "is a bag of ROS 1; expected one of ROS 2, as `rosbags-convert` makes of it",
 }
-# What mcap, struct, zstandard, lz4 (RuntimeError) and sqlite3 raise for damaged bytes. Anything else, such as
-# a TypeError, is a mistake of ours.
-_DAMAGE = (
+# Errors of mcap, struct, zstandard, lz4 (RuntimeError) and sqlite3 for damaged bytes. Any other, such as a
+# TypeError, is a bug.
+_DAMAGE_ERRORS = (
     McapError, struct.error, zstandard.ZstdError, sqlite3.Error, RuntimeError, ValueError, EOFError,
     LookupError, OverflowError, MemoryError,
 )  # fmt: skip
-_PACKED = re.compile(r"\.(mcap|db3)\.\w+$")
+_COMPRESSED_FILE = re.compile(r"\.(mcap|db3)\.\w+$")
+_Key = TypeVar("_Key", int, tuple[int, int])
 
 
 class BagMessage(NamedTuple):
-    """A message as it lies in a bag.
+    """A message of a bag.
 
     Attributes:
         topic: full name.
         type: ROS 2 message type.
         data: serialised (CDR).
-        log_time_ns: when it was received, nanoseconds since the epoch.
-        publish_time_ns: when it was published; the log time, where the bag does not tell.
+        log_time_ns: receive time, nanoseconds since the epoch.
+        publish_time_ns: publish time; the log time, if the bag has none.
     """
 
     topic: str
@@ -65,12 +67,12 @@ class RecordedTopic:
     Attributes:
         name: full name.
         type: ROS 2 message type.
-        definition: the type with all types inside it, as text in `encoding`; empty where the bag has none.
+        definition: the type with all types inside it, as text in `encoding`; empty if the bag has none.
         encoding: of the definition: `ros2msg`, or `ros2idl`.
         serialization: of the messages, `cdr` in ROS 2.
-        offered_qos: the publishers' QoS, rosbag2's YAML; empty where the bag does not tell.
+        offered_qos: the publishers' QoS, rosbag2's YAML; empty if the bag has none.
         count: messages.
-        other_types: further types that messages of this topic have; ROS 2 allows one only.
+        other_types: further types of the topic's messages; ROS 2 allows only one.
     """
 
     name: str
@@ -82,8 +84,8 @@ class RecordedTopic:
     count: int = 0
     other_types: tuple[str, ...] = ()
 
-    def join(self, other: "RecordedTopic") -> None:
-        """Enter what another channel, or another file, has of this topic."""
+    def merge(self, other: "RecordedTopic") -> None:
+        """Add the same topic of another channel, or of another file."""
         if not self.count and other.count:
             self.offered_qos = other.offered_qos
         self.count += other.count
@@ -91,24 +93,30 @@ class RecordedTopic:
         self.other_types += tuple(sorted(new))
 
 
+def merge_topic(topics: dict[str, RecordedTopic], topic: RecordedTopic) -> None:
+    """Add a topic to those by name."""
+    known = topics.setdefault(topic.name, topic)
+    if known is not topic:
+        known.merge(topic)
+
+
 Messages = Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
 
 
 @dataclass(kw_only=True)
 class Storage:
-    """A storage file: what it holds, and its messages.
+    """The contents of a storage file.
 
     Attributes:
-        messages: those between two log times (the second one excluded), in the order of their log times.
-        recorded: those of some topics, or all, in the order in which they were recorded.
-        goes_back_ns: by how much the log time went back, at most, from one message of a topic to the next,
-            nanoseconds; looks through the file.
-        about, dropped, repeated: as those of `metadata.Part`; repeated messages are those left out.
-        library: what wrote it, in its own words.
-        damages: what of it cannot be used; told only where it was read as far as it goes.
-        has_end: whether it is finished.
-        has_index: whether its messages can be found without reading all of it.
-        compressed: topics of whose messages rosbag2 compressed each by itself, among those read until now.
+        messages: those of some topics (None: all) from a log time on and before another, sorted by log time.
+        recorded: those of some topics, or all, in the order of recording.
+        goes_back_ns: the longest step back in log time between consecutive messages of a topic; reads the file.
+        about, dropped, repeated: as in `metadata.Part`; repeated messages are those left out.
+        library: name of the software that wrote the file.
+        damages: unusable places; only known of a file that was scanned.
+        has_end: whether the file is finished.
+        has_index: whether messages are found without reading the whole file.
+        compressed: topics whose messages rosbag2 compressed individually, among those read so far.
     """
 
     path: Path
@@ -129,10 +137,10 @@ class Storage:
 
 
 def storage_files(path: Path) -> list[Path]:
-    """The storage files of a bag, in their order: MCAP files, or those of SQLite storage.
+    """The MCAP files of a bag, or the files of its SQLite storage, in their order.
 
     Raises:
-        BagError: there is no bag, or one that cannot be read.
+        BagError: there is no bag, or it cannot be read.
     """
     try:
         mode = path.stat().st_mode
@@ -144,44 +152,70 @@ def storage_files(path: Path) -> list[Path]:
         return [path]
     if not stat.S_ISDIR(mode):
         raise BagError(f"bag {path}: expected a folder or a file")
-    found = part_paths(path) or part_paths(path, SQLITE)
+    found = part_paths(path) or part_paths(path, ".db3")
     if found:
         return found
-    packed = sorted(file.name for file in path.iterdir() if _PACKED.search(file.name))
-    if packed:
+    compressed = sorted(file.name for file in path.iterdir() if _COMPRESSED_FILE.search(file.name))
+    if compressed:
         raise BagError(
-            f"bag {path} holds {packed[0]}, which is compressed as a whole; expected its files unpacked, as "
-            "`zstd -d` does"
+            f"bag {path} holds {compressed[0]}, which is compressed as a whole; expected its files unpacked, "
+            "as `zstd -d` does"
         )
     raise BagError(
         f"bag {path} holds no MCAP file; expected at least one (*.mcap), or SQLite storage (*.db3)"
     )
 
 
-def foreign(beginning: bytes) -> str:
-    """What a file is that is no MCAP file, by its first bytes, and what was expected."""
-    for magic, told in FOREIGN.items():
+def describe_foreign(beginning: bytes) -> str:
+    """What a file is that is not an MCAP file, by its first bytes, and what was expected."""
+    for magic, description in FOREIGN.items():
         if beginning.startswith(magic):
-            return told
+            return description
     return f"starts with {beginning!r}; expected an MCAP file, or SQLite storage"
 
 
 def goes_back_ns(times: Iterable[tuple[object, int]]) -> int:
-    """The most by which a message's log time is earlier than that of the one before it on its topic, ns.
+    """The longest step back in time between consecutive messages of a topic.
 
     Args:
-        times: topic (or channel) and log time of each message, those of a topic in their order.
+        times: topic (or channel) and log time of each message, in order within a topic.
     """
-    most_ns, last_ns = 0, dict[object, int]()
+    max_ns, last_ns = 0, dict[object, int]()
     for topic, time_ns in times:
-        most_ns = max(most_ns, last_ns.get(topic, 0) - time_ns)
+        max_ns = max(max_ns, last_ns.get(topic, 0) - time_ns)
         last_ns[topic] = time_ns
-    return most_ns
+    return max_ns
+
+
+def sorted_within(
+    keyed: Iterable[tuple[_Key, BagMessage]],
+    max_bytes: int,
+    is_due: Callable[[_Key], bool] = lambda key: False,
+) -> Iterator[tuple[_Key, BagMessage]]:
+    """Messages sorted by their keys within a buffer; those of equal keys keep their order.
+
+    Args:
+        keyed: messages with their keys.
+        max_bytes: size of the buffer: a message that is further out of order stays so.
+        is_due: whether no message with a smaller key follows.
+    """
+    waiting: list[tuple[_Key, int, BagMessage]] = []  # key, number
+    waiting_bytes = 0
+    for n, (key, message) in enumerate(keyed):
+        heapq.heappush(waiting, (key, n, message))
+        waiting_bytes += len(message.data) + MESSAGE_BYTES
+        while waiting and (waiting_bytes > max_bytes or is_due(waiting[0][0])):
+            first_key, _, first = heapq.heappop(waiting)
+            waiting_bytes -= len(first.data) + MESSAGE_BYTES
+            yield first_key, first
+    while waiting:
+        first_key, _, first = heapq.heappop(waiting)
+        yield first_key, first
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """What goes wrong with a file, in words."""
+def read_errors(path: Path) -> Iterator[None]:
+    """Raises BagError for an OSError in the block."""
     try:
         yield
     except OSError as error:
@@ -189,11 +223,11 @@ def reading(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def damage(path: Path, help: str = f"; {RECOVER} brings back what is whole") -> Iterator[None]:
-    """What goes wrong inside the libraries, in words; nothing of ours is to be called in it."""
+def damage_errors(path: Path, help: str = f"; {RECOVER} recovers the intact rest") -> Iterator[None]:
+    """Raises BagDamagedError for errors of libraries; the block may not call code of this package."""
     try:
-        with reading(path):
+        with read_errors(path):
             yield
-    except _DAMAGE as error:
-        told = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BagDamagedError(f"{path} is damaged: {told}{help}") from None
+    except _DAMAGE_ERRORS as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BagDamagedError(f"{path} is damaged: {reason}{help}") from None

@@ -1,4 +1,4 @@
-"""Messages that are there, and cannot be decoded: how many, of which topics, and what was wrong with them."""
+"""Counts of messages that cannot be decoded."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -7,23 +7,23 @@ from uav_dc_ros.errors import MessageError
 
 
 class Unreadable(Counter[tuple[str, str]]):
-    """Counts them by topic and reason, see `MessageError.reason`."""
+    """Messages that cannot be decoded, by topic and `MessageError.reason`."""
 
     def __init__(self) -> None:
         super().__init__()
         self._first: dict[tuple[str, str], str] = {}
 
-    def enter(self, topic: str, error: MessageError) -> None:
-        """One more."""
+    def add(self, topic: str, error: MessageError) -> None:
+        """Count a message."""
         kind = topic, error.reason
         self[kind] += 1
         self._first.setdefault(kind, str(error))
 
-    def why(self, topic: str, reason: str) -> str:
-        """What was wrong with the first one of a kind."""
+    def first_error(self, topic: str, reason: str) -> str:
+        """The text of the first error of a kind."""
         return self._first[topic, reason]
 
     def lines(self) -> Iterator[str]:
-        """How many of each kind there are and what was wrong with the first, in words."""
+        """A line for each kind: the count and the first error."""
         for (topic, reason), n in sorted(self.items()):
             yield f"{n:,} messages of {topic} cannot be read: {reason}: {self._first[topic, reason]}"

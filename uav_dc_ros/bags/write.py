@@ -1,49 +1,82 @@
 """Write a rosbag2 folder: MCAP files, and metadata.yaml.
 
-Messages are stored as they came, serialised; nothing is decoded. An MCAP file tells the whole story
-by itself, so a folder whose metadata.yaml was never written loses nothing but convenience.
+Messages are stored serialised, as received. The MCAP files are complete without metadata.yaml.
 
-A bag has one part, `<folder>_0.mcap`, unless it is split, or its writer was killed: who goes on writes the
-next part. Each part after the first begins with the last messages of each latched topic, one for each of its
-publishers, so that it can be understood alone. They have their own publish time, the log time of the part's
-first new message, and the sequence 0; a metadata record counts them.
+A bag has one part, `<folder>_0.mcap`, unless it is split or a killed writer is resumed, which starts the next
+part. Each later part begins with the last messages of each latched topic, one for each of its publishers, so
+that it can be read alone. They keep their publish time, have the log time of the part's first new message and
+the sequence 0, and are counted in a metadata record.
 """
 
 import os
-from collections import deque
-from collections.abc import Iterable, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType, TracebackType
-from typing import Self
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Self
 
-from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
 
 from uav_dc_ros.bags import message_definitions
-from uav_dc_ros.bags.metadata import FILE_NAME, Part, is_latched, to_yaml, total, write_metadata
-from uav_dc_ros.bags.part_writer import FolderLock, part_paths
-from uav_dc_ros.bags.salvage.repair import mend_parts
-from uav_dc_ros.bags.split_writer import PartSeries, Row
-from uav_dc_ros.bags.sync import DiskSync
+from uav_dc_ros.bags.metadata import (
+    ABOUT_RECORD,
+    DROPPED_RECORD,
+    METADATA_FILE,
+    REPEATED_RECORD,
+    Part,
+    is_latched,
+    merged,
+    to_yaml,
+    write_metadata,
+)
+from uav_dc_ros.bags.part_writer import CHUNK_BYTES, FolderLock, PartWriter, part_number, part_paths
+from uav_dc_ros.bags.salvage.repair import repair_parts
 from uav_dc_ros.errors import BagError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Qos
+
+MIN_CHUNKS_PER_PART = 8  # keeps the size of a part close to the limit
+MIN_CHUNK_BYTES = 1024
+
+
+@dataclass(kw_only=True)
+class _WrittenTopic:
+    """A topic of the bag.
+
+    Attributes:
+        metadata: rosbag2's, of the topic's channels.
+        latest: last messages with their publish times; None unless the topic is latched.
+        sequence: of the last message, counted from 1 over all parts.
+        channel: id in the current part.
+    """
+
+    type: str
+    definition: bytes
+    metadata: Mapping[str, str]
+    latest: deque[tuple[bytes, int]] | None
+    sequence: int
+    channel: int = 0
 
 
 class BagWriter:
-    """A bag that is being written; a context manager that closes it.
+    """Writes a bag; a context manager that closes it.
 
     Args:
-        folder: the bag's folder; must not exist, unless its writing is resumed.
-        about: what the bag is about, stored inside as text by key. What earlier parts say of a key stays.
-        resume: go on with a bag whose writer was killed: its parts are mended, and a new one is begun.
-        compression: of its chunks: one of `compression.COMPRESSIONS`.
-        split_bytes: size of a part's file after which the next one is begun; 0: never. A part is larger by
-            no more than a chunk, one message and its index.
-        split_s: log time after which the next part is begun, seconds; 0: never.
+        folder: the bag's folder; must not exist, unless writing is resumed.
+        about: description of the bag, text by key. Values of earlier parts stay.
+        resume: continue a bag whose writer was killed: its parts are repaired, and a new one begins.
+        compression: of the chunks: one of `bags.COMPRESSIONS`.
+        split_bytes: size of a part's file at which the next part begins; 0: never. A part exceeds it by at
+            most a chunk, one message and the index.
+        split_s: log time after which the next part begins; 0: never.
 
     Raises:
         BagError: the folder exists, or cannot be made. When resuming: there is no such folder, the bag was
-            closed (so it is finished, and no bag is ever overwritten), it is still being written, or it
-            cannot be mended.
+            closed, is still being written, or cannot be repaired.
     """
 
     def __init__(
@@ -57,7 +90,15 @@ class BagWriter:
         split_s: float = 0.0,
     ) -> None:
         self.folder = folder
-        self._disk = DiskSync()
+        self._about = dict(about)
+        self._compression = compression
+        self._split_bytes, self._split_ns = split_bytes, round(split_s * 1e9)
+        chunk_bytes = max(split_bytes // MIN_CHUNKS_PER_PART, MIN_CHUNK_BYTES)
+        self._chunk_bytes = min(CHUNK_BYTES, chunk_bytes) if split_bytes else CHUNK_BYTES
+        self._topics: dict[str, _WrittenTopic] = {}
+        self._dropped_before: Counter[str] = Counter()  # in parts that this writer finished
+        self._sync_thread = ThreadPoolExecutor(1, thread_name_prefix="fsync")
+        self._last_sync: Future[None] | None = None
         if not resume:
             if folder.exists():
                 raise BagError(f"bag folder {folder} exists already; expected a new one")
@@ -67,78 +108,75 @@ class BagWriter:
                 raise BagError(f"bag folder {folder} cannot be made: {error.strerror}") from None
         self._lock = FolderLock(folder)
         try:
-            earlier = _earlier_parts(folder) if resume else []
-            self._resumed = total(earlier)
-            try:
-                self._parts = PartSeries(
-                    folder,
-                    about,
-                    earlier,
-                    compression=compression,
-                    split_bytes=split_bytes,
-                    split_ns=round(split_s * 1e9),
-                )
-            except OSError as error:
-                raise BagError(f"bag {folder} cannot be written: {error.strerror}") from None
+            self._finished = _earlier_parts(folder) if resume else []
+            self._resumed = merged(self._finished)
+            self._begin_part()
+        except OSError as error:
+            self._lock.release()
+            raise BagError(f"bag {folder} cannot be written: {error.strerror}") from None
         except BaseException:
             self._lock.release()
             raise
 
     @property
     def message_count(self) -> int:
-        """Messages in the bag so far, those of earlier parts and repeated ones included."""
-        return sum(part.message_count for part in self._parts.all)
+        """Messages in the bag so far, with those of earlier parts and repeated ones."""
+        return sum(part.message_count for part in self._parts)
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed, or given up."""
-        return self._parts.current.closed
+        """Whether the bag was closed, or abandoned after an error."""
+        return self._writer.closed
 
     @property
     def topics(self) -> list[str]:
-        """Topics that were added, by full name."""
-        return list(self._parts.rows)
+        """Full names of the topics that were added."""
+        return list(self._topics)
 
     @property
     def part_count(self) -> int:
         """Parts of the bag so far."""
-        return len(self._parts.all)
+        return len(self._parts)
 
     @property
     def already_written(self) -> Mapping[str, int]:
-        """Latest publish time of each topic that a killed writer's parts hold, nanoseconds since the epoch.
+        """Latest publish time by topic in the parts of a killed writer.
 
-        Latched topics come again to who subscribes again: what is not newer than this is in the bag.
+        A new subscription receives latched messages again; those that are not newer are in the bag.
         """
         return MappingProxyType(self._resumed.published_ns)
+
+    @property
+    def _parts(self) -> list[Part]:
+        return [*self._finished, self._writer.part]
 
     def add_topic(
         self,
         name: str,
         type: str,
-        offered_qos: Iterable[Qos] = (),
+        offered_qos: "Iterable[Qos]" = (),
         *,
         definition: bytes = b"",
         type_hash: str = "",
     ) -> None:
-        """Announce a topic, once, before its first message.
+        """Add a topic, once, before its first message.
 
-        A topic of which earlier parts hold messages keeps the QoS that they tell: metadata.yaml has one
-        QoS for a topic, and rosbags reads no message whose channel tells another.
+        A topic with messages in earlier parts keeps their QoS: metadata.yaml has one QoS for a topic, and
+        rosbags skips channels with another one.
 
         Args:
             name: full name, with its namespace.
             type: ROS 2 message type, such as `std_msgs/msg/String`.
             offered_qos: QoS that the topic's publishers offer.
-            definition: of a type that ROS 2 itself does not have, with all types inside it, as `ros2msg`.
+            definition: of a type that ROS 2 does not have, with all types inside it, as `ros2msg`.
             type_hash: of such a type (REP-2011).
 
         Raises:
-            BagError: ROS 2 has no such type, the topic has another one in earlier parts, or the disk is full.
+            BagError: ROS 2 has no such type, earlier parts have another one, or the disk is full.
         """
         qos = dump_qos_v9(list(offered_qos))
-        if name in self._resumed.topics:
-            earlier = self._resumed.topics[name]
+        earlier = self._resumed.topics.get(name)
+        if earlier is not None:
             if earlier["type"] != type:
                 raise BagError(
                     f"topic {name} is of type {type}; expected {earlier['type']}, as in earlier parts"
@@ -146,27 +184,29 @@ class BagWriter:
             if self._resumed.counts[name]:
                 qos = earlier["offered_qos_profiles"]
         if not definition:
-            definition = _definition(name, type)
-            type_hash = message_definitions.TYPESTORE.hash_rihs01(type)
-        row = Row(
+            try:
+                definition = message_definitions.definition(type)
+            except BagError as error:
+                raise BagError(f"topic {name} is of type {error}") from None
+            type_hash = message_definitions.typestore().hash_rihs01(type)
+        topic = _WrittenTopic(
             type=type,
             definition=definition,
-            channel={"offered_qos_profiles": to_yaml(qos), "topic_type_hash": type_hash},
+            metadata={"offered_qos_profiles": to_yaml(qos), "topic_type_hash": type_hash},
             latest=deque(maxlen=len(qos)) if is_latched({"offered_qos_profiles": qos}) else None,
             sequence=self._resumed.counts.get(name, 0) - self._resumed.repeated.get(name, 0),
         )
-        if row.latest is not None and name in self._resumed.latest:
-            row.latest.append(self._resumed.latest[name])
-        try:
-            self._parts.add(name, row)
-        except OSError as error:  # a definition may be what fills the chunk
-            raise self._failure(error) from None
+        if topic.latest is not None and name in self._resumed.latest:
+            topic.latest.append(self._resumed.latest[name])
+        with self._abandoned_on_error():  # a definition can fill the chunk
+            self._add_channel(name, topic)
+        self._topics[name] = topic
 
     def keep_latched(self, topic: str, n: int) -> None:
-        """Repeat at least the last `n` messages of a latched topic in the next part: one a publisher."""
-        row = self._parts.rows[topic]
-        if row.latest is not None and n > (row.latest.maxlen or 0):
-            row.latest = deque(row.latest, maxlen=n)
+        """Repeat at least the last `n` messages of a latched topic in the next part: one for each publisher."""
+        written = self._topics[topic]
+        if written.latest is not None and n > (written.latest.maxlen or 0):
+            written.latest = deque(written.latest, maxlen=n)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:
         """Append a message.
@@ -174,107 +214,195 @@ class BagWriter:
         Args:
             topic: full name of a topic that was added.
             data: the message, serialised (CDR).
-            log_time_ns: when it was received, nanoseconds since the epoch.
-            publish_time_ns: when it was published.
+            log_time_ns: receive time, nanoseconds since the epoch.
+            publish_time_ns: publish time.
 
         Raises:
-            BagError: the disk is full, or gone.
+            BagError: the disk is full or gone.
         """
-        try:
-            self._parts.write(topic, data, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
-        except OSError as error:
-            raise self._failure(error) from None
+        written = self._topics[topic]
+        with self._abandoned_on_error():
+            if self._begun_ns is None:
+                self._begun_ns = log_time_ns
+            elif self._is_full(self._begun_ns, log_time_ns, len(data)):
+                self._split()
+                self._begun_ns = log_time_ns
+            if self._to_repeat:
+                self._repeat_latched(log_time_ns)
+            written.sequence += 1
+            self._writer.add_message(
+                written.channel,
+                data,
+                log_time_ns=log_time_ns,
+                publish_time_ns=publish_time_ns,
+                sequence=written.sequence,
+            )
+        if written.latest is not None:
+            written.latest.append((data, publish_time_ns))
 
-    def tell(self, about: Mapping[str, str]) -> None:
-        """Add to what the bag is about.
+    def add_about(self, about: Mapping[str, str]) -> None:
+        """Add to the description of the bag.
 
         Raises:
-            BagError: the disk is full, or gone.
+            BagError: the disk is full or gone.
         """
-        try:
-            self._parts.tell(about)
-        except OSError as error:
-            raise self._failure(error) from None
+        self._about |= about
+        with self._abandoned_on_error():
+            self._writer.add_metadata(ABOUT_RECORD, about)
 
-    def tell_dropped(self, dropped: Mapping[str, int]) -> None:
-        """Note how many messages of each topic were lost by now, since this writer began.
+    def set_dropped(self, dropped: Mapping[str, int]) -> None:
+        """Record how many messages of each topic were lost since this writer began.
 
         Raises:
-            BagError: the disk is full, or gone.
+            BagError: the disk is full or gone.
         """
-        try:
-            self._parts.tell_dropped(dropped)
-        except OSError as error:
-            raise self._failure(error) from None
+        recorded = self._writer.part.dropped
+        in_part = {topic: n - self._dropped_before[topic] for topic, n in dropped.items()}
+        changes = {topic: str(n) for topic, n in in_part.items() if n != (recorded or {}).get(topic, 0)}
+        if changes or recorded is None:
+            with self._abandoned_on_error():
+                self._writer.add_metadata(DROPPED_RECORD, changes)
 
     def sync(self) -> None:
-        """Hand over all that was written: to the operating system now, and to the disk soon, by a thread.
+        """Write everything to the operating system, and start a sync to disk in a thread.
 
-        What a kill can take is then what came since the last call; what a power cut can take, what came since
-        the last one but one, if the disk keeps up.
+        A kill then loses only what follows this call; a power cut, what follows the call before it, if the
+        disk keeps up: no sync starts while another one runs.
 
         Raises:
-            BagError: the disk is full, or gone.
+            BagError: the disk is full or gone.
         """
-        try:
-            self._parts.current.flush()
-            if self._disk.is_free:
-                folder = os.open(self.folder, os.O_RDONLY)  # the names of new parts, too
-                self._disk.begin([self._parts.current.descriptor(), folder])
-        except OSError as error:
-            raise self._failure(error) from None
+        with self._abandoned_on_error():
+            self._writer.flush()
+            if self._last_sync is None or self._last_sync.done():
+                self._finish_sync()
+                folder = os.open(self.folder, os.O_RDONLY)  # for the names of new parts
+                descriptors = (self._writer.descriptor(), folder)
+                self._last_sync = self._sync_thread.submit(_fsync_and_close, descriptors)
 
     def close(self) -> None:
-        """Finish the part and write metadata.yaml over all parts. Closing twice does nothing.
+        """Finish the part and write metadata.yaml over all parts; a second call does nothing.
 
         Raises:
-            BagError: the disk is full, or gone.
+            BagError: the disk is full or gone.
         """
         if self.closed:
             return
         try:
-            self._disk.wait()
-            self._parts.current.finish()
-            write_metadata(self.folder, self._parts.all)
-        except OSError as error:
-            raise self._failure(error) from None
+            with self._abandoned_on_error():
+                self._finish_sync()
+                self._writer.finish()
+                write_metadata(self.folder, self._parts)
         finally:
-            self._disk.close()
+            self._sync_thread.shutdown()
             self._lock.release()
 
-    def _failure(self, error: OSError) -> BagError:
-        """Give the file up as it is: what was written until now stays."""
-        self._parts.current.abandon()
-        self._disk.close()
-        self._lock.release()
-        return BagError(
-            f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no index, "
-            "and holds what was written until now"
-        )
-
     def __enter__(self) -> Self:
-        """Use the writer in a `with` statement."""
+        """The writer."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the bag, also when the block failed: what was recorded stays readable."""
+    def __exit__(self, *_: object) -> None:
+        """Close the bag, also after an error: its messages stay readable."""
         self.close()
+
+    def _finish_sync(self) -> None:
+        """Wait for the last sync; OSError if it failed."""
+        if self._last_sync is not None:
+            self._last_sync.result()
+
+    def _begin_part(self) -> None:
+        number = max((part_number(part.name) for part in self._finished), default=-1) + 1
+        self._begun_ns: int | None = None  # log time of the part's first message
+        self._unchecked_bytes = 0  # written since the file's size was checked
+        self._schemas: dict[str, int] = {}  # ids by type
+        self._to_repeat: list[str] = []  # topics whose last messages are not repeated yet
+        self._writer = PartWriter(
+            self.folder / f"{self.folder.name}_{number}.mcap",
+            compression=self._compression,
+            chunk_bytes=self._chunk_bytes,
+        )
+        self._writer.add_metadata(ABOUT_RECORD, self._about)
+
+    def _add_channel(self, name: str, topic: _WrittenTopic) -> None:
+        if topic.type not in self._schemas:
+            self._schemas[topic.type] = self._writer.add_schema(
+                topic.type, message_definitions.ENCODING, topic.definition
+            )
+        topic.channel = self._writer.add_channel(name, "cdr", self._schemas[topic.type], topic.metadata)
+        if topic.latest:
+            self._to_repeat.append(name)
+
+    def _is_full(self, begun_ns: int, log_time_ns: int, n_bytes: int) -> bool:
+        """Whether the part is at a limit before a message of `n_bytes`."""
+        if self._split_ns and log_time_ns - begun_ns >= self._split_ns:
+            return True
+        if not self._split_bytes:
+            return False
+        self._unchecked_bytes += n_bytes
+        if self._unchecked_bytes < self._chunk_bytes:  # the file has not grown by more than that
+            return False
+        self._unchecked_bytes = 0
+        return self._writer.size >= self._split_bytes
+
+    def _split(self) -> None:
+        """Finish the part, and begin the next one with the same topics."""
+        dropped = self._writer.part.dropped
+        self._writer.finish()
+        self._finished.append(self._writer.part)
+        self._dropped_before.update(dropped or {})
+        self._begin_part()
+        if dropped is not None:
+            self._writer.add_metadata(DROPPED_RECORD, {})
+        for name, topic in self._topics.items():
+            self._add_channel(name, topic)
+
+    def _repeat_latched(self, log_time_ns: int) -> None:
+        """Write the last messages of latched topics at the head of the part."""
+        repeated = {name: self._topics[name] for name in self._to_repeat}
+        self._to_repeat.clear()
+        counts = {name: str(len(topic.latest or ())) for name, topic in repeated.items()}
+        self._writer.add_metadata(REPEATED_RECORD, counts)
+        for topic in repeated.values():
+            for data, publish_time_ns in topic.latest or ():
+                self._writer.add_message(
+                    topic.channel,
+                    data,
+                    log_time_ns=log_time_ns,
+                    publish_time_ns=publish_time_ns,
+                    sequence=0,
+                )
+
+    @contextmanager
+    def _abandoned_on_error(self) -> Iterator[None]:
+        """Abandon the bag when the disk fails: what was written stays."""
+        try:
+            yield
+        except OSError as error:
+            self._writer.abandon()
+            self._sync_thread.shutdown()
+            self._lock.release()
+            raise BagError(
+                f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no "
+                "index, and holds what was written so far"
+            ) from None
 
 
 def _earlier_parts(folder: Path) -> list[Part]:
-    """The parts of a bag whose writer was killed, mended. None, if it was killed before it began one."""
-    if (folder / FILE_NAME).exists():
-        raise BagError(f"bag {folder} was closed: it has a {FILE_NAME}; expected one whose writer was killed")
+    """The repaired parts of a bag whose writer was killed; none if it was killed before the first one."""
+    if (folder / METADATA_FILE).exists():
+        raise BagError(
+            f"bag {folder} was closed: it has a {METADATA_FILE}; expected one whose writer was killed"
+        )
     if not part_paths(folder) and any(folder.iterdir()):
-        raise BagError(f"folder {folder} holds files, but no MCAP file; expected a bag to go on with")
-    parts, _ = mend_parts(folder)
+        raise BagError(f"folder {folder} holds files, but no MCAP file; expected a bag to resume")
+    parts, _ = repair_parts(folder)
     return parts
 
 
-def _definition(topic: str, type: str) -> bytes:
+def _fsync_and_close(descriptors: Sequence[int]) -> None:
     try:
-        return message_definitions.definition(type)
-    except BagError as error:
-        raise BagError(f"topic {topic} is of type {error}") from None
+        for descriptor in descriptors:
+            os.fsync(descriptor)
+    finally:
+        for descriptor in descriptors:
+            os.close(descriptor)

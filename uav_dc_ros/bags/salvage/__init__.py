@@ -1,1 +1,1 @@
-"""Reads files of bags that are torn or damaged, and makes whole bags of them."""
+"""Reads torn and damaged files of bags, and makes whole bags of them."""

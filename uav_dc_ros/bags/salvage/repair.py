@@ -1,8 +1,8 @@
-"""Make a whole rosbag2 folder of one whose writer was killed.
+"""Repair the rosbag2 folder of a killed writer, in place.
 
-Each part that lacks its end is copied, as far as it can be read, into a new file beside it, which then takes
-its place; so the disk must have room for one part more. The bag can be mended again whenever mending is
-killed. No part is ever dropped: one that holds nothing becomes an empty part.
+Each part without its end is copied, as far as it can be read, into a new file that replaces it; so the disk
+needs room for one more part. A killed repair can be repeated. No part is dropped: one without contents becomes
+an empty part.
 """
 
 from collections import Counter
@@ -14,101 +14,95 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from uav_dc_ros import files
 from uav_dc_ros.bags import metadata
-from uav_dc_ros.bags.metadata import Part, is_told, total, write_metadata
+from uav_dc_ros.bags.metadata import Part, matches_metadata, merged, write_metadata
 from uav_dc_ros.bags.part_writer import FolderLock, PartWriter, part_paths
 from uav_dc_ros.bags.salvage.scan import Scan, has_end
 from uav_dc_ros.errors import BagError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mended:
-    """What a bag holds after mending, and what was done for it.
+class Repaired:
+    """The contents of a repaired bag.
 
     Attributes:
-        parts: all MCAP files of the bag, by name, in their order.
-        mended: those that were written anew.
-        message_counts: messages by topic, over all parts.
-        last_publish_ns: latest publish time by topic, of topics with messages, nanoseconds since the epoch.
+        parts: file names of all parts, in their order.
+        repaired: those that were rewritten.
+        message_counts: messages by topic.
+        last_publish_ns: latest publish time by topic with messages.
         lost_bytes: bytes at the torn ends that could not be used.
     """
 
     parts: tuple[str, ...]
-    mended: tuple[str, ...]
+    repaired: tuple[str, ...]
     message_counts: Mapping[str, int]
     last_publish_ns: Mapping[str, int]
     lost_bytes: int
 
 
-def mend(folder: Path) -> Mended:
-    """Make a bag whole; one that is whole stays as it is, byte for byte.
-
-    Args:
-        folder: the bag's folder; nobody may be writing it.
+def repair(folder: Path) -> Repaired:
+    """Make the bag of a killed writer whole; a whole one stays as it is, byte for byte.
 
     Raises:
-        BagError: no such folder, no MCAP file in it, a file that is none, damage that is not a torn end, a
-            full disk, or somebody who is writing or mending the bag. Each part is then whole or as it was.
+        BagError: no such folder, no MCAP file in it, a file that is not one, damage that is not a torn end, a
+            full disk, or another process that writes or repairs the bag. Each part is then whole or unchanged.
     """
     with FolderLock(folder):
         if not part_paths(folder):
             raise BagError(f"bag {folder} holds no MCAP file; expected at least one (*.mcap)")
-        parts, mended = mend_parts(folder)
-        if not is_told(folder, parts):
+        parts, repaired = repair_parts(folder)
+        if not matches_metadata(folder, parts):
             write_metadata(folder, parts)
-    return mended
+    return repaired
 
 
-def mend_parts(folder: Path) -> tuple[list[Part], Mended]:
-    """Mend the parts of a bag, but leave metadata.yaml alone; the caller holds the folder's lock.
+def repair_parts(folder: Path) -> tuple[list[Part], Repaired]:
+    """Repair the parts of a bag, but not metadata.yaml; the caller holds the folder's lock.
 
     Raises:
-        BagError: as for `mend`.
+        BagError: as for `repair`.
     """
     parts: list[Part] = []
-    mended: list[str] = []
+    rewritten: list[str] = []
     lost_bytes = 0
     try:
-        for left in folder.glob(".*.partial"):  # by a mending, or a metadata.yaml, that was killed
-            if not left.is_dir():  # by an export into this folder
+        for left in folder.glob(".*.partial"):  # of a killed repair or writer of metadata.yaml
+            if not left.is_dir():  # a folder is of an export
                 left.unlink()
         for path in part_paths(folder):
             with path.open("rb") as file:
                 scan = Scan(path, file)
                 if has_end(file):
-                    _read(scan)
-                    parts.append(scan.part)
+                    parts.append(_read(scan))
                 else:
                     parts.append(_rewrite(scan, path))
-                    mended.append(path.name)
+                    rewritten.append(path.name)
             lost_bytes += scan.lost_bytes
     except OSError as error:
-        raise BagError(
-            f"bag {folder} cannot be mended: {error.strerror}; what it held is still there"
-        ) from None
-    whole = total(parts)
-    return parts, Mended(
+        raise BagError(f"bag {folder} cannot be repaired: {error.strerror}; its contents are kept") from None
+    whole = merged(parts)
+    return parts, Repaired(
         parts=tuple(part.name for part in parts),
-        mended=tuple(mended),
+        repaired=tuple(rewritten),
         message_counts=whole.counts,
         last_publish_ns=whole.published_ns,
         lost_bytes=lost_bytes,
     )
 
 
-def _read(scan: Scan) -> None:
-    """Read a part that has its end, for what it holds."""
+def _read(scan: Scan) -> Part:
+    """The contents of a part with its end."""
     for _ in scan:
         pass
     if scan.lost_bytes:
-        # No kill did this. A copy would throw away what a better tool may still read.
+        # A kill does not cause this. A rewrite would discard what a better tool can still read.
         raise BagError(
             f"{scan.path} has its end, but {scan.lost_bytes} bytes before it are damaged; expected a file "
-            "that lacks nothing but its end"
+            "that lacks only its end"
         )
+    return scan.part
 
 
 def _rewrite(scan: Scan, path: Path) -> Part:
-    """Put what can be read of a part into its place."""
     with files.replacing(path) as partial:
         writer = PartWriter(partial, name=path.name)
         try:
@@ -120,8 +114,8 @@ def _rewrite(scan: Scan, path: Path) -> Part:
 
 
 def copy(scan: Scan, writer: PartWriter) -> None:
-    """Write what can be read of a part into another one; its indexes are made anew."""
-    schemas = {0: 0}  # a channel without a schema stays one
+    """Copy the readable records of a part; the writer makes new indexes."""
+    schemas = {0: 0}  # ids in the copy; 0: a channel without a schema
     channels: dict[int, int] = {}
     topics: dict[int, str] = {}
     repeated: Counter[str] = Counter()
@@ -144,8 +138,8 @@ def copy(scan: Scan, writer: PartWriter) -> None:
                     record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
                 )
                 topics[record.id] = record.topic
-            case Metadata(name="rosbag2") | Metadata(name=metadata.REPEATED_NAME):
-                pass  # counts of a part that was not finished: the copy gets its own
+            case Metadata(name="rosbag2") | Metadata(name=metadata.REPEATED_RECORD):
+                pass  # counts of the unfinished part: the copy has its own
             case Metadata():
                 writer.add_metadata(record.name, record.metadata)
             case Attachment():
@@ -157,4 +151,4 @@ def copy(scan: Scan, writer: PartWriter) -> None:
                     create_time_ns=record.create_time,
                 )
     if repeated:
-        writer.add_metadata(metadata.REPEATED_NAME, {topic: str(n) for topic, n in repeated.items()})
+        writer.add_metadata(metadata.REPEATED_RECORD, {topic: str(n) for topic, n in repeated.items()})

@@ -1,8 +1,8 @@
-"""Read an MCAP file as far as it goes: whole, cut at any byte, or damaged anywhere.
+"""Read an MCAP file as far as possible: whole, cut at any byte, or damaged anywhere.
 
-mcap's StreamReader stops a torn file with EndOfFile, struct.error, ZstdError, UnicodeDecodeError or
-CRCValidationError, as the cut falls, and hands out a message that is cut short as if it were whole. So the
-frames of the records are read here, and only what lies inside a whole frame goes to mcap.
+mcap's StreamReader ends a torn file with EndOfFile, struct.error, ZstdError, UnicodeDecodeError or
+CRCValidationError, and returns a message that is cut short as a whole one. So the record headers are read
+here, and mcap parses only complete records.
 """
 
 import os
@@ -26,32 +26,32 @@ from uav_dc_ros import cdr
 from uav_dc_ros.bags.metadata import Part, is_latched
 from uav_dc_ros.bags.records import (
     CDR,
-    COMPRESSIONS,
+    CHUNK_COMPRESSIONS,
     FOOTER_BYTES,
-    FRAME,
+    HEADER,
     MAGIC,
     MESSAGE,
     TIME_MAX_NS,
-    ChunkHead,
-    Frames,
-    frames,
-    inflate_torn,
+    ChunkHeader,
+    RecordReader,
+    complete_records,
+    decompress_chunk,
+    decompress_payload,
+    decompress_torn,
     parse,
-    plain,
-    unpack,
 )
 from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.errors import BagDamagedError, BagError, MessageError
 from uav_dc_ros.topics import JSON
 
-_END_BYTES = FRAME.size + FOOTER_BYTES + len(MAGIC)
+_END_BYTES = HEADER.size + FOOTER_BYTES + len(MAGIC)
 _FOOTER = struct.Struct("<QQI")  # start of the summary, of its offsets, and CRC
-DAMAGES_MAX = 10_000  # places that are told apart; the last one takes in what follows
-_KEPT = (Schema, Channel, Metadata, Attachment)  # the rest is an index: it is made anew
+DAMAGES_MAX = 10_000  # listed places; the last one includes those after it
+_COPIED = (Schema, Channel, Metadata, Attachment)  # indexes are written anew
 
 
 def has_end(file: IO[bytes]) -> bool:
-    """Whether an MCAP file has a footer and the closing magic; and its summary, if any, is unharmed.
+    """Whether an MCAP file has a footer, the closing magic, and an undamaged summary or none.
 
     Raises:
         OSError: the disk is gone.
@@ -61,295 +61,289 @@ def has_end(file: IO[bytes]) -> bool:
         return False
     file.seek(size - _END_BYTES)
     end = file.read(_END_BYTES)
-    opcode, length = FRAME.unpack_from(end)
-    if end[-len(MAGIC) :] != MAGIC or (opcode, length) != (Opcode.FOOTER, FOOTER_BYTES):
+    if end[-len(MAGIC) :] != MAGIC or HEADER.unpack_from(end) != (Opcode.FOOTER, FOOTER_BYTES):
         return False
-    start, offsets_start, crc = _FOOTER.unpack_from(end, FRAME.size)
-    if start == 0:  # without a summary, which is optional
-        return offsets_start == 0 and crc in (0, zlib.crc32(end[: FRAME.size + 16]))
+    start, offsets_start, crc = _FOOTER.unpack_from(end, HEADER.size)
+    if start == 0:  # no summary
+        return offsets_start == 0 and crc in (0, zlib.crc32(end[: HEADER.size + 16]))
     if not len(MAGIC) <= start < size - _END_BYTES:
         return False
-    if crc == 0:  # MCAP's way to say that there is none
+    if crc == 0:  # no CRC
         return True
     file.seek(start)
-    # The summary is small, some ten bytes for each chunk and topic. Its CRC takes in the footer up to itself.
+    # The summary is small, some ten bytes for each chunk and topic. The CRC includes the footer before it.
     return zlib.crc32(file.read(size - start - len(MAGIC) - 4)) == crc
 
 
 def metadata_records(path: Path, file: IO[bytes]) -> Iterator[Metadata]:
-    """The metadata records of a finished MCAP file, without an index; chunks, which hold none, are skipped.
+    """The metadata records of a finished MCAP file without an index; chunks, which have none, are skipped.
 
     Raises:
-        BagDamagedError: what lies between them is damaged.
+        BagDamagedError: a record is invalid.
         OSError: the disk is gone.
     """
-    looked, at, opcode = Frames(file), len(MAGIC), 0
+    reader, at, opcode = RecordReader(file), len(MAGIC), 0
     while opcode not in (Opcode.DATA_END, Opcode.FOOTER):
-        frame = looked.read(at, FRAME.size)
-        opcode, length = FRAME.unpack(frame) if len(frame) == FRAME.size else (0, 0)
+        opcode, length = reader.header(at)
         if opcode == Opcode.METADATA:
-            record = parse(opcode, looked.read(at + FRAME.size, length))
+            record = parse(opcode, reader.read(at + HEADER.size, length))
             if isinstance(record, Metadata):
                 yield record
             else:
                 opcode = 0
         if opcode == 0:
-            raise BagDamagedError(f"{path} is damaged: what lies at byte {at} is no record")
-        at += FRAME.size + length
+            raise BagDamagedError(f"{path} is damaged: the record at byte {at} is invalid")
+        at += HEADER.size + length
 
 
 @dataclass
 class Damage:
-    """A place in a file that could not be used.
+    """An unusable place in a file.
 
     Attributes:
-        at: where it begins, bytes.
-        n_bytes: its length as it lies in the file.
-        why: what it is.
-        after_ns: log time of the message read last before it, nanoseconds since the epoch; None for none.
-        before_ns: log time of the next message after it.
+        at: its offset, bytes.
+        n_bytes: its length in the file.
+        reason: what is damaged.
+        after_ns, before_ns: log times of the messages around it; None without one.
     """
 
     at: int
     n_bytes: int
-    why: str
+    reason: str
     after_ns: int | None = None
     before_ns: int | None = None
 
 
 class Scan:
-    """Iterates over what can be read of an MCAP file, in one pass, a chunk at a time in memory.
+    """Iterates once over the readable records of an MCAP file, with one chunk at a time in memory.
 
     Yields schemas, channels, messages, metadata records and attachments. Schemas and channels come
     once; a message comes after its channel.
 
-    What cannot be believed is left out: a chunk whose CRC does not hold, with all it has; a record whose
-    length is wrong, up to the next chunk that is whole. Of a chunk that is torn at the end of the file come
-    the first records, as far as its compression gives them.
+    Skipped are a chunk with a wrong CRC, and everything between a record of invalid length and the next
+    valid chunk. A chunk torn at the end of the file yields its first records, as far as it can be
+    decompressed.
 
     Attributes:
-        path: the file's.
-        part: what was read until now.
-        library: what wrote the file, in its own words.
-        lag_ns: how much earlier than one before it a message was until now, nanoseconds.
-        goes_back_ns: how much earlier than the one before it on its topic.
-        damages: what could not be used until now, as it lies in the file.
-        unreadable: messages that are whole, and whose payload is no CDR.
-        compressed: topics of whose messages rosbag2 compressed each by itself; they come decompressed.
-        size: of the file when it was opened, bytes; what is appended later is not read.
-        magic: its first bytes.
+        part: contents read so far.
+        library: name of the software that wrote the file.
+        lag_ns: the longest step back in log time from any earlier message so far.
+        goes_back_ns: the longest step back from the message before on the same topic so far.
+        damages: unusable places so far.
+        unreadable: intact messages whose payload is not CDR.
+        compressed: topics whose messages rosbag2 compressed individually; they are decompressed.
+        size: of the file when it was opened, bytes; bytes appended later are not read.
+        magic: the file's first bytes.
 
     Raises:
-        BagError: the file is no MCAP file, or is compressed in a way that cannot be read here.
+        BagError: not an MCAP file, or an unsupported compression.
         OSError: the disk is gone.
     """
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
+        self.path = path
         self.part = Part(path.name)
         self.damages: list[Damage] = []
         self.unreadable = Unreadable()
         self.compressed: set[str] = set()
-        self.path = path
         self.library = ""
         self.lag_ns = self.goes_back_ns = 0
         self._file = file
-        self._frames = Frames(file)
-        self.size = self._frames.size
-        self.magic = self._frames.read(0, len(MAGIC))
+        self._reader = RecordReader(file)
+        self.size = self._reader.size
+        self.magic = self._reader.read(0, len(MAGIC))
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, str] = {}
-        self._cdr: set[int] = set()  # channels
-        self._times_ns: dict[str, int] = {}  # log time of the last message by topic
+        self._cdr_channels: set[int] = set()
         self._latched: set[str] = set()
+        self._times_ns: dict[str, int] = {}  # log time of the last message by topic
         self._last_ns: int | None = None
         self._chunked = False
-        self._at = 0  # of the record, or chunk, that is being read
+        self._at = 0  # of the current record or chunk
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes that could not be used until now, as they lie in the file."""
+        """Unusable bytes of the file so far."""
         return sum(damage.n_bytes for damage in self.damages)
 
     @cached_property
     def summary(self) -> Summary | None:
-        """What the end of the file tells; None without an end."""
+        """The file's summary; None without an end."""
         try:
             if not has_end(self._file):
                 return None
-            self._file.seek(-len(MAGIC), os.SEEK_END)  # mcap wants one; that at the start may be damaged
+            self._file.seek(-len(MAGIC), os.SEEK_END)  # mcap checks for a magic; that at the start may be damaged
             return SeekingReader(self._file).get_summary()
-        except Exception:  # of mcap, struct: one without a CRC, and damaged
+        except Exception:  # of mcap, struct: a damaged summary without a CRC
             return None
 
     def __iter__(self) -> Iterator[McapRecord]:
-        """Start at the beginning of the file; once."""
-        size = self.size
-        if not self._starts():
+        """Scan the file from its beginning; once."""
+        if not self._check_magic():
             return
-        at = len(MAGIC)
+        size, at = self.size, len(MAGIC)
         while at < size:
             self._at = at
-            record = self._frames.record(at)
-            # No writer puts messages beside chunks: it would be an index whose opcode is damaged.
+            record = self._reader.record(at)
+            # No writer mixes chunks with messages outside of them: it is an index with a damaged opcode.
             if record is not None and not (self._chunked and record[0] == Opcode.MESSAGE):
                 opcode, content, at = record
                 if opcode == Opcode.FOOTER:
-                    self._lose(at + len(MAGIC), size - at - len(MAGIC), "bytes after the file's end")
+                    self._add_damage(at + len(MAGIC), size - at - len(MAGIC), "bytes after the file's end")
                     return
                 yield from self._record(opcode, content)
                 continue
-            chunk = self._frames.chunk(at)
-            if chunk is not None:
-                self._chunked = True
-                head, at = chunk
-                yield from self._chunk(head, at)
+            chunk = self._reader.chunk(at)
+            if chunk is None:
+                following = self._next(at + 1)
+                torn_end = following == size and self.summary is None
+                self._add_damage(at, following - at, "torn at the end" if torn_end else "damaged")
+                at = following
                 continue
-            torn = self._frames.torn_chunk(at)
-            if torn is not None:
-                yield from self._torn(torn)
+            header, at = chunk
+            if at > size:
+                yield from self._torn_chunk(header)
                 return
-            following = self._resume(at + 1)
-            torn_end = following == size and self.summary is None
-            self._lose(at, following - at, "torn at the end" if torn_end else "damaged")
-            at = following
+            self._chunked = True
+            yield from self._chunk(header, at)
 
     def is_mcap(self) -> bool:
-        """Whether it is an MCAP file: by its magic, torn or not, or by the header behind a damaged one."""
+        """Whether it is an MCAP file: by its magic, torn or not, or by the header after a damaged one."""
         if MAGIC.startswith(self.magic):
             return True
-        record = self._frames.record(len(MAGIC))
+        record = self._reader.record(len(MAGIC))
         return record is not None and record[0] == Opcode.HEADER
 
-    def _starts(self) -> bool:
-        """Whether the file goes on after its magic."""
+    def _check_magic(self) -> bool:
+        """Whether records can follow the magic."""
         if self.magic == MAGIC:
             return True
         if not self.is_mcap():
-            raise BagError(
-                f"{self.path} starts with {self.magic!r}; expected {MAGIC!r}, as an MCAP file does"
-            )
+            raise BagError(f"{self.path} starts with {self.magic!r}; expected {MAGIC!r} of an MCAP file")
         torn = MAGIC.startswith(self.magic)
-        self._lose(0, len(self.magic), "torn at the end" if torn else "damaged")
+        self._add_damage(0, len(self.magic), "torn at the end" if torn else "damaged")
         return not torn
 
     @cached_property
-    def _known(self) -> list[int]:
-        """Where records begin that the end of the file tells of."""
+    def _indexed_offsets(self) -> list[int]:
+        """Offsets of records by the summary."""
         if self.summary is None:
             return []
-        known = [index.chunk_start_offset for index in self.summary.chunk_indexes]
-        known += [index.offset for index in self.summary.metadata_indexes]
-        known += [index.offset for index in self.summary.attachment_indexes]
-        return sorted(known)
+        return sorted(
+            [index.chunk_start_offset for index in self.summary.chunk_indexes]
+            + [index.offset for index in self.summary.metadata_indexes]
+            + [index.offset for index in self.summary.attachment_indexes]
+        )
 
-    def _resume(self, at: int) -> int:
-        """Where reading goes on after damage; the end of the file, if nowhere."""
-        number = bisect_left(self._known, at)
-        if number < len(self._known):
-            return self._known[number]
+    def _next(self, at: int) -> int:
+        """Offset of the next valid record after damage; the end of the file without one."""
+        number = bisect_left(self._indexed_offsets, at)
+        if number < len(self._indexed_offsets):
+            return self._indexed_offsets[number]
         found = None
-        if self._channels and not self._chunked:  # messages inside of a damaged chunk are not to be believed
-            found = self._frames.next_message(at, self._channels)
+        if self._channels and not self._chunked:  # bytes of a damaged chunk can look like messages
+            found = self._reader.next_message(at, self._channels)
         if found is None:
-            found = self._frames.next_chunk(at)
+            found = self._reader.next_chunk(at)
         return self.size if found is None else found
 
-    def _chunk(self, head: ChunkHead, end: int) -> Iterator[McapRecord]:
+    def _chunk(self, header: ChunkHeader, end: int) -> Iterator[McapRecord]:
         try:
-            data = unpack(head, self._frames.read(end - head.data_bytes, head.data_bytes))
+            data = decompress_chunk(header, self._reader.read(end - header.data_bytes, header.data_bytes))
         except UnsupportedCompressionError as error:
-            # Left out, its messages would be gone once the file is written anew.
-            raise BagError(f"{self.path}: {error}; expected one of {COMPRESSIONS} at hand") from None
+            # A copy of the file without this chunk would lose its messages.
+            raise BagError(f"{self.path}: {error}; expected one of {CHUNK_COMPRESSIONS}") from None
         if data is None:
-            self._lose(self._at, end - self._at, "a chunk whose content is damaged")
+            self._add_damage(self._at, end - self._at, "a chunk whose content is damaged")
             return
-        rest = yield from self._inside(data)
-        if rest:
-            self._lose(self._at, rest, "records that are none in a chunk")
+        rest = yield from self._content(data)
+        self._add_damage(self._at, rest, "invalid records in a chunk")
 
-    def _torn(self, head: ChunkHead) -> Iterator[McapRecord]:
-        """The first records of the chunk at the end of the file; no CRC can tell of them."""
+    def _torn_chunk(self, header: ChunkHeader) -> Iterator[McapRecord]:
+        """The first records of the chunk at the end of the file, which no CRC can check."""
         at, end = self._at, self.size
-        data_at = at + FRAME.size + head.data_at
-        data = inflate_torn(head.compression, self._frames.read(data_at, end - data_at))[: head.size]
+        data_at = at + HEADER.size + header.data_at
+        data = decompress_torn(header.compression, self._reader.read(data_at, end - data_at))[: header.size]
         before = self.part.message_count
-        rest = yield from self._inside(data)
+        rest = yield from self._content(data)
         kept = self.part.message_count - before
-        # Which compressed bytes the lost records were in, nobody can tell.
-        n_bytes = end - at if head.compression else rest
-        told = f"; messages of it that are whole: {kept}" if kept else ""
-        if n_bytes:
-            self._lose(end - n_bytes, n_bytes, f"a chunk torn at the end{told}")
+        # The compressed bytes of the lost records are unknown.
+        n_bytes = end - at if header.compression else rest
+        reason = "a chunk torn at the end" + (f"; messages of it that are whole: {kept}" if kept else "")
+        self._add_damage(end - n_bytes, n_bytes, reason)
 
-    def _inside(self, data: bytes) -> Generator[McapRecord, None, int]:
-        """Records of a chunk. Returns how many bytes at its end are none."""
+    def _content(self, data: bytes) -> Generator[McapRecord, None, int]:
+        """Records of a chunk. Returns the number of bytes after the last complete one."""
         rest = len(data)
-        for opcode, content in frames(BytesIO(data), rest):
-            rest -= FRAME.size + len(content)
+        for opcode, content in complete_records(BytesIO(data), rest):
+            rest -= HEADER.size + len(content)
             yield from self._record(opcode, content)
         return rest
 
     def _record(self, opcode: int, content: bytes) -> Iterator[McapRecord]:
-        """A record outside of chunks, or inside of one; none if it is of no use for a copy."""
+        """A record inside or outside of chunks, if a copy needs it."""
         if opcode == Opcode.MESSAGE and len(content) >= MESSAGE.size:
-            channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(content)
-            if channel not in self._channels:
-                yield from self._announced(channel)
-            if channel not in self._channels:
-                self._lose(self._at, FRAME.size + len(content), "messages of a topic that is lost")
-                return
-            topic = self._channels[channel]
-            log_time_ns, publish_time_ns = min(log_time_ns, TIME_MAX_NS), min(publish_time_ns, TIME_MAX_NS)
-            self.part.count(topic, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
-            self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
-            self.goes_back_ns = max(self.goes_back_ns, self._times_ns.get(topic, 0) - log_time_ns)
-            self._last_ns = self._times_ns[topic] = log_time_ns
-            for damage in reversed(self.damages):
-                if damage.before_ns is not None:
-                    break
-                damage.before_ns = log_time_ns
-            data = content[MESSAGE.size :]
-            if channel in self._cdr:
-                payload, data = data, plain(data)
-                if data is not payload:
-                    self.compressed.add(topic)
-                self._check(topic, data)
-            if topic in self._latched:
-                self.part.latest[topic] = data, publish_time_ns
-            yield Message(channel, log_time_ns, data, publish_time_ns, sequence)
+            yield from self._message(content)
             return
         if opcode in (Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX):
             return
         record = parse(opcode, content)
         if isinstance(record, Header):
             self.library = record.library
-        if isinstance(record, _KEPT) and self._is_new(record):
+        if isinstance(record, _COPIED) and self._is_new(record):
             yield record
         elif record is None and opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE):
-            self._lose(self._at, FRAME.size + len(content), "a record that is none")
+            self._add_damage(self._at, HEADER.size + len(content), "an invalid record")
 
-    def _check(self, topic: str, data: bytes) -> None:
-        """Look whether a payload is CDR, as far as that can be told without its type; of a text, whole."""
+    def _message(self, content: bytes) -> Iterator[McapRecord]:
+        """A message, after its schema and channel if only the summary still has them."""
+        channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(content)
+        if channel not in self._channels:
+            yield from self._from_summary(channel)
+        if channel not in self._channels:
+            self._add_damage(self._at, HEADER.size + len(content), "messages of a topic that is lost")
+            return
+        topic = self._channels[channel]
+        log_time_ns, publish_time_ns = min(log_time_ns, TIME_MAX_NS), min(publish_time_ns, TIME_MAX_NS)
+        self.part.add_message(topic, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+        self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
+        self.goes_back_ns = max(self.goes_back_ns, self._times_ns.get(topic, 0) - log_time_ns)
+        self._last_ns = self._times_ns[topic] = log_time_ns
+        for damage in reversed(self.damages):
+            if damage.before_ns is not None:
+                break
+            damage.before_ns = log_time_ns
+        data = content[MESSAGE.size :]
+        if channel in self._cdr_channels:
+            payload, data = data, decompress_payload(data)
+            if data is not payload:
+                self.compressed.add(topic)
+            self._check_payload(topic, data)
+        if topic in self._latched:
+            self.part.latest[topic] = data, publish_time_ns
+        yield Message(channel, log_time_ns, data, publish_time_ns, sequence)
+
+    def _check_payload(self, topic: str, data: bytes) -> None:
+        """Count a payload that is not CDR: a string is checked completely, other types by the encapsulation."""
         try:
             if self.part.topics[topic]["type"] == JSON:
                 cdr.decode_string(data)
             else:
                 cdr.byte_order(data)
         except MessageError as error:
-            self.unreadable.enter(topic, error)
+            self.unreadable.add(topic, error)
 
-    def _announced(self, channel_id: int) -> Iterator[McapRecord]:
-        """A channel, with its schema, as the summary repeats them: the chunk that had them is damaged."""
+    def _from_summary(self, channel_id: int) -> Iterator[McapRecord]:
+        """A channel and its schema whose chunk is damaged, repeated in the summary."""
         channel = self.summary.channels.get(channel_id) if self.summary is not None else None
         if channel is None or self.summary is None:
             return
-        schema = self.summary.schemas.get(channel.schema_id)
-        for record in (schema, channel):
+        for record in (self.summary.schemas.get(channel.schema_id), channel):
             if record is not None and self._is_new(record):
                 yield record
 
     def _is_new(self, record: McapRecord) -> bool:
-        """Enter a record; False for a schema or channel that the summary repeats."""
+        """Add a record; False for a repeated schema or channel."""
         if isinstance(record, Schema):
             if record.id in self._schemas:
                 return False
@@ -359,24 +353,24 @@ class Scan:
                 return False
             self._channels[record.id] = record.topic
             if record.message_encoding == CDR:
-                self._cdr.add(record.id)
+                self._cdr_channels.add(record.id)
             type = self._schemas[record.schema_id]
-            self.part.announce(record.topic, type, record.message_encoding, record.metadata)
+            self.part.add_topic(record.topic, type, record.message_encoding, record.metadata)
             if is_latched(self.part.topics[record.topic]):
                 self._latched.add(record.topic)
         elif isinstance(record, Metadata):
-            self.part.learn(record.name, record.metadata)
+            self.part.add_metadata(record.name, record.metadata)
         return True
 
-    def _lose(self, at: int, n_bytes: int, why: str) -> None:
-        """Enter bytes that could not be used; those that follow each other are one place."""
+    def _add_damage(self, at: int, n_bytes: int, reason: str) -> None:
+        """Add unusable bytes; consecutive ones are one place."""
         if n_bytes <= 0:
             return
         last = self.damages[-1] if self.damages else None
         if last is not None and (
             len(self.damages) >= DAMAGES_MAX
-            or (last.before_ns is None and (last.at + last.n_bytes == at or last.why == why))
+            or (last.before_ns is None and (last.at + last.n_bytes == at or last.reason == reason))
         ):
             last.n_bytes += n_bytes
             return
-        self.damages.append(Damage(at, n_bytes, why, after_ns=self._last_ns))
+        self.damages.append(Damage(at, n_bytes, reason, after_ns=self._last_ns))
