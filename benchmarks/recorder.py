@@ -26,7 +26,7 @@ from mcap.writer import Writer
 
 from uav_dc_ros import cdr
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.bags.salvage.repair import mend
+from uav_dc_ros.bags.salvage.repair import repair
 
 SECONDS = 3.0  # that a rate is held
 SETTLE_S = 1.0
@@ -159,7 +159,7 @@ def recorded(folder: Path, size: int, rate_hz: float) -> tuple[bool, bool]:
     recorder.send_signal(signal.SIGKILL)
     recorder.wait()
     publisher.communicate()
-    mend(bag)
+    repair(bag)
     with BagReader(bag) as reader:
         there = reader.message_count
     for path in bag.iterdir():

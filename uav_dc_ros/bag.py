@@ -18,7 +18,10 @@ VERBS = {
     "play": ("uav_dc_ros.nodes.play.bag_play", "publish a bag's messages again, with their timing and QoS"),
     "info": ("uav_dc_ros.recordings.info.command", "show what a bag holds, and whether it is complete"),
     "recover": ("uav_dc_ros.bags.salvage.recover", "make a whole bag of what a killed recorder left"),
-    "verify": ("uav_dc_ros.recordings.verify.command", "recompute everything that a bag holds of its missions"),
+    "verify": (
+        "uav_dc_ros.recordings.verify.command",
+        "recompute everything that a bag holds of its missions",
+    ),
     "report": ("uav_dc_ros.recordings.report", "write a page about missions, or compare several bags"),
     "export": (
         "uav_dc_ros.recordings.export.command",

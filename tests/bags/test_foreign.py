@@ -19,7 +19,7 @@ from tests.support.bags import QOS, STRING, bare, in_bag, text
 from uav_dc_ros import bag as command
 from uav_dc_ros.bags import mcap_storage, message_definitions
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.bags.salvage.recover import recover, told
+from uav_dc_ros.bags.salvage.recover import recover, report
 from uav_dc_ros.errors import BagDamagedError, BagError
 from uav_dc_ros.recordings.info.survey import survey
 
@@ -152,7 +152,7 @@ def test_messages_that_are_compressed_one_by_one_are_read_and_named(
 
 def test_payloads_that_cannot_be_decoded_are_told_when_they_are_recovered(tmp_path: Path) -> None:
     path = by_message(tmp_path / "one.mcap", damaged=5)
-    lines = told(recover(path, tmp_path / "out"))
+    lines = report(recover(path, tmp_path / "out"))
     assert (
         "  1 messages of /b cannot be read: encapsulation: a zstd frame that is damaged; "
         "expected CDR (0x0000 or 0x0001)" in lines
@@ -165,7 +165,7 @@ def test_payloads_that_cannot_be_decoded_are_told_when_they_are_recovered(tmp_pa
         text("hello")[:-2]: "malformed: 4 bytes of text; expected 6, its length field",
     }.items():
         path = rows(tmp_path / f"{expected[:25]}.mcap", *(("/a", data, i, STRING) for i in range(3)))
-        lines = told(recover(path, tmp_path / f"out {path.stem}"))
+        lines = report(recover(path, tmp_path / f"out {path.stem}"))
         assert any(f"3 messages of /a cannot be read: {expected}" in line for line in lines), lines
 
 
@@ -201,7 +201,7 @@ def test_what_a_killed_recorder_left_in_a_write_ahead_log_is_read(tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ("UPDATE messages SET data = 3", "a message of /a is none"),
+        ("UPDATE messages SET data = 3", "a message of /a has data or a time of the wrong type"),
         ("UPDATE messages SET timestamp = 'noon'", "is damaged"),
         ("DROP TABLE messages", "is damaged: no such table: messages"),
     ],
@@ -281,8 +281,8 @@ def test_what_may_not_be_read_is_named() -> None:
 def test_a_definition_with_the_line_ends_of_windows_is_the_same() -> None:
     for type in (STRING, "geometry_msgs/msg/PoseStamped"):
         text_of_it = message_definitions.definition(type)
-        assert message_definitions.is_defined_so(type, "ros2msg", text_of_it.replace(b"\n", b"\r\n"))
-    assert not message_definitions.is_defined_so(STRING, "ros2msg", b"int8 data\r\n")
+        assert message_definitions.matches_jazzy(type, "ros2msg", text_of_it.replace(b"\n", b"\r\n"))
+    assert not message_definitions.matches_jazzy(STRING, "ros2msg", b"int8 data\r\n")
 
 
 def test_mistakes_of_ours_are_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,7 +291,7 @@ def test_mistakes_of_ours_are_no_damage(tmp_path: Path, monkeypatch: pytest.Monk
     def mistaken(*_: object) -> bytes:
         raise TypeError("a mistake")
 
-    monkeypatch.setattr(mcap_storage, "plain", mistaken)
+    monkeypatch.setattr(mcap_storage, "decompress_payload", mistaken)
     with pytest.raises(TypeError, match="a mistake"):
         messages(path)
 

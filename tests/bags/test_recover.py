@@ -32,7 +32,7 @@ from tests.support.bags import (
 )
 from uav_dc_ros import bag as command
 from uav_dc_ros.bags import part_writer
-from uav_dc_ros.bags.salvage.recover import Recovered, recover, told
+from uav_dc_ros.bags.salvage.recover import Recovered, recover, report
 from uav_dc_ros.errors import BagError
 
 Message = tuple[str, int, int, int, bytes]
@@ -214,7 +214,7 @@ def test_a_flipped_bit_costs_its_chunk_at_most_and_never_lies(
             assert missing == sorted(messages[first : first + of_chunk[number]]) or (
                 number == 0 and not finished
             )
-            assert one.damages or one.why, f"bit {bit} of byte {at}"
+            assert one.damages or one.reason, f"bit {bit} of byte {at}"
             if finished and one.expected is not None:
                 assert one.lost_messages == len(missing)
             for damage in one.damages:
@@ -264,7 +264,7 @@ def test_topics_of_a_lost_first_chunk_come_from_the_end(tmp_path: Path) -> None:
     assert recovered.parts[0].lost_messages == len(messages_in(chunk))
     assert recovered.whole.message_count == 30 - len(messages_in(chunk))
     assert recovered.whole.topics["/a"]["type"] == STRING
-    assert f"{end - start:,} bytes at byte {start}, before" in "\n".join(told(recovered))
+    assert f"{end - start:,} bytes at byte {start}, before" in "\n".join(report(recovered))
 
 
 def test_a_killed_recorder(tmp_path: Path) -> None:
@@ -286,7 +286,7 @@ def test_parts_qos_and_records_are_kept(tmp_path: Path) -> None:
     kinds = {"compression": CompressionType.LZ4, "chunked": True}
     files = [mcap_file(n=5, **kinds), b"", b"SQLite format 3", mcap_file(n=30, finished=False, **kinds)[:-7]]
     recovered = recover(folder_of(tmp_path / "bag", files), tmp_path / "out")
-    lines = told(recovered)
+    lines = report(recovered)
     assert lines[2] == "bag_1.mcap: nothing was recovered: an empty file"
     assert lines[3].startswith("bag_2.mcap: nothing was recovered: no MCAP file: it is SQLite storage")
     info = information(tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Mending: what a killed writer left becomes a whole bag, at whatever byte its file ends."""
+"""Repair: the files of a killed writer become a whole bag, at whatever byte its file ends."""
 
 import contextlib
 import io
@@ -35,8 +35,8 @@ from tests.support.bags import (
 )
 from uav_dc_ros.bags import part_writer
 from uav_dc_ros.bags.part_writer import CHUNK_BYTES
-from uav_dc_ros.bags.salvage import repair as mending
-from uav_dc_ros.bags.salvage.repair import Mended, mend
+from uav_dc_ros.bags.salvage import repair as salvage_repair
+from uav_dc_ros.bags.salvage.repair import Repaired, repair
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
 
@@ -101,7 +101,7 @@ def in_memory() -> Iterator[Path]:
 def test_a_file_cut_at_any_byte_keeps_all_that_is_there_in_full(
     in_memory: Path, quick: None, kind: str, each: int
 ) -> None:
-    """All cuts of a file, or some, are the parts of one bag, mended in one go; each is then read."""
+    """All cuts of a file, or some, are the parts of one bag, repaired in one go; each is then read."""
     tmp_path = in_memory
     file = made(kind, n=12, qos="")  # short
     (tmp_path / "whole.mcap").write_bytes(file)
@@ -111,24 +111,24 @@ def test_a_file_cut_at_any_byte_keeps_all_that_is_there_in_full(
     assert len(set(ends)) >= 4  # several chunks, or messages that lie open to see
     cuts = [*range(0, len(file), each), len(file)]
     bag = folder_of(tmp_path / "bag", *(file[:cut] for cut in cuts))
-    mended = mend(bag)
-    assert len(mended.parts) == len(cuts)
-    assert mended.mended == mended.parts[:-1]  # all but the last, which is not cut
+    repaired = repair(bag)
+    assert len(repaired.parts) == len(cuts)
+    assert repaired.repaired == repaired.parts[:-1]  # all but the last, which is not cut
     total = 0
-    for cut, name in zip(cuts, mended.parts, strict=True):
+    for cut, name in zip(cuts, repaired.parts, strict=True):
         expected = messages[: sum(end <= cut for end in ends)]
         assert in_mcap(bag / name) == expected, f"cut at {cut} of {len(file)}"
         total += len(expected)
-    assert sum(mended.message_counts.values()) == total == information(bag)["message_count"]
-    assert (bag / mended.parts[-1]).read_bytes() == file
+    assert sum(repaired.message_counts.values()) == total == information(bag)["message_count"]
+    assert (bag / repaired.parts[-1]).read_bytes() == file
 
 
 @pytest.mark.parametrize("cut", [None, -40])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_mended_part_says_what_the_torn_one_said(tmp_path: Path, kind: str, cut: int | None) -> None:
+def test_a_repaired_part_has_the_records_of_the_torn_one(tmp_path: Path, kind: str, cut: int | None) -> None:
     """Schemas, channels with their metadata, and metadata records; once, though a summary repeats them."""
     bag = folder_of(tmp_path / "bag", made(kind, finished=cut is not None)[:cut])
-    mend(bag)
+    repair(bag)
     with (bag / "bag_0.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         records = {record.name: record.metadata for record in reader.iter_metadata()}
@@ -150,16 +150,16 @@ def test_a_part_tells_its_counts_once(tmp_path: Path) -> None:
         writer.add_topic("/a", STRING)
         writer.write("/a", text("x"), log_time_ns=1, publish_time_ns=1)
     torn = folder_of(tmp_path / "torn", content(tmp_path / "bag")["bag_0.mcap"][:-1])
-    mend(torn)
+    repair(torn)
     with (torn / "torn_0.mcap").open("rb") as file:
         records = [record for record in make_reader(file).iter_metadata() if record.name == "rosbag2"]
     [told] = [YAML(typ="safe").load(record.metadata["serialized_metadata"]) for record in records]
     assert (told["relative_file_paths"], told["message_count"]) == (["torn_0.mcap"], 1)
 
 
-def test_metadata_yaml_of_a_mended_bag(tmp_path: Path) -> None:
+def test_metadata_yaml_of_a_repaired_bag(tmp_path: Path) -> None:
     bag = folder_of(tmp_path / "bag", made("without chunks", finished=False), made("zstd", n=4))
-    mended = mend(bag)
+    repaired = repair(bag)
     info = information(bag)
     topics = {
         row["topic_metadata"]["name"]: (row["topic_metadata"], row["message_count"])
@@ -173,9 +173,9 @@ def test_metadata_yaml_of_a_mended_bag(tmp_path: Path) -> None:
     assert [(f["path"], f["message_count"]) for f in info["files"]] == [("bag_0.mcap", 30), ("bag_1.mcap", 4)]
     assert [f["duration"]["nanoseconds"] for f in info["files"]] == [29, 3]
     assert (info["starting_time"]["nanoseconds_since_epoch"], info["duration"]["nanoseconds"]) == (1000, 29)
-    assert mended == Mended(
+    assert repaired == Repaired(
         parts=("bag_0.mcap", "bag_1.mcap"),
-        mended=("bag_0.mcap",),
+        repaired=("bag_0.mcap",),
         message_counts={"/a": 17, "/b": 17, "/silent": 0},
         last_publish_ns={"/a": 928, "/b": 929},
         lost_bytes=0,
@@ -191,26 +191,26 @@ def test_a_writer_that_was_killed(tmp_path: Path) -> None:
     with (bag / "bag_0.mcap").open("rb") as file, contextlib.suppress(Exception):
         for record in StreamReader(file).records:
             torn += isinstance(record, Message)
-    mended = mend(bag)
-    assert mended.mended == ("bag_0.mcap",)
-    n = sum(mended.message_counts.values())
+    repaired = repair(bag)
+    assert repaired.repaired == ("bag_0.mcap",)
+    n = sum(repaired.message_counts.values())
     assert n >= torn > 0
     assert (written - n) * 500 <= CHUNK_BYTES
     expected = [text(f"{i:09d}" + 500 * "x") for i in range(n)]
     assert [data for *_, data in in_mcap(bag / "bag_0.mcap")] == expected
     assert [int(data[:9]) for _, _, data in in_bag(bag)] == list(range(n))
-    assert mended.last_publish_ns == {"/a": (n - 1) // 2 * 2, "/b": n // 2 * 2 - 1}
+    assert repaired.last_publish_ns == {"/a": (n - 1) // 2 * 2, "/b": n // 2 * 2 - 1}
 
 
-def test_mending_twice_changes_nothing(tmp_path: Path) -> None:
+def test_repairing_twice_changes_nothing(tmp_path: Path) -> None:
     bag = folder_of(tmp_path / "bag", made("zstd")[:-200], made("zstd"))
-    first = mend(bag)
+    first = repair(bag)
     before = content(bag)
     stamps = {path: path.stat().st_mtime_ns for path in bag.iterdir()}
-    second = mend(bag)
+    second = repair(bag)
     assert content(bag) == before
     assert {path: path.stat().st_mtime_ns for path in bag.iterdir()} == stamps
-    assert (first.mended, second.mended) == (("bag_0.mcap",), ())
+    assert (first.repaired, second.repaired) == (("bag_0.mcap",), ())
     assert (first.lost_bytes > 0, second.lost_bytes) == (True, 0)
     assert first.message_counts == second.message_counts
 
@@ -221,7 +221,7 @@ def test_a_closed_bag_is_left_alone(tmp_path: Path) -> None:
         writer.add_topic("/a", STRING)
         writer.write("/a", text("x"), log_time_ns=1, publish_time_ns=1)
     before = content(bag)
-    assert mend(bag).mended == ()
+    assert repair(bag).repaired == ()
     assert content(bag) == before
 
 
@@ -229,13 +229,13 @@ def test_a_closed_bag_is_left_alone(tmp_path: Path) -> None:
 def test_a_wrong_metadata_yaml_is_written_anew(tmp_path: Path, wrong: str) -> None:
     bag = folder_of(tmp_path / "bag", made("zstd"))
     (bag / "metadata.yaml").write_text(wrong)
-    assert mend(bag).mended == ()
+    assert repair(bag).repaired == ()
     assert len(in_bag(bag)) == 30
 
 
 def test_parts_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     bag = folder_of(tmp_path / "bag", *(made("zstd", n=1) for _ in range(11)))
-    assert mend(bag).parts == tuple(f"bag_{i}.mcap" for i in range(11))
+    assert repair(bag).parts == tuple(f"bag_{i}.mcap" for i in range(11))
     assert information(bag)["relative_file_paths"][-2:] == ["bag_9.mcap", "bag_10.mcap"]
 
 
@@ -243,25 +243,25 @@ def test_hidden_files_are_no_parts(tmp_path: Path) -> None:
     """Such as those that a Mac leaves on a stick."""
     bag = folder_of(tmp_path / "bag", made("zstd"))
     (bag / "._bag_0.mcap").write_bytes(b"Mac OS X")
-    assert mend(bag).parts == ("bag_0.mcap",)
+    assert repair(bag).parts == ("bag_0.mcap",)
     assert (bag / "._bag_0.mcap").exists()
 
 
-def test_what_an_export_into_the_bag_s_folder_left_does_not_keep_it_from_being_mended(tmp_path: Path) -> None:
-    """Killed, it leaves a folder that ends like a mending's file."""
+def test_the_rest_of_an_export_into_the_bag_s_folder_does_not_prevent_a_repair(tmp_path: Path) -> None:
+    """Killed, it leaves a folder with the suffix of a repair's file."""
     bag = folder_of(tmp_path / "bag", made("zstd", finished=False))
     (bag / ".tables.123.partial").mkdir()
-    assert mend(bag).mended
+    assert repair(bag).repaired
     assert (bag / ".tables.123.partial").is_dir()
 
 
 @pytest.mark.parametrize("left", [b"", b"\x89MCA", b"\x89MCAP0\r\n"])
 def test_a_part_without_anything_becomes_an_empty_part(tmp_path: Path, left: bytes) -> None:
     bag = folder_of(tmp_path / "bag", left)
-    assert mend(bag).message_counts == {}
+    assert repair(bag).message_counts == {}
     assert (in_mcap(bag / "bag_0.mcap"), in_bag(bag)) == ([], [])
     two = folder_of(tmp_path / "two", made("zstd"), left)
-    mend(two)
+    repair(two)
     assert [file["message_count"] for file in information(two)["files"]] == [30, 0]
     assert len(in_bag(two)) == 30
 
@@ -269,9 +269,9 @@ def test_a_part_without_anything_becomes_an_empty_part(tmp_path: Path, left: byt
 def test_zeros_that_a_power_cut_left_are_no_records(tmp_path: Path) -> None:
     file = made("zstd", finished=False)
     bag = folder_of(tmp_path / "bag", file + bytes(4096))
-    mended = mend(bag)
-    assert mended.lost_bytes == 4096
-    assert sum(mended.message_counts.values()) == len(in_mcap(bag / "bag_0.mcap")) > 20
+    repaired = repair(bag)
+    assert repaired.lost_bytes == 4096
+    assert sum(repaired.message_counts.values()) == len(in_mcap(bag / "bag_0.mcap")) > 20
 
 
 def test_a_damaged_chunk_costs_itself_alone(tmp_path: Path) -> None:
@@ -280,7 +280,7 @@ def test_a_damaged_chunk_costs_itself_alone(tmp_path: Path) -> None:
     at = file.index(text("message 9"))
     file[at + 8] ^= 1
     bag = folder_of(tmp_path / "bag", bytes(file))
-    mend(bag)
+    repair(bag)
     kept = {log_time for _, _, log_time, *_ in in_mcap(bag / "bag_0.mcap")}
     lost = set(range(1000, max(kept))) - kept
     assert 1009 in lost
@@ -293,7 +293,7 @@ def test_damage_in_a_part_that_has_its_end_is_no_torn_end(tmp_path: Path) -> Non
     file[file.index(text("message 9")) + 8] ^= 1
     bag = folder_of(tmp_path / "bag", bytes(file))
     with pytest.raises(BagError, match=r"bag_0.mcap has its end, but \d+ bytes before it are damaged"):
-        mend(bag)
+        repair(bag)
     assert content(bag) == {"bag_0.mcap": bytes(file)}
 
 
@@ -301,19 +301,19 @@ def test_a_summary_that_was_harmed_is_made_anew(tmp_path: Path) -> None:
     file = bytearray(made("zstd"))
     file[-60] ^= 1
     bag = folder_of(tmp_path / "bag", bytes(file))
-    assert mend(bag).mended == ("bag_0.mcap",)
+    assert repair(bag).repaired == ("bag_0.mcap",)
     assert len(in_mcap(bag / "bag_0.mcap")) == 30
 
 
 def test_mistakes_are_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="No such file or directory; expected the folder of a bag"):
-        mend(tmp_path / "none")
+        repair(tmp_path / "none")
     (tmp_path / "file").write_text("")
     with pytest.raises(BagError, match="Not a directory; expected the folder of a bag"):
-        mend(tmp_path / "file")
+        repair(tmp_path / "file")
     (tmp_path / "empty").mkdir()
     with pytest.raises(BagError, match="holds no MCAP file; expected at least one"):
-        mend(tmp_path / "empty")
+        repair(tmp_path / "empty")
 
 
 @pytest.mark.parametrize("other", [b"SQLite format 3\0", b"PNG", bytes(100)])
@@ -321,7 +321,7 @@ def test_a_file_that_is_no_mcap_file_is_refused_and_kept(tmp_path: Path, other: 
     bag = folder_of(tmp_path / "bag", made("zstd"), other)
     before = content(bag)
     with pytest.raises(BagError, match=r"bag_1.mcap starts with b.*; expected b'.x89MCAP"):
-        mend(bag)
+        repair(bag)
     assert content(bag) == before
 
 
@@ -330,17 +330,17 @@ def test_a_compression_that_cannot_be_read_loses_no_message(tmp_path: Path) -> N
     file = file.replace(b"\x28\xb5\x2f\xfd", b"fast")  # zstd's magic: else its CRC tells that it is zstd
     bag = folder_of(tmp_path / "bag", file)
     with pytest.raises(BagError, match="unsupported compression type fast"):
-        mend(bag)
+        repair(bag)
     assert content(bag) == {"bag_0.mcap": file}
 
 
-def test_a_bag_that_is_being_written_is_not_mended(tmp_path: Path) -> None:
+def test_a_bag_that_is_being_written_is_not_repaired(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag", {}) as writer:
-        with pytest.raises(BagError, match="is being written or mended"):
-            mend(tmp_path / "bag")
+        with pytest.raises(BagError, match="is being written or repaired"):
+            repair(tmp_path / "bag")
         writer.add_topic("/a", STRING)
         writer.write("/a", text("still here"), log_time_ns=1, publish_time_ns=1)
-    mend(tmp_path / "bag")
+    repair(tmp_path / "bag")
     assert in_bag(tmp_path / "bag") == [("/a", 1, "still here")]
 
 
@@ -350,30 +350,30 @@ def test_a_full_disk_costs_nothing(tmp_path: Path) -> None:
     killed_writer(bag, n=3000)
     before = content(bag)
     size = len(before["bag_0.mcap"])
-    mended = subprocess.run(
+    repaired = subprocess.run(
         [sys.executable, "-c", "import sys\nfrom pathlib import Path\n"
-         "from uav_dc_ros.bags.salvage.repair import mend\n"
+         "from uav_dc_ros.bags.salvage.repair import repair\n"
          "from uav_dc_ros.errors import BagError\n"
-         "try: mend(Path(sys.argv[1]))\nexcept BagError as error: print(error)", str(bag)],
+         "try: repair(Path(sys.argv[1]))\nexcept BagError as error: print(error)", str(bag)],
         cwd=ROOT, capture_output=True, text=True, check=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, size // 2)),
     )  # fmt: skip
-    assert mended.stdout == f"bag {bag} cannot be mended: File too large; what it held is still there\n"
+    assert repaired.stdout == f"bag {bag} cannot be repaired: File too large; its contents are kept\n"
     assert content(bag) == before
-    assert mend(bag).mended == ("bag_0.mcap",)
+    assert repair(bag).repaired == ("bag_0.mcap",)
 
 
 @pytest.mark.parametrize("step", ["finish", "add_message", "fsync"])
-def test_a_mending_that_is_killed_can_be_done_again(tmp_path: Path, step: str) -> None:
+def test_a_killed_repair_can_be_repeated(tmp_path: Path, step: str) -> None:
     """Killed while it copies, before it finishes, and before the copy is on the disk."""
     file = made("zstd")[:-100]
     bag = folder_of(tmp_path / "bag", file, file)
     where = "os" if step == "fsync" else "PartWriter"
     killed = subprocess.run(
         [sys.executable, "-c", "import os, signal, sys; from pathlib import Path\n"
-         "from uav_dc_ros.bags.salvage.repair import PartWriter, mend\n"
+         "from uav_dc_ros.bags.salvage.repair import PartWriter, repair\n"
          f"{where}.{step} = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
-         "mend(Path(sys.argv[1]))", str(bag)],
+         "repair(Path(sys.argv[1]))", str(bag)],
         cwd=ROOT, check=False,
     )  # fmt: skip
     assert killed.returncode == -signal.SIGKILL
@@ -382,7 +382,7 @@ def test_a_mending_that_is_killed_can_be_done_again(tmp_path: Path, step: str) -
     assert left.startswith(".bag_0.mcap.")
     assert left.endswith(".partial")
     (bag / ".metadata.yaml.123.partial").write_text("rosbag2_")  # killed at the very end
-    assert mend(bag).mended == ("bag_0.mcap", "bag_1.mcap")
+    assert repair(bag).repaired == ("bag_0.mcap", "bag_1.mcap")
     assert {path.name for path in bag.iterdir()} == {"bag_0.mcap", "bag_1.mcap", "metadata.yaml"}
     assert len(in_bag(bag)) == 60
 
@@ -396,10 +396,10 @@ def test_memory_does_not_grow_with_the_bag(tmp_path: Path, monkeypatch: pytest.M
     torn = content(bag)["bag_0.mcap"][:-1000]
     writer.close()
     again = folder_of(tmp_path / "again", torn)
-    monkeypatch.setattr(mending, "write_metadata", lambda *_: None)
+    monkeypatch.setattr(salvage_repair, "write_metadata", lambda *_: None)
     tracemalloc.start()
     try:
-        mend(again)
+        repair(again)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -12,9 +12,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from tests.support.bags import ROOT, STRING, TYPES, content, in_bag, in_mcap, information, killed_writer, text
-from uav_dc_ros.bags import split_writer
+from uav_dc_ros.bags import write
 from uav_dc_ros.bags.part_writer import FolderLock, PartWriter
-from uav_dc_ros.bags.salvage.repair import mend
+from uav_dc_ros.bags.salvage.repair import repair
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
 
@@ -54,9 +54,9 @@ def test_killed_twice_and_then_closed(tmp_path: Path) -> None:
         shadow.mkdir()
         for name, data in content(bag).items():
             (shadow / name).write_bytes(data)
-        first = max(mend(shadow).last_publish_ns.values()) + 1
+        first = max(repair(shadow).last_publish_ns.values()) + 1
     with BagWriter(bag, {"seed": "3"}, resume=True) as writer:
-        assert dict(writer.already_written) == mend(shadow).last_publish_ns
+        assert dict(writer.already_written) == repair(shadow).last_publish_ns
         assert sorted(writer.already_written.values()) == [first - 2, first - 1]
         assert writer.message_count == first
         for topic in ("/a", "/b"):
@@ -86,13 +86,13 @@ def test_killed_twice_and_then_closed(tmp_path: Path) -> None:
     sequences = [sequence for part in in_parts for topic, sequence, *_ in part if topic == "/a"]
     assert sequences == list(range(1, len(sequences) + 1))
     before = content(bag)
-    assert mend(bag).mended == ()
+    assert repair(bag).repaired == ()
     assert content(bag) == before
 
 
 def test_a_bag_that_was_closed_is_finished(tmp_path: Path) -> None:
     bag = left_by_a_killed_writer(tmp_path / "bag")
-    mend(bag)
+    repair(bag)
     before = content(bag)
     with pytest.raises(BagError, match=r"was closed: it has a metadata.yaml; expected one whose writer was"):
         BagWriter(bag, {}, resume=True)
@@ -100,7 +100,7 @@ def test_a_bag_that_was_closed_is_finished(tmp_path: Path) -> None:
 
 
 def test_a_bag_that_is_being_written_is_not_resumed(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "bag", {}), pytest.raises(BagError, match="is being written or mended"):
+    with BagWriter(tmp_path / "bag", {}), pytest.raises(BagError, match="is being written or repaired"):
         BagWriter(tmp_path / "bag", {}, resume=True)
     assert information(tmp_path / "bag")["relative_file_paths"] == ["bag_0.mcap"]
 
@@ -110,7 +110,7 @@ def test_what_is_no_bag_is_not_resumed(tmp_path: Path) -> None:
         BagWriter(tmp_path / "none", {}, resume=True)
     (tmp_path / "papers").mkdir()
     (tmp_path / "papers" / "note.txt").write_text("mine")
-    with pytest.raises(BagError, match="holds files, but no MCAP file; expected a bag to go on with"):
+    with pytest.raises(BagError, match="holds files, but no MCAP file; expected a bag to resume"):
         BagWriter(tmp_path / "papers", {}, resume=True)
     assert content(tmp_path / "papers") == {"note.txt": b"mine"}
 
@@ -186,7 +186,7 @@ def test_a_full_disk_leaves_the_bag_as_it_was(tmp_path: Path) -> None:
         cwd=ROOT, capture_output=True, text=True, check=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )  # fmt: skip
-    assert "cannot be mended: File too large" in resumed.stdout
+    assert "cannot be repaired: File too large" in resumed.stdout
     assert content(bag) == before
 
 
@@ -201,7 +201,7 @@ def test_a_failure_lets_the_folder_go(tmp_path: Path, monkeypatch: pytest.Monkey
         bag.add_topic("/a", STRING)
         bag.write("/a", text("x"), log_time_ns=1, publish_time_ns=1)
     monkeypatch.undo()
-    monkeypatch.setattr(split_writer, "PartWriter", full)
+    monkeypatch.setattr(write, "PartWriter", full)
     with pytest.raises(BagError, match="cannot be written: No space left"):
         BagWriter(tmp_path / "bag", {}, resume=True)
     monkeypatch.undo()

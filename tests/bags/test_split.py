@@ -13,11 +13,10 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
 from tests.support.bags import QOS, ROOT, STRING, in_bag, in_mcap, information, text
-from uav_dc_ros.bags.compression import COMPRESSIONS
+from uav_dc_ros.bags import COMPRESSIONS
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.bags.salvage.repair import mend
-from uav_dc_ros.bags.split_writer import CHUNKS_OF_A_PART
-from uav_dc_ros.bags.write import BagWriter
+from uav_dc_ros.bags.salvage.repair import repair
+from uav_dc_ros.bags.write import MIN_CHUNKS_PER_PART, BagWriter
 
 S = 10**9
 LIMIT = 64 * 1024
@@ -49,7 +48,7 @@ def test_parts_by_size(tmp_path: Path) -> None:
     assert len(names) > 5
     assert names == [f"bag_{n}.mcap" for n in range(len(names))]
     sizes = [(bag / name).stat().st_size for name in names]
-    chunk = LIMIT // CHUNKS_OF_A_PART
+    chunk = LIMIT // MIN_CHUNKS_PER_PART
     # A chunk that is too many has its index, and the file has its summary, too.
     assert all(LIMIT <= size < LIMIT + 4 * chunk for size in sizes[:-1]), sizes
     assert [len(in_mcap(bag / name)) for name in names] == [file["message_count"] for file in info["files"]]
@@ -119,12 +118,12 @@ def test_dropped_messages_are_told_by_each_part_and_summed_up(tmp_path: Path) ->
     with BagWriter(folder, {}, split_s=1.0) as bag:
         for topic in ("/a", "/b"):
             bag.add_topic(topic, STRING)
-        bag.tell_dropped({})
+        bag.set_dropped({})
         bag.write("/a", text("1"), log_time_ns=0, publish_time_ns=0)
-        bag.tell_dropped({"/a": 3})
+        bag.set_dropped({"/a": 3})
         bag.write("/a", text("2"), log_time_ns=2 * S, publish_time_ns=0)
-        bag.tell_dropped({"/a": 5, "/b": 1})
-        bag.tell_dropped({"/a": 7, "/b": 1})
+        bag.set_dropped({"/a": 5, "/b": 1})
+        bag.set_dropped({"/a": 7, "/b": 1})
     assert information(folder)["custom_data"] == {"dropped": '{"/a": 7, "/b": 1}'}
     for name, dropped in (("bag_0.mcap", {"/a": 3}), ("bag_1.mcap", {"/a": 4, "/b": 1})):
         with BagReader(folder / name) as reader:
@@ -132,7 +131,7 @@ def test_dropped_messages_are_told_by_each_part_and_summed_up(tmp_path: Path) ->
     with BagReader(folder) as reader:
         assert reader.dropped == {"/a": 7, "/b": 1}
     (folder / "metadata.yaml").unlink()
-    mend(folder)
+    repair(folder)
     assert information(folder)["custom_data"] == {"dropped": '{"/a": 7, "/b": 1}'}
 
 
@@ -140,7 +139,7 @@ def test_a_bag_of_which_nothing_was_dropped_says_so_and_one_that_nobody_counted_
     tmp_path: Path,
 ) -> None:
     with BagWriter(tmp_path / "counted", {}) as bag:
-        bag.tell_dropped({})
+        bag.set_dropped({})
     with BagWriter(tmp_path / "not", {}):
         pass
     assert information(tmp_path / "counted")["custom_data"] == {"dropped": "{}"}
@@ -157,7 +156,7 @@ def test_a_split_part_that_is_cut_anywhere_counts_what_it_repeats(tmp_path: Path
         folder.mkdir()
         (folder / "bag_0.mcap").write_bytes((whole / "whole_0.mcap").read_bytes())
         (folder / "bag_1.mcap").write_bytes(last[:cut])
-        mend(folder)
+        repair(folder)
         with BagReader(folder) as reader:
             told = [int(message.data[8:17]) for message in reader.messages()]
             assert told == list(range(len(told)))
@@ -207,7 +206,7 @@ def test_what_was_synced_survives_a_kill(tmp_path: Path) -> None:
     synced = max([synced, *(int(line) for line in process.stdout.read().split())])
     process.stdout.close()
     process.wait()
-    mend(tmp_path / "bag")
+    repair(tmp_path / "bag")
     with BagReader(tmp_path / "bag") as reader:
         told = [int(message.data[8:17]) for message in reader.messages()]
     assert len(reader.parts) > 1

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from uav_dc_ros.bags.metadata import METADATA_NAME
+from uav_dc_ros.bags.metadata import ABOUT_RECORD
 from uav_dc_ros.bags.part_writer import CHUNK_BYTES
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
@@ -54,7 +54,7 @@ def test_mcap_reads_it(tmp_path: Path) -> None:
         ]
         assert read == [(STRING, "ros2msg", "/a", 1000 + i, 900 + i) for i in range(3)]
         about = {record.name: record.metadata for record in reader.iter_metadata()}
-        assert about[METADATA_NAME] == {"seed": "3", "note": "äöü: \n 'quoted'"}
+        assert about[ABOUT_RECORD] == {"seed": "3", "note": "äöü: \n 'quoted'"}
         summary = reader.get_summary()
         assert summary is not None
         assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}

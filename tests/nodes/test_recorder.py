@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 
 from tests.conftest import Ros, finish, wait_for
 from uav_dc_ros.bags.read import BagReader
-from uav_dc_ros.bags.salvage.repair import mend
+from uav_dc_ros.bags.salvage.repair import repair
 
 MIB = 2**20
 
@@ -179,7 +179,7 @@ def test_a_kill_takes_the_last_second_at_most(ros: Ros) -> None:
     recorder.kill()
     finish(recorder)
     said(talker)
-    mend(ros.folder / "bag")
+    repair(ros.folder / "bag")
     with BagReader(ros.folder / "bag") as reader:
         published_ns = [message.publish_time_ns for message in reader.messages(["/a"])]
     assert len(published_ns) > 100

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import cdr, messages, payloads, topics
-from uav_dc_ros.bags.message_definitions import TYPESTORE
+from uav_dc_ros.bags.message_definitions import typestore
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core import world
 from uav_dc_ros.core.grid import ACTION_LABELS
@@ -39,22 +39,22 @@ def states(scenario: Scenario, seed: int, steps: int | None = None) -> Iterator[
 
 def pose(time_ns: int, position_m: Any) -> bytes:
     """A geometry_msgs/PoseStamped in frame map, serialised."""
-    types = TYPESTORE.types
+    types = typestore().types
     x, y, z = map(float, position_m)
     stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
     turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
     place = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x=x, y=y, z=z), turn)
     made = types[topics.POSE](types["std_msgs/msg/Header"](stamp, "map"), place)
-    return bytes(TYPESTORE.serialize_cdr(made, topics.POSE))
+    return bytes(typestore().serialize_cdr(made, topics.POSE))
 
 
 def diagnostics(name: str, level: int, message: str, values: dict[str, str]) -> bytes:
     """A diagnostic_msgs/DiagnosticArray with one status, serialised."""
-    types = TYPESTORE.types
+    types = typestore().types
     pairs = [types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in values.items()]
     status = types["diagnostic_msgs/msg/DiagnosticStatus"](level, name, message, "uav_dc_ros", pairs)
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "")
-    return bytes(TYPESTORE.serialize_cdr(types[topics.DIAGNOSTICS](header, [status]), topics.DIAGNOSTICS))
+    return bytes(typestore().serialize_cdr(types[topics.DIAGNOSTICS](header, [status]), topics.DIAGNOSTICS))
 
 
 def write(

@@ -15,7 +15,7 @@ from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, plain, read
 from tests.support import flights
 from tests.support.bags import bare
 from tests.support.worlds import tiny
-from uav_dc_ros.bags import receive_order
+from uav_dc_ros.bags import receive_order, storage
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core.scenario import Scenario
@@ -134,7 +134,7 @@ def test_the_order_of_receipt() -> None:
 
 
 def test_memory_of_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(receive_order, "WAITING_BYTES", 10 * (receive_order.MESSAGE_BYTES + 100))
+    monkeypatch.setattr(receive_order, "WAITING_BYTES", 10 * (storage.MESSAGE_BYTES + 100))
     taken = 0
 
     def stream():

@@ -100,7 +100,7 @@ def flown(
         log_time_ns=10**18 + 5, publish_time_ns=0,
     )  # fmt: skip
     if dropped is not None:
-        bag.tell_dropped(dropped)
+        bag.set_dropped(dropped)
     if close:
         bag.close()
     return folder

@@ -18,7 +18,7 @@ WAITING_BYTES = 16 * 2**20  # of messages that wait for earlier ones
 
 
 class _Last(NamedTuple):
-    """The last message of a topic: settings of the clock before it, its times, shortest latency since then."""
+    """Of a topic: clock settings before its last message, that message's times, shortest latency since then."""
 
     setting: int
     log_ns: int

@@ -289,7 +289,7 @@ class RecordReader:
         return None
 
     def next_message(self, at: int, channels: Collection[int]) -> int | None:
-        """Offset of the next message outside of chunks: of a known channel, with two valid records after it."""
+        """Offset of the next message outside of chunks, of a known channel and before two valid records."""
         for found in self._matches(_MESSAGE_START, at):
             following = found
             for _ in range(3):

@@ -95,6 +95,8 @@ class BagWriter:
         self._split_bytes, self._split_ns = split_bytes, round(split_s * 1e9)
         chunk_bytes = max(split_bytes // MIN_CHUNKS_PER_PART, MIN_CHUNK_BYTES)
         self._chunk_bytes = min(CHUNK_BYTES, chunk_bytes) if split_bytes else CHUNK_BYTES
+        self._writer: PartWriter
+        self._begun_ns: int | None  # log time of the part's first message
         self._topics: dict[str, _WrittenTopic] = {}
         self._dropped_before: Counter[str] = Counter()  # in parts that this writer finished
         self._sync_thread = ThreadPoolExecutor(1, thread_name_prefix="fsync")
@@ -203,7 +205,7 @@ class BagWriter:
         self._topics[name] = topic
 
     def keep_latched(self, topic: str, n: int) -> None:
-        """Repeat at least the last `n` messages of a latched topic in the next part: one for each publisher."""
+        """Repeat at least the last `n` messages of a latched topic, one of each publisher, in the next part."""
         written = self._topics[topic]
         if written.latest is not None and n > (written.latest.maxlen or 0):
             written.latest = deque(written.latest, maxlen=n)
@@ -312,7 +314,7 @@ class BagWriter:
 
     def _begin_part(self) -> None:
         number = max((part_number(part.name) for part in self._finished), default=-1) + 1
-        self._begun_ns: int | None = None  # log time of the part's first message
+        self._begun_ns = None
         self._unchecked_bytes = 0  # written since the file's size was checked
         self._schemas: dict[str, int] = {}  # ids by type
         self._to_repeat: list[str] = []  # topics whose last messages are not repeated yet

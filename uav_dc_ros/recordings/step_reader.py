@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import cdr, messages, scenarios, topics
-from uav_dc_ros.bags.message_definitions import is_defined_so
+from uav_dc_ros.bags.message_definitions import matches_jazzy
 from uav_dc_ros.bags.read import BagMessage, BagReader, RecordedTopic
 from uav_dc_ros.bags.unreadable import Unreadable
 from uav_dc_ros.core.scenario import Scenario, from_values
@@ -155,7 +155,7 @@ class Steps:
                     continue
                 payload = messages.decode(cdr.decode_string(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
-                self.rejected.enter(topic, error)
+                self.rejected.add(topic, error)
                 continue
             assert isinstance(payload, messages.Stepped), "the topics of steps"
             published = clock, message.publish_time_ns
@@ -302,7 +302,7 @@ def _expect(reader: BagReader, topic: RecordedTopic, type: str) -> None:
             f"bag {reader.path}: topic {topic.name} is of type {topic.type or '(none)'} "
             f"({topic.serialization or 'no encoding'}); expected {type} (cdr)"
         )
-    if not is_defined_so(type, topic.encoding, topic.definition):
+    if not matches_jazzy(type, topic.encoding, topic.definition):
         raise BagError(
             f"bag {reader.path}: topic {topic.name}: its definition of {type} is another one than that of "
             "ROS 2 Jazzy"

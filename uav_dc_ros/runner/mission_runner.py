@@ -271,15 +271,15 @@ class MissionRunner:
         if self.bag is None or not self.bag.is_dir() or (self.bag / "metadata.yaml").is_file():
             return 0
         from uav_dc_ros.bags.salvage.repair import (
-            mend,  # brings what reads bags, for the few that must be mended
+            repair,  # slow to import, and rarely needed
         )
 
         try:
-            mended = mend(self.bag)
+            repaired = repair(self.bag)
         except BagError as error:
             self._error(str(error))
             return 1
-        self.display.note(f"the recorder did not close its bag: {mended}")
+        self.display.note(f"the recorder did not close its bag: {repaired}")
         return 0
 
     def _peers(self) -> list[str]:

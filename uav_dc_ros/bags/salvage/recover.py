@@ -159,9 +159,10 @@ def report(recovered: Recovered) -> list[str]:
     whole = recovered.whole
     start_ns = whole.first_ns or 0
     n_parts = sum(part.part is not None for part in recovered.parts)
+    duration_s = max(0, whole.last_ns - start_ns) / 1e9
     lines = [
-        f"{recovered.folder}: {_count(whole.message_count, 'message')} of {_count(len(whole.topics), 'topic')} "
-        f"in {_count(n_parts, 'part')}, {max(0, whole.last_ns - start_ns) / 1e9:.3f} s"
+        f"{recovered.folder}: {_count(whole.message_count, 'message')} "
+        f"of {_count(len(whole.topics), 'topic')} in {_count(n_parts, 'part')}, {duration_s:.3f} s"
     ]
     for part in recovered.parts:
         if part.part is None:

@@ -1,8 +1,7 @@
 """Repair the rosbag2 folder of a killed writer, in place.
 
-Each part without its end is copied, as far as it can be read, into a new file that replaces it; so the disk
-needs room for one more part. A killed repair can be repeated. No part is dropped: one without contents becomes
-an empty part.
+Each part without its end is copied, as far as it can be read, into a new file that replaces it: the disk needs
+room for one more part. A killed repair can be repeated. A part without contents becomes an empty part.
 """
 
 from collections import Counter
@@ -44,7 +43,7 @@ def repair(folder: Path) -> Repaired:
 
     Raises:
         BagError: no such folder, no MCAP file in it, a file that is not one, damage that is not a torn end, a
-            full disk, or another process that writes or repairs the bag. Each part is then whole or unchanged.
+            full disk, or another process that writes or repairs it. Each part is then whole or unchanged.
     """
     with FolderLock(folder):
         if not part_paths(folder):

@@ -172,7 +172,9 @@ class Scan:
         try:
             if not has_end(self._file):
                 return None
-            self._file.seek(-len(MAGIC), os.SEEK_END)  # mcap checks for a magic; that at the start may be damaged
+            self._file.seek(
+                -len(MAGIC), os.SEEK_END
+            )  # mcap checks for a magic; that at the start may be damaged
             return SeekingReader(self._file).get_summary()
         except Exception:  # of mcap, struct: a damaged summary without a CRC
             return None
@@ -324,7 +326,7 @@ class Scan:
         yield Message(channel, log_time_ns, data, publish_time_ns, sequence)
 
     def _check_payload(self, topic: str, data: bytes) -> None:
-        """Count a payload that is not CDR: a string is checked completely, other types by the encapsulation."""
+        """Count a payload that is not CDR, by its encapsulation; a string is checked completely."""
         try:
             if self.part.topics[topic]["type"] == JSON:
                 cdr.decode_string(data)

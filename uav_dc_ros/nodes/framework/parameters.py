@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from uav_dc_ros.bags.compression import COMPRESSIONS
+from uav_dc_ros.bags import COMPRESSIONS
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.messages import Run

@@ -7,7 +7,7 @@ from pathlib import Path
 import rclpy
 
 from uav_dc_ros import __version__, cli
-from uav_dc_ros.bags.compression import COMPRESSIONS
+from uav_dc_ros.bags import COMPRESSIONS
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework import parameters as p
 from uav_dc_ros.nodes.record.recorder_base import RecorderBase

@@ -66,6 +66,7 @@ class RecorderBase(MissionNode):
     def prepare(self) -> None:
         """Import the bag writer."""
         importlib.import_module("uav_dc_ros.bags.write")
+        importlib.import_module("uav_dc_ros.bags.message_definitions").typestore()
         importlib.import_module("uav_dc_ros.nodes.ros.recorded_qos")
 
     def configure(self) -> None:
@@ -117,11 +118,11 @@ class RecorderBase(MissionNode):
             for name, topic in self._recorded.items():
                 self._undrained[name] = topic.drain(now_ns, deadline_s)
             dropped = self.dropped()
-            self.writer.tell_dropped(dropped)
+            self.writer.set_dropped(dropped)
             for name in self.selected - self._recorded.keys() - self._not_recorded.keys():
                 self._not_recorded[name] = "it has no publisher"
             if self._not_recorded:
-                self.writer.tell({"not_recorded": json.dumps(self._not_recorded, sort_keys=True)})
+                self.writer.add_about({"not_recorded": json.dumps(self._not_recorded, sort_keys=True)})
             if dropped:
                 counts = ", ".join(f"{name} {n}" for name, n in sorted(dropped.items()))
                 self.get_logger().warning(f"dropped messages: {counts}")
@@ -325,7 +326,7 @@ class RecorderBase(MissionNode):
             return [], {}
         dropped = self.dropped()
         if dropped:
-            self.writer.tell_dropped(dropped)
+            self.writer.set_dropped(dropped)
         warnings = ["messages were dropped"] if dropped else []
         values = {"messages": str(self.writer.message_count), "parts": str(self.writer.part_count)}
         values |= {f"{name} dropped": str(n) for name, n in dropped.items()}

@@ -41,7 +41,7 @@ def definition(type: str) -> bytes:
     """
     from uav_dc_ros.bags import message_definitions  # imports rosbags, which few callers need
 
-    if type in message_definitions.TYPESTORE.fielddefs:
+    if type in message_definitions.typestore().fielddefs:
         return message_definitions.definition(type)
     texts: dict[str, str] = {}
     _describe(type, texts)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from uav_dc_ros import topics
-from uav_dc_ros.bags.message_definitions import TYPESTORE
-from uav_dc_ros.bags.metadata import FILE_NAME, LOST, Part, is_told, read_metadata
+from uav_dc_ros.bags.message_definitions import typestore
+from uav_dc_ros.bags.metadata import LOST_BYTES_KEY, METADATA_FILE, Part, matches_metadata, read_metadata
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.records import TIME_MAX_NS
 from uav_dc_ros.bags.storage import Storage
@@ -186,7 +186,7 @@ def _damages(storage: Storage) -> Iterator[str]:
     if not storage.has_end:
         yield f"{storage.path.name} has no end: its recorder was killed, or still writes it"
     for damage in storage.damages[:TOLD_MAX]:
-        yield f"{storage.path.name}: {damage.n_bytes:,} bytes lost at byte {damage.at:,}: {damage.why}"
+        yield f"{storage.path.name}: {damage.n_bytes:,} bytes lost at byte {damage.at:,}: {damage.reason}"
     if len(storage.damages) > TOLD_MAX:
         n_bytes = sum(damage.n_bytes for damage in storage.damages[TOLD_MAX:])
         n_places = len(storage.damages) - TOLD_MAX
@@ -196,8 +196,8 @@ def _damages(storage: Storage) -> Iterator[str]:
 def _metadata_problems(reader: BagReader, told: bool) -> Iterator[str]:
     """A folder's metadata.yaml must tell its parts; `told`: does it say anything of a bag."""
     if not told:
-        there = (reader.path / FILE_NAME).exists()
-        yield f"{FILE_NAME} {'says nothing of a bag' if there else 'is missing'}"
+        there = (reader.path / METADATA_FILE).exists()
+        yield f"{METADATA_FILE} {'says nothing of a bag' if there else 'is missing'}"
         return
     parts = []
     for storage in reader.storages:
@@ -206,8 +206,8 @@ def _metadata_problems(reader: BagReader, told: bool) -> Iterator[str]:
             part.topics[topic.name] = {"offered_qos_profiles": []}
             part.counts[topic.name] = topic.count + storage.repeated.get(topic.name, 0)
         parts.append(part)
-    if not is_told(reader.path, parts):
-        yield f"{FILE_NAME} tells other files, or other numbers of messages, than there are"
+    if not matches_metadata(reader.path, parts):
+        yield f"{METADATA_FILE} tells other files, or other numbers of messages, than there are"
 
 
 def _miscounted(reader: BagReader, found: list[TopicSurvey]) -> Iterator[str]:
@@ -221,8 +221,9 @@ def _miscounted(reader: BagReader, found: list[TopicSurvey]) -> Iterator[str]:
 def _lost(reader: BagReader) -> Iterator[str]:
     """What was lost before the bag was recovered."""
     for storage in reader.storages:
-        if LOST in storage.about:
-            yield f"{storage.path.name} was recovered, without {storage.about[LOST][:40]} bytes of its source"
+        if LOST_BYTES_KEY in storage.about:
+            lost = storage.about[LOST_BYTES_KEY][:40]
+            yield f"{storage.path.name} was recovered, without {lost} bytes of its source"
 
 
 @dataclass
@@ -277,7 +278,7 @@ def _topics(reader: BagReader, dropped: Mapping[str, int]) -> tuple[list[TopicSu
 def _restarts(message: BagMessage) -> Iterator[tuple[str, int]]:
     """Nodes that a diagnostics message tells of, and how often each was started again."""
     try:
-        array: Any = TYPESTORE.deserialize_cdr(message.data, topics.DIAGNOSTICS)
+        array: Any = typestore().deserialize_cdr(message.data, topics.DIAGNOSTICS)
     except Exception:  # of struct, numpy, rosbags: another one's bytes are not ours to judge
         return
     namespace = message.topic.removesuffix("/diagnostics").removeprefix("/")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from uav_dc_ros import topics
-from uav_dc_ros.bags.message_definitions import TYPESTORE
+from uav_dc_ros.bags.message_definitions import typestore
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TEXT_MAX, Phase
 from uav_dc_ros.recordings.mission_totals import UNFINISHED
@@ -126,7 +126,7 @@ class Health:
     def count(self, steps: Steps) -> None:
         """Note what could not be read, or came too late to belong to its step."""
         for (topic, reason), count in steps.rejected.items():
-            why = steps.rejected.why(topic, reason)
+            why = steps.rejected.first_error(topic, reason)
             self._fault(self._reader.first_ns, topic, f"unreadable messages ({reason}): {count}: {why}")
         for topic, count in steps.orphans.items():
             self._fault(self._reader.first_ns, topic, f"messages of steps that were over already: {count}")
@@ -166,7 +166,7 @@ class Health:
 
     def _diagnose(self, message: BagMessage) -> None:
         try:
-            array: Any = TYPESTORE.deserialize_cdr(message.data, topics.DIAGNOSTICS)
+            array: Any = typestore().deserialize_cdr(message.data, topics.DIAGNOSTICS)
             told = [
                 (it.name, Report(it.level, it.message, {pair.key: pair.value for pair in it.values}))
                 for it in array.status
