@@ -18,7 +18,7 @@ WAITING_BYTES = 16 * 2**20  # of messages that wait for earlier ones
 
 
 class _Last(NamedTuple):
-    """Of a topic: clock settings before its last message, that message's times, shortest latency since then."""
+    """A topic's last message: clock settings before it, its times, shortest latency since the last one."""
 
     setting: int
     log_ns: int

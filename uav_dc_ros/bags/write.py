@@ -205,7 +205,7 @@ class BagWriter:
         self._topics[name] = topic
 
     def keep_latched(self, topic: str, n: int) -> None:
-        """Repeat at least the last `n` messages of a latched topic, one of each publisher, in the next part."""
+        """Repeat at least the last `n` messages of a latched topic (one of each publisher) in each part."""
         written = self._topics[topic]
         if written.latest is not None and n > (written.latest.maxlen or 0):
             written.latest = deque(written.latest, maxlen=n)

@@ -1,7 +1,7 @@
 """Repair the rosbag2 folder of a killed writer, in place.
 
-Each part without its end is copied, as far as it can be read, into a new file that replaces it: the disk needs
-room for one more part. A killed repair can be repeated. A part without contents becomes an empty part.
+Each part without its end is copied, as far as it can be read, into a new file that replaces it: the disk
+needs room for one more part. A killed repair can be repeated. A part without contents becomes an empty part.
 """
 
 from collections import Counter
