@@ -1,4 +1,4 @@
-"""Public functions that put several parts together; `uav_dc_ros` re-exports them."""
+"""Public functions that combine several parts; `uav_dc_ros` re-exports them."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,16 +13,15 @@ from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
 def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Missions:
-    """Fly one mission per seed, side by side in numpy, without ROS.
+    """Fly one mission per seed in parallel, in numpy, without ROS.
 
     Args:
-        act: a policy, or a function from the state of the missions (`core.world.State`, `[S, ...]`) to an
-            action for each, integers `[S]`.
-        scenario: the world.
+        act: a policy, or a function from the state of the missions (`core.world.State`, `[S, ...]`) to actions,
+            integers `[S]`.
         seeds: of the users, S of them.
 
     Returns:
-        How the missions went, `[S]` each.
+        Results, `[S]` each.
 
     Raises:
         PolicyError: the policy does not fit the scenario.
@@ -31,15 +30,15 @@ def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_S
 
 
 def read_steps(bag: str | Path, namespace: str | None = None) -> Iterator[RecordedStep]:
-    """The steps of the missions in a bag, in order; a few are in memory at a time.
+    """The steps of the missions in a bag, in order, with bounded memory.
 
     Args:
-        bag: folder of a bag, or a file of one.
+        bag: folder of a bag, or one of its files.
         namespace: of the missions; None: the only one in the bag.
 
     Raises:
-        BagError: the bag cannot be read, or does not hold such missions.
-        ScenarioError: the bag's own scenario cannot be read.
+        BagError: the bag cannot be read, or has no such missions.
+        ScenarioError: the bag's scenario cannot be read.
     """
     with BagReader(Path(bag)) as reader:
         name = step_reader.namespace(reader, namespace)

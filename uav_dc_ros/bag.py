@@ -7,8 +7,7 @@ import importlib
 import sys
 from typing import NoReturn
 
-from uav_dc_ros import __version__, cli
-from uav_dc_ros.errors import ParameterError
+from uav_dc_ros import cli
 
 PROG = "python -m uav_dc_ros.bag"
 DESCRIPTION = "Record, play, recover, verify and explain bags."
@@ -31,31 +30,21 @@ VERBS = {
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run a verb, and exit with its status."""
-    words = sys.argv[1:] if arguments is None else arguments
-    verb = words[0] if words else "--help"
+    """Run the command, and exit."""
+    given = sys.argv[1:] if arguments is None else arguments
+    verb = given[0] if given else "--help"
 
     def command() -> int:
-        if verb == "--version":
-            print(__version__)
-            return 0
-        if verb in ("-h", "--help"):
-            print(_help())
-            return 0
         if verb not in VERBS:
-            raise ParameterError(f"{verb!r}; expected a verb: {', '.join(VERBS)}")
-        module_name, does = VERBS[verb]
-        module = importlib.import_module(module_name)
-        parser = cli.Parser(prog=f"{PROG} {verb}", description=does[0].upper() + does[1:] + ".")
+            return cli.without_verb(verb, VERBS, PROG, DESCRIPTION)
+        name, description = VERBS[verb]
+        module = importlib.import_module(name)
+        sentence = f"{description[0].upper()}{description[1:]}."
+        parser = cli.Parser(prog=f"{PROG} {verb}", description=sentence)
         module.add_options(parser)
-        return int(module.run(parser.parse_args(words[1:])))
+        return int(module.run(parser.parse_args(given[1:])))
 
     cli.run(command, f"{PROG} {verb}" if verb in VERBS else PROG)
-
-
-def _help() -> str:
-    verbs = "\n".join(f"  {verb:<8} {does}" for verb, (_, does) in VERBS.items())
-    return f"usage: {PROG} VERB ...\n\n{DESCRIPTION}\n\n{verbs}\n\n{PROG} VERB --help lists its options."
 
 
 if __name__ == "__main__":

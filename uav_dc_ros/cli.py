@@ -12,11 +12,12 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TextIO, cast
 
-from uav_dc_ros.errors import UavDcError
+from uav_dc_ros import __version__
+from uav_dc_ros.errors import ParameterError, UavDcError
 
 if TYPE_CHECKING:  # rich takes as long to import as the rest of a command line
     from rich.console import Console
@@ -105,6 +106,24 @@ def namespace(text: str) -> str:
             "with '/' between parts"
         )
     return "/" + "/".join(names)
+
+
+def without_verb(word: str, verbs: Mapping[str, tuple[str, str]], prog: str, description: str) -> int:
+    """Print the help or the version of a command with verbs; `verbs` holds a module and a description each.
+
+    Raises:
+        ParameterError: `word` is none of --help, -h and --version.
+    """
+    if word == "--version":
+        print(__version__)
+    elif word in ("-h", "--help"):
+        width = max(map(len, verbs))
+        lines = "\n".join(f"  {verb:<{width}}  {does}" for verb, (_, does) in verbs.items())
+        usage = f"usage: {prog} VERB ..."
+        print(f"{usage}\n\n{description}\n\n{lines}\n\n{prog} VERB --help lists its options.")
+    else:
+        raise ParameterError(f"{word!r}; expected a verb: {', '.join(verbs)}")
+    return 0
 
 
 def on_stop(handler: Callable[..., object]) -> None:

@@ -1,4 +1,4 @@
-"""What a flown mission brought, in numbers."""
+"""The result of a flown mission."""
 
 import msgspec
 
@@ -6,20 +6,19 @@ from uav_dc_ros.messages import Phase
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """One mission, as `--summary` writes it and `fly` returns it.
+    """One mission, as in the file of `--summary` and returned by `fly`.
 
     Attributes:
         scenario, policy: names.
         seed: seed of the mission's users.
         outcome: `landed`, `timeout` or `aborted`.
         steps: steps flown.
-        steps_not_reached: of them, those whose cell a real vehicle did not reach.
-        users_collected, users_total: users.
+        steps_not_reached: flown steps whose cell a real vehicle did not reach.
         data_bits: data collected from all users, bit.
         sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
-        distance_m: length of the path flown, metres.
-        reward: r^t at the end (eq. 7), as `evaluate` and the policies' cards have it.
-        reason: how a real vehicle came to its end, or why a mission was aborted, in words; else empty.
+        distance_m: length of the path, metres.
+        reward: r^t at the end (eq. 7), as in `evaluate` and policy cards.
+        reason: end of a real vehicle's mission, or cause of an abort, in words; else empty.
         bag: folder of the bag, or null.
     """
 

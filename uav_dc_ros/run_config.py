@@ -1,9 +1,10 @@
-"""What a run of missions is made of: the options of run_all, and of `fly` from Python."""
+"""A run of missions: the options of run_all, and of `fly` from Python."""
 
 import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import UnionType
 from typing import Literal
 
 from uav_dc_ros import cli
@@ -12,11 +13,18 @@ from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.topics import SIMULATED, SYSTEM_MAX, VEHICLES
 
 PORT_MAX = 65535
+RANGES = {  # of whole numbers
+    "seed": (0, 2**62 - 1),  # sums of it fit into 64 bits
+    "missions": (1, 2**62 - 1),
+    "system": (1, SYSTEM_MAX),
+    "live": (0, PORT_MAX),
+}
+OPTIONAL = ("policy", "bag", "summary", "system", "live", "compose")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """A run of missions: the options of run_all. What depends on this machine is checked when it flies.
+    """A run of missions: the options of run_all. `MissionRunner` checks what depends on this machine.
 
     Attributes:
         scenario: name of a shipped scenario, or the path of a TOML file.
@@ -24,22 +32,22 @@ class RunConfig:
         seed: seed of the first mission's users; each further mission takes the next one.
         missions: number of missions.
         pace: how many times faster than real time, or `lockstep`: as fast as the nodes can.
-        vehicle: what flies: `simulated`, `mavlink`, `mavros` or `px4`.
+        vehicle: `simulated`, `mavlink`, `mavros` or `px4`.
         connect: address of a vehicle on MAVLink.
         system: its MAVLink system number; None: the only autopilot on the link.
-        arm: does the bridge arm the vehicle and take off?
-        datum: where the grid's corner lies: `here`, `last` or `LAT,LON,ALT`.
-        settings: parameters of nodes by `NODE.PARAMETER`. Text is read as `--set` reads it.
+        arm: whether the bridge arms the vehicle and takes off.
+        datum: position of the grid's corner: `here`, `last` or `LAT,LON,ALT`.
+        settings: parameters of nodes by `NODE.PARAMETER`. Text is parsed as by `--set`.
         bag: folder of the new bag; None: a dated one in `bags/`.
-        record: is a bag written?
+        record: whether a bag is written.
         namespace: ROS namespace of the mission.
         nodes: nodes to start on this host; None: all.
-        compose: do world, channel monitor and policy share a process? None: in lockstep.
-        live: TCP port of the Foxglove server; None: there is none.
-        summary: file for the summary as JSON; None: there is none.
+        compose: whether world, channel monitor and policy share a process; None: in lockstep.
+        live: TCP port of the Foxglove server; None: no server.
+        summary: JSON file for the summary; None: no file.
 
     Raises:
-        ParameterError: a value that no run can have.
+        ParameterError: an invalid value.
     """
 
     scenario: str | Path = "five_clusters"
@@ -62,19 +70,17 @@ class RunConfig:
     summary: str | Path | None = None
 
     def __post_init__(self) -> None:
-        """Check each value by itself."""
+        """Check each value."""
         for name in ("scenario", "policy", "bag", "summary"):
+            self._check_type(name, str | Path, "text or a path")
+        for name in ("arm", "record", "compose"):
+            self._check_type(name, bool, "True or False")
+        for name, (minimum, maximum) in RANGES.items():
             value = getattr(self, name)
-            optional = name != "scenario"
-            if not (isinstance(value, str | Path) or (optional and value is None)):
-                raise ParameterError(f"{name}: {value!r}; expected text or a path")
-        for name, least, most in (
-            ("seed", 0, 2**62 - 1),  # so that sums of it still fit into 64 bits
-            ("missions", 1, 2**62 - 1),
-            ("system", 1, SYSTEM_MAX),
-            ("live", 0, PORT_MAX),
-        ):
-            self._check_whole(name, least, most)
+            expected = f"a whole number from {minimum} to {maximum}"
+            self._check_type(name, int, expected)
+            if value is not None and (isinstance(value, bool) or not minimum <= value <= maximum):
+                raise ParameterError(f"{name}: {value!r}; expected {expected}")
         if self.pace != paces.LOCKSTEP:
             if isinstance(self.pace, bool) or not isinstance(self.pace, int | float):
                 raise ParameterError(f"pace: {self.pace!r}; expected {paces.LOCKSTEP!r} or a number above 0")
@@ -83,44 +89,28 @@ class RunConfig:
             raise ParameterError(
                 f"vehicle: {self.vehicle!r}; expected one of {', '.join((SIMULATED, *VEHICLES))}"
             )
-        for name in ("arm", "record"):
-            self._check_flag(name)
-        if self.compose is not None:
-            self._check_flag("compose")
         if not self.record and self.bag is not None:
             raise ParameterError(f"bag: {str(self.bag)!r}, with record = False; expected one or the other")
         for key in self.settings:
             if not all(str(key).partition(".")):
-                raise ParameterError(f"settings: {key!r}; expected NODE.PARAMETER, such as bridge.then")
-        self._check_namespace()
-        self._check_nodes()
+                raise ParameterError(
+                    f"settings: {key!r}; expected NODE.PARAMETER, such as bridge.failsafe_action"
+                )
+        try:
+            object.__setattr__(self, "namespace", cli.namespace(self.namespace))
+        except argparse.ArgumentTypeError as error:
+            raise ParameterError(f"namespace: {error}") from None
+        if self.nodes is not None:
+            if isinstance(self.nodes, str) or not self.nodes or len(set(self.nodes)) < len(self.nodes):
+                raise ParameterError(f"nodes: {self.nodes!r}; expected names of nodes, each once")
+            object.__setattr__(self, "nodes", tuple(self.nodes))
 
     @property
     def factor(self) -> float | None:
         """How many times faster than real time; None in lockstep."""
         return None if self.pace == paces.LOCKSTEP else float(self.pace)
 
-    def _check_whole(self, name: str, least: int, most: int) -> None:
+    def _check_type(self, name: str, expected_type: type | UnionType, expected: str) -> None:
         value = getattr(self, name)
-        if value is None and name in ("system", "live"):
-            return
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-            raise ParameterError(f"{name}: {value!r}; expected a whole number from {least} to {most}")
-
-    def _check_flag(self, name: str) -> None:
-        if not isinstance(getattr(self, name), bool):
-            raise ParameterError(f"{name}: {getattr(self, name)!r}; expected True or False")
-
-    def _check_namespace(self) -> None:
-        try:
-            object.__setattr__(self, "namespace", cli.namespace(self.namespace))
-        except argparse.ArgumentTypeError as error:
-            raise ParameterError(f"namespace: {error}") from None
-
-    def _check_nodes(self) -> None:
-        names = self.nodes
-        if names is None:
-            return
-        if isinstance(names, str) or not names or len(set(names)) < len(names):
-            raise ParameterError(f"nodes: {names!r}; expected names of nodes, each once")
-        object.__setattr__(self, "nodes", tuple(names))
+        if not isinstance(value, expected_type) and not (value is None and name in OPTIONAL):
+            raise ParameterError(f"{name}: {value!r}; expected {expected}")

@@ -217,7 +217,7 @@ def test_a_killed_policy_makes_the_vehicle_hold_and_a_killed_bridge_takes_the_mi
         assert not autopilot.report()["armed"]
     assert "node policy was killed by SIGKILL" in output
     assert "node bridge was killed by SIGKILL" in output
-    assert output.count("it is started again (1 of 3") == 2
+    assert output.count("it is restarted (1 of 3") == 2
     if kind == "ardupilot":
         assert status == 0, output
         check_steps(ros.folder / "bag")

@@ -70,7 +70,7 @@ def test_a_node_that_is_killed_is_started_again_and_the_vehicle_hovers_meanwhile
     status, output = finish(process)
     assert status == 0, output
     assert f"note: node {node} was killed by SIGKILL" in output
-    assert "it is started again (1 of 3 within 60 s)" in output
+    assert "it is restarted (1 of 3 within 60 s)" in output
     assert "Traceback" not in output
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["steps"] == 30

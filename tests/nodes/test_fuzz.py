@@ -133,7 +133,7 @@ def fly_under_fire(ros: Ros, scenario: Path, policy: Path, per_topic: int, overs
     }
     for name, (_, output) in ended.items():
         assert "Traceback" not in output, f"{name}: {output}"
-        assert "it is started again" not in output
+        assert "it is restarted" not in output
     return told | {"output": {name: output for name, (_, output) in ended.items()}, "bag": bag}
 
 

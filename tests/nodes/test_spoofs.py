@@ -142,7 +142,7 @@ def test_a_lie_ends_no_node_and_no_run_hangs(ros: Ros, truth: dict[str, list[Any
     output += rest
 
     assert "Traceback" not in output
-    assert "it is started again" not in output
+    assert "it is restarted" not in output
     assert status in (0, 1)  # a mission that stands still is given up after a while
     if lie not in HARMFUL:
         assert status == 0, output

@@ -32,7 +32,7 @@ def process() -> Process:
 def turn(process: Process) -> Callable[..., str | None]:
     """A turn of run_all, after the node has reported this."""
     node = SupervisedNode("policy", {})
-    node.begin(process)  # type: ignore[arg-type]
+    node.attach(process)  # type: ignore[arg-type]
 
     def turn(*report: str, may_activate: bool = True) -> str | None:
         if report:
@@ -60,64 +60,64 @@ def test_a_node_goes_up_and_each_transition_is_commanded_once(
     assert process.commands == [b"configure policy\n", b"activate policy\n"]
 
 
-def test_a_node_that_somebody_configured_is_activated(
-    process: Process, turn: Callable[..., str | None]
-) -> None:
+def test_a_node_that_was_configured_is_activated(process: Process, turn: Callable[..., str | None]) -> None:
     turn("inactive")
     assert process.commands == [b"activate policy\n"]
 
 
-@pytest.mark.parametrize(("before", "told"), [("unconfigured", "configured"), ("inactive", "activated")])
-def test_a_refusal_is_told_with_its_reason(turn: Callable[..., str | None], before: str, told: str) -> None:
+@pytest.mark.parametrize(("before", "wanted"), [("unconfigured", "configured"), ("inactive", "activated")])
+def test_a_refusal_is_reported_with_its_reason(
+    turn: Callable[..., str | None], before: str, wanted: str
+) -> None:
     turn(before)
-    with pytest.raises(NodeError, match=f"node policy could not be {told}: no policy 'x'"):
+    with pytest.raises(NodeError, match=f"node policy could not be {wanted}: no policy 'x'"):
         turn(before, "no policy 'x'")
 
 
-def test_a_node_that_somebody_shut_down_is_told(turn: Callable[..., str | None]) -> None:
+def test_a_node_that_was_shut_down_is_reported(turn: Callable[..., str | None]) -> None:
     with pytest.raises(NodeError, match="node policy is finalized; expected some of unconfigured"):
         turn("finalized")
 
 
 class Stopping:
-    """A process that says its last some looks after it was asked to stop, and notes what is done with it."""
+    """A process whose nodes are finalized some polls after SIGTERM, and which logs what is done with it."""
 
-    def __init__(self, name: str, looks: int, told: list[str]) -> None:
-        self.name, self._looks, self._told = name, looks, told
+    def __init__(self, name: str, polls: int, log: list[str]) -> None:
+        self.name, self._polls, self._log = name, polls, log
 
-    def ask_to_stop(self) -> None:
+    def terminate(self) -> None:
         """Note it."""
-        self._told.append(f"{self.name} asked")
+        self._log.append(f"{self.name} terminated")
 
     @property
-    def is_silent(self) -> bool:
-        """After so many looks."""
-        self._looks -= 1
-        if self._looks == 0:
-            self._told.append(f"{self.name} silent")
-        return self._looks <= 0
+    def is_finalized(self) -> bool:
+        """After so many polls."""
+        self._polls -= 1
+        if self._polls == 0:
+            self._log.append(f"{self.name} finalized")
+        return self._polls <= 0
 
     def wait(self, deadline_s: float) -> int:
         """Note it."""
-        self._told.append(f"{self.name} ended")
+        self._log.append(f"{self.name} ended")
         return 0
 
 
-def test_a_rank_is_asked_to_stop_when_the_one_above_is_silent(tmp_path: Path) -> None:
-    told: list[str] = []
+def test_a_rank_is_terminated_when_the_one_above_is_finalized(tmp_path: Path) -> None:
+    log: list[str] = []
     names = ("world", "channel_monitor", "policy", "visualizer", "recorder")
     supervisor = Supervisor(
         "/", {name: {} for name in names}, (), tmp_path, lambda *line: None, lambda note: None
     )
-    container = Stopping("container", 3, told)
-    processes = {"visualizer": Stopping("visualizer", 2, told), "recorder": Stopping("recorder", 1, told)}
+    container = Stopping("container", 3, log)
+    processes = {"visualizer": Stopping("visualizer", 2, log), "recorder": Stopping("recorder", 1, log)}
     for node in supervisor.nodes:
-        node.begin(processes.get(node.row.name, container))  # type: ignore[arg-type]
-    assert supervisor.stop(lambda: told.append("meanwhile")) == dict.fromkeys((*processes, "container"), 0)
-    assert told[:6] == [
-        *("container asked", "container silent", "visualizer asked", "visualizer silent"),
-        *("recorder asked", "recorder silent"),
-    ], "the recorder hears all of it"
-    assert told[6] == "meanwhile"
-    assert sorted(told[7:]) == ["container ended", "recorder ended", "visualizer ended"]
+        node.attach(processes.get(node.row.name, container))  # type: ignore[arg-type]
+    assert supervisor.stop(lambda: log.append("meanwhile")) == dict.fromkeys((*processes, "container"), 0)
+    assert log[:6] == [
+        *("container terminated", "container finalized", "visualizer terminated", "visualizer finalized"),
+        *("recorder terminated", "recorder finalized"),
+    ], "the recorder receives all messages"
+    assert log[6] == "meanwhile"
+    assert sorted(log[7:]) == ["container ended", "recorder ended", "visualizer ended"]
     assert supervisor.stop() == {}

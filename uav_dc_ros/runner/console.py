@@ -1,16 +1,13 @@
-"""What run_all shows: a live line on a terminal, plain lines elsewhere, and the summary."""
+"""The display of run_all: a live line on a terminal, plain lines elsewhere, and the summary."""
 
-import sys
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from rich.console import JustifyMethod
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from uav_dc_ros.cli import Output
+from uav_dc_ros.cli import LiveDisplay
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
@@ -18,82 +15,73 @@ from uav_dc_ros.phases import POLICY_CONTROLLED
 from uav_dc_ros.runner.monitor import MissionProgress
 
 REFRESH_S = 0.05
-PLAIN_LINES = 6  # of progress a mission, where there is no terminal
+PLAIN_LINES = 6  # per mission, without a terminal
 
 
-class MissionConsole:
-    """Shows missions while they are flown; a context manager.
+class MissionConsole(LiveDisplay):
+    """Shows running missions.
 
     Args:
-        scenario: the world that is flown.
-        missions: how many missions will be flown.
-        show: is anything printed?
+        missions: number of missions in the run.
+        show: whether anything is printed.
     """
 
     def __init__(self, scenario: Scenario, missions: int, *, show: bool = True) -> None:
+        super().__init__(
+            TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+        )
         self.scenario = scenario
         self.missions = missions
-        self._here = Path.cwd()  # by the end of the missions it may be deleted
-        self._output = Output()
-        self.console = self._output.console(sys.stdout)
-        self.errors = self._output.console(sys.stderr)
+        self._working_directory = Path.cwd()  # may be deleted during the run
         self.console.quiet = self.errors.quiet = not show
-        self._every = max(1, scenario.mission.max_steps // PLAIN_LINES)
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
-            TextColumn("{task.fields[told]}"),
-            TimeElapsedColumn(),
-            console=self.console,
-            disable=not self.console.is_terminal,
-        )
-        self._next_s = 0.0  # when the next step is shown
-        self._told: Mission | None = None  # what the vehicle did last
-        self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, told="")
+        self._line_steps = max(1, scenario.mission.max_steps // PLAIN_LINES)
+        self._next_s = 0.0  # time of the next refresh
+        self._status: Mission | None = None  # last one shown
+        self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, text="")
 
     def step(self, now: MissionProgress) -> None:
-        """Show a step: on a terminal a few times a second, elsewhere a few lines a mission."""
-        shown = now.step % self._every == 0 if self._bar.disable else time.monotonic() >= self._next_s
-        if not (shown or now.over or now.step == self.scenario.mission.max_steps):
+        """Show a step: on a terminal at `REFRESH_S`, elsewhere a few per mission."""
+        due = now.step % self._line_steps == 0 if self._bar.disable else time.monotonic() >= self._next_s
+        if not (due or now.over or now.step == self.scenario.mission.max_steps):
             return
         self._next_s = time.monotonic() + REFRESH_S
         title = "mission" if self.missions == 1 else f"mission {now.mission + 1} of {self.missions}"
-        told = (
+        text = (
             f"{now.users_collected}/{self.scenario.n_users} users, "
             f"{now.sum_rate_bps / 1e6:.2f} Mbit/s, {now.dock_distance_m:.0f} m to the dock"
         )
         if self._bar.disable:
-            self.console.print(f"{title}: step {now.step}/{self.scenario.mission.max_steps}: {told}")
+            self.console.print(f"{title}: step {now.step}/{self.scenario.mission.max_steps}: {text}")
         else:
-            self._bar.update(self._task, description=title, completed=now.step, told=told)
+            self._bar.update(self._task, description=title, completed=now.step, text=text)
 
     def vehicle(self, status: Mission) -> None:
-        """Tell what a real vehicle does, unless it is a step's daily work: a fault, and its end, is not."""
-        before, told = self._told, (status.state, status.reason)
-        if not status.reason or (before is not None and told == (before.state, before.reason)):
+        """Print a new state or reason of a real vehicle, except the routine of a step without faults."""
+        before = self._status
+        if not status.reason or (before and (status.state, status.reason) == (before.state, before.reason)):
             return
-        self._told = status
-        goes_on = before is not None and before.phase in POLICY_CONTROLLED and not before.held
-        if status.phase in POLICY_CONTROLLED and not status.held and goes_on:
+        self._status = status
+        if _is_routine(status) and before is not None and _is_routine(before):
             return
         self._bar.update(self._task, description=status.phase.value)
         self.console.print(f"{status.state}: {status.reason}", markup=False)
 
     def node_line(self, node: str, line: str) -> None:
-        """Pass on a line that a node printed."""
-        self._bar.console.print(f"{node}: {line}", markup=False)
+        """Print a node's line of output."""
+        self.console.print(f"{node}: {line}", markup=False)
 
     def note(self, text: str) -> None:
-        """Tell what the user should know."""
+        """Print a note."""
         self.console.print(f"note: {text}", markup=False)
 
     def error(self, text: str) -> None:
-        """Tell what went wrong."""
+        """Print an error to standard error."""
         self.errors.print(f"error: {text}", markup=False)
 
     def summary(self, summaries: list[Summary]) -> None:
-        """Show the missions as a table, and where the bag is."""
+        """Print the missions as a table, and the bag's folder; wait until everything is written."""
         table = Table(box=None, pad_edge=False, header_style="bold")
         for name in ("seed", "outcome", "steps", "users", "data", "sum-rate", "flown", "reward"):
             justify: JustifyMethod = "left" if name == "outcome" else "right"
@@ -112,24 +100,12 @@ class MissionConsole:
             )
         self.console.print(table)
         if summaries and summaries[0].bag is not None:
-            self.console.print(f"bag: {self._beside(Path(summaries[0].bag))}", markup=False)
-
-    def _beside(self, path: Path) -> Path:
-        """A path, short where it lies in the working directory."""
-        return path.relative_to(self._here) if path.is_relative_to(self._here) else path
-
-    def __enter__(self) -> Self:
-        """Start the live display."""
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Leave the terminal as it was."""
-        self._bar.stop()
-        self.drain()
-
-    def drain(self) -> None:
-        """Wait until everything is written."""
+            bag = Path(summaries[0].bag)
+            if bag.is_relative_to(self._working_directory):
+                bag = bag.relative_to(self._working_directory)
+            self.console.print(f"bag: {bag}", markup=False)
         self._output.drain()
+
+
+def _is_routine(status: Mission) -> bool:
+    return status.phase in POLICY_CONTROLLED and not status.held

@@ -101,7 +101,7 @@ class MissionRunner:
         self.nodes = run_options.nodes(config)
         # Whoever starts the vehicle draws the run's identity; a run_all on another host adopts it.
         self.run_id = new_run() if ("world" if self.is_simulated else "bridge") in self.nodes else ""
-        self.together = run_options.together(config, self.nodes)
+        self.composed = run_options.composed(config, self.nodes)
         self._settings = run_options.settings(config, self.nodes)
         run_options.check_vehicle(config, self.nodes, self.scenario)
         if config.live is not None:
@@ -111,7 +111,7 @@ class MissionRunner:
         bag = None if config.bag is None else Path(config.bag)
         self.bag = run_options.new_bag(bag) if "recorder" in self.nodes else None
         if config.summary is not None:
-            run_options.check_writable(Path(config.summary), self.bag)
+            run_options.check_summary(Path(config.summary), self.bag)
         self._show, self._display, self._making = show, cast("MissionConsole | None", None), threading.Lock()
         self.summaries: list[Summary] = []
         self.errors: list[str] = []
@@ -144,7 +144,7 @@ class MissionRunner:
             network.node.trigger_configure()
             network.node.trigger_activate()  # it looks for other missions while all else starts
             on_line: Callable[[str, str], None] = lambda node, line: self.display.node_line(node, line)  # noqa: E731
-            supervisor = Supervisor(namespace, parameters, self.together, folder, on_line, self._note)
+            supervisor = Supervisor(namespace, parameters, self.composed, folder, on_line, self._note)
             stack.enter_context(supervisor)
             stack.enter_context(self.display)
             try:
@@ -167,7 +167,6 @@ class MissionRunner:
                 self._account_for_all(network.node)
         status = max(status, self._mend_bag(), int(self._aborted))
         self._tell()
-        self.display.drain()
         return cli.INTERRUPTED if self.interrupted else status
 
     def _observer(self, context: Context) -> MissionMonitor:

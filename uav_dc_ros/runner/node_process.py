@@ -1,8 +1,7 @@
-"""Runs a node of the node table as a process, or several in one.
+"""A process that runs one node of the node table, or several.
 
-Such a process ends when its standard input ends, so none outlives a run_all that was killed. What it prints
-is passed on with its name in front. The thread that runs its callbacks sends reports through a pipe, also
-while there is nothing to do: a process that sends none hangs.
+The process ends with its standard input, so it never outlives run_all. Its output is passed on line by line.
+The executor's thread sends reports through a pipe, also while idle: a process without reports hangs.
 """
 
 import contextlib
@@ -21,28 +20,29 @@ from uav_dc_ros.nodes.framework import process_control
 from uav_dc_ros.nodes.framework.process_control import FINALIZED, REPORTS, SUPERVISED, NodeReport
 from uav_dc_ros.nodes.ros import environment
 
-READ_MAX = 1 << 16  # bytes; no pipe holds more
+READ_BYTES = 1 << 16  # capacity of a pipe
+READER_S = 1.0  # timeout for the last lines of output
 
 
 class NodeProcess:
-    """A process of one node, or of several.
+    """A running process of one node, or of several.
 
     Args:
-        parameters: ROS parameters of its nodes, by name of their rows in the node table.
-        namespace: that they live in; their clock is that of the namespace, too.
-        restarts: how often they were started before.
-        folder: for a file with the parameters.
-        on_line: called, from a thread, with each line that the process prints.
+        parameters: ROS parameters by node name.
+        namespace: of the nodes and their clock.
+        restarts: number of earlier processes of these nodes.
+        folder: for the parameter file.
+        on_line: called from a thread with the name of the process and each line of its output.
 
     Raises:
-        NodeError: the file cannot be written.
+        NodeError: the parameter file cannot be written.
 
     Attributes:
-        name: of the module that it runs.
-        who: it, in words.
-        failure: why it was killed; empty if it was not.
-        reports: the last report of each of its nodes, by name; empty until it has started.
-        silent_s: time since its last report, or its start, seconds.
+        name: of the module.
+        description: of the process, for messages.
+        kill_reason: empty if `kill` was not called.
+        reports: last report by node name; empty until the process has started.
+        silent_s: time since the last report, or the start, seconds.
     """
 
     def __init__(
@@ -54,98 +54,99 @@ class NodeProcess:
         on_line: Callable[[str, str], None],
     ) -> None:
         names = list(parameters)
-        alone = len(names) == 1
-        self.name = names[0] if alone else "container"
-        self.who = f"node {self.name}" if alone else f"the container of {', '.join(names)}"
+        is_single = len(names) == 1
+        self.name = names[0] if is_single else "container"
+        self.description = f"node {self.name}" if is_single else f"the container of {', '.join(names)}"
         file = folder / f"{self.name}.yaml"
         of_nodes = {f"/**/{name}": {"ros__parameters": values} for name, values in parameters.items()}
-        try:  # JSON is YAML: any text arrives as it is
+        try:  # JSON is valid YAML, and keeps any text
             file.write_text(json.dumps(of_nodes, ensure_ascii=False), "utf-8")
         except (OSError, UnicodeEncodeError) as error:
-            raise NodeError(f"parameters of {self.who} cannot be written to {file}: {error}") from None
-        self._pipe, theirs = os.pipe()
+            raise NodeError(
+                f"parameters of {self.description} cannot be written to {file}: {error}"
+            ) from None
+        self._pipe, write_end = os.pipe()
         os.set_blocking(self._pipe, False)
-        own = {SUPERVISED: str(restarts), REPORTS: str(theirs)}
-        if not alone and os.environ.get(environment.LINES) == environment.LINE_OF_NODE:
-            own[environment.LINES] = environment.LINE_OF_ONE_OF_MANY
+        variables = {SUPERVISED: str(restarts), REPORTS: str(write_end)}
+        if not is_single and os.environ.get(environment.LINES) == environment.LINE_OF_NODE:
+            variables[environment.LINES] = environment.LINE_OF_ONE_OF_MANY
         self.process = subprocess.Popen(
             [
-                *(sys.executable, "-m", f"uav_dc_ros.nodes.{self.name}", *([] if alone else names)),
+                *(sys.executable, "-m", f"uav_dc_ros.nodes.{self.name}", *([] if is_single else names)),
                 *("--ros-args", "--params-file", str(file)),
                 *("-r", f"__ns:={namespace}", "-r", "/clock:=clock"),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **own},
-            pass_fds=(theirs,),
-            start_new_session=True,  # Ctrl-C reaches the launcher alone, which stops nodes in order
+            env={**os.environ, **variables},
+            pass_fds=(write_end,),
+            start_new_session=True,  # Ctrl-C reaches run_all only, which stops the nodes in order
         )
-        os.close(theirs)
-        self.failure = ""
+        os.close(write_end)
+        self.kill_reason = ""
         self.silent_s = 0.0
         self.reports: Mapping[str, NodeReport] = {}
-        self._unread = b""  # the beginning of a report
+        self._partial = b""  # start of a report
         self._on_line = on_line
-        self.last_line = ""
+        self._last_line = ""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
         for raw in self.process.stdout:
-            self.last_line = raw.decode(errors="replace").rstrip()
-            self._on_line(self.name, self.last_line)
+            self._last_line = raw.decode(errors="replace").rstrip()
+            self._on_line(self.name, self._last_line)
 
-    def watch(self, passed_s: float) -> None:
-        """Take in reports; `passed_s` seconds have passed since this was done last."""
+    def receive_reports(self, passed_s: float) -> None:
+        """Update `reports` and `silent_s`; `passed_s` is the time since the last call."""
         try:
-            received = os.read(self._pipe, READ_MAX)
+            received = os.read(self._pipe, READ_BYTES)
         except BlockingIOError:
             received = b""
         self.silent_s = 0.0 if received else self.silent_s + passed_s
-        *lines, self._unread = (self._unread + received).split(b"\n")
+        *lines, self._partial = (self._partial + received).split(b"\n")
         if lines:
             self.reports = process_control.decode(lines[-1])
 
     def command(self, transition: str, node: str) -> None:
         """Command a transition of one of its nodes."""
         assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended, which is seen as any other end
+        with contextlib.suppress(BrokenPipeError):  # it has ended: see `has_ended`
             os.write(self.process.stdin.fileno(), process_control.command(transition, node))
 
-    def kill(self, why: str) -> None:
-        """End a process that hangs."""
-        self.failure = why
+    def kill(self, reason: str) -> None:
+        """Kill a process that hangs."""
+        self.kill_reason = reason
         self.process.kill()
 
-    def how_it_ended(self) -> str:
-        """How the process ended, and its last line, in words."""
-        self._reader.join(1.0)
+    def exit_description(self) -> str:
+        """How the process ended, and its last line of output."""
+        self._reader.join(READER_S)
         status = self.process.returncode
         how = f"was killed by {signal.Signals(-status).name}" if status < 0 else f"ended with {status}"
-        how = f"{self.failure}, and {how}" if self.failure else how
-        return f"{how}: {self.last_line or 'it printed nothing'}"
+        how = f"{self.kill_reason}, and {how}" if self.kill_reason else how
+        return f"{how}: {self._last_line or 'it printed nothing'}"
 
     @property
-    def ended(self) -> bool:
-        """Has the process ended."""
+    def has_ended(self) -> bool:
+        """Whether the process has ended."""
         return self.process.poll() is not None
 
     @property
-    def is_silent(self) -> bool:
-        """Have all its nodes said their last, or has the process ended."""
-        self.watch(0.0)
-        states = {report.state for report in self.reports.values()}
-        return states == {FINALIZED} or self.ended
+    def is_finalized(self) -> bool:
+        """Whether none of its nodes publishes any more: all are finalized, or the process has ended."""
+        self.receive_reports(0.0)
+        return {report.state for report in self.reports.values()} == {FINALIZED} or self.has_ended
 
-    def ask_to_stop(self) -> None:
-        """Send SIGTERM: unlike SIGINT it ends a Python that still starts without a traceback."""
-        if not self.ended:
+    def terminate(self) -> None:
+        """Send SIGTERM: unlike SIGINT it ends a starting Python without a traceback."""
+        if not self.has_ended:
             self.process.terminate()
 
     def wait(self, deadline_s: float) -> int:
-        """Wait for the end until `deadline_s` of the monotonic clock, then kill. Returns the status."""
+        """Wait for the end until a deadline of the monotonic clock, then kill; returns the exit status."""
         try:
             status = self.process.wait(max(0.0, deadline_s - time.monotonic()))
         except subprocess.TimeoutExpired:
@@ -155,8 +156,8 @@ class NodeProcess:
         return status
 
     def close(self) -> None:
-        """Let go of the pipes of a process that has ended."""
-        self._reader.join(1.0)
+        """Close the pipes of an ended process."""
+        self._reader.join(READER_S)
         if self._pipe >= 0:
             os.close(self._pipe)
             self._pipe = -1

@@ -1,4 +1,4 @@
-"""Options of run_all that are looked at together, or need this machine: checked before anything starts."""
+"""Checks of run_all's options that depend on one another, or on this machine, before anything starts."""
 
 import contextlib
 import os
@@ -15,106 +15,92 @@ from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
+VEHICLE_OPTIONS = ("connect", "system", "arm", "datum")
 # Parameters that are options of run_all.
-OPTIONS = (
-    "scenario",
-    "policy",
-    "seed",
-    "missions",
-    "pace",
-    "bag",
-    "vehicle",
-    "connect",
-    "system",
-    "arm",
-    "datum",
-)
+OPTIONS = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", *VEHICLE_OPTIONS)
 
 
 def nodes(config: RunConfig) -> list[str]:
-    """Names of the nodes to start here.
+    """Names of the nodes to start on this host.
 
     Raises:
-        ParameterError: a node that does not exist, or contradicts another option.
+        ParameterError: an unknown node, or one that contradicts another option.
     """
     known = [row.name for row in NODES.values() if row.process]
-    wanted = list(config.nodes or ())
+    selected = list(config.nodes or ())
     if config.nodes is None:
-        wanted = [name for name in known if not NODES[name].on_request]
+        selected = [name for name in known if not NODES[name].on_request]
         if config.vehicle != SIMULATED:
-            wanted.append("bridge")
+            selected.append("bridge")
         if not config.record:
-            wanted.remove("recorder")
-    for name in wanted:
+            selected.remove("recorder")
+    for name in selected:
         if name not in known:
             raise ParameterError(f"--nodes: {name!r}; expected some of {', '.join(known)}")
-    if "bridge" in wanted and config.vehicle == SIMULATED:
+    if "bridge" in selected and config.vehicle == SIMULATED:
         raise ParameterError(f"--nodes: 'bridge'; expected it with --vehicle {', '.join(VEHICLES)} only")
-    if config.live is not None and "live_view" not in wanted:
-        wanted = [*wanted, "live_view"]
-    if "recorder" in wanted and not config.record:
+    if config.live is not None:
+        selected.append("live_view")
+    if "recorder" in selected and not config.record:
         raise ParameterError("--nodes: 'recorder', with --no-record; expected one or the other")
-    if "recorder" not in wanted and config.bag is not None:
+    if "recorder" not in selected and config.bag is not None:
         raise ParameterError(f"--bag {config.bag}: no recorder is started here; expected it among --nodes")
-    return [name for name in known if name in wanted]
+    return [name for name in known if name in selected]
 
 
-def together(config: RunConfig, nodes: list[str]) -> list[str]:
-    """Names of the nodes that share a process: in lockstep, unless told, those that wait for one another.
+def composed(config: RunConfig, nodes: list[str]) -> list[str]:
+    """Names of the nodes that share a process; by default, in lockstep, all composable ones.
 
     Raises:
-        ParameterError: it is asked for, and there are no two such nodes.
+        ParameterError: `compose` without two composable nodes.
     """
     if not (config.factor is None if config.compose is None else config.compose):
         return []
     found = [name for name in nodes if name in COMPOSABLE]
     if config.compose and len(found) < 2:
-        able = ", ".join(COMPOSABLE)
-        raise ParameterError(f"--compose: expected two of {able} among --nodes {','.join(nodes)}")
+        expected = ", ".join(COMPOSABLE)
+        raise ParameterError(f"--compose: expected two of {expected} among --nodes {','.join(nodes)}")
     return found
 
 
 def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]]:
-    """Values of the settings (`--set`), checked, by node and parameter.
+    """Checked values of `--set`, by node and parameter.
 
     Raises:
-        ParameterError: a node that is not started here, or a parameter or value that cannot be.
+        ParameterError: a node that is not started here, an unknown parameter, or an invalid value.
     """
-    given: dict[str, dict[str, object]] = {}
-    for key, setting in config.settings.items():
+    checked: dict[str, dict[str, object]] = {}
+    for key, value in config.settings.items():
         node, _, name = key.partition(".")
-        told = f"--set {key}={setting}"
+        option = f"--set {key}={value}"
         if node not in nodes:
-            raise ParameterError(f"{told}: expected a node that is started here: {', '.join(nodes)}")
+            raise ParameterError(f"{option}: expected a node that is started here: {', '.join(nodes)}")
         row = next((row for row in NODES[node].parameters if row.name == name), None)
         if name in OPTIONS:
-            raise ParameterError(f"{told}: expected --{name}, which tells all nodes alike")
+            raise ParameterError(f"{option}: expected --{name}, which sets it for all nodes")
         if row is None:
             known = ", ".join(row.name for row in NODES[node].parameters if row.name not in OPTIONS)
-            expected = (
-                f"expected some of {known}" if known else "expected none: it has options of run_all only"
-            )
-            raise ParameterError(f"{told}: node {node} has no such parameter; {expected}")
-        value = setting
-        if isinstance(setting, str) and not isinstance(row.default, str):
+            expected = f"some of {known}" if known else "none: it has options of run_all only"
+            raise ParameterError(f"{option}: node {node} has no such parameter; expected {expected}")
+        if isinstance(value, str) and not isinstance(row.default, str):
             with contextlib.suppress(msgspec.DecodeError):
-                value = msgspec.json.decode(setting)
+                value = msgspec.json.decode(value)
         try:
             row.value(value)
         except ParameterError as error:
             raise ParameterError(f"--set {node}.{error}") from None
-        given.setdefault(node, {})[name] = row.typed(value)
-    return given
+        checked.setdefault(node, {})[name] = row.typed(value)
+    return checked
 
 
 def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> None:
-    """Refuse options that do not go together, and a way to the vehicle that this machine does not have.
+    """Check the options of a vehicle, and the connection to it.
 
     Raises:
-        UavDcError: what was wrong.
+        UavDcError: they contradict one another, or this machine has no such connection.
     """
     simulated = config.vehicle == SIMULATED
-    for name in ("connect", "system", "arm", "datum"):
+    for name in VEHICLE_OPTIONS:
         value = getattr(config, name)
         if value and simulated:
             raise ParameterError(f"--{name}: expected --vehicle {', '.join(VEHICLES)} with it")
@@ -128,17 +114,17 @@ def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> No
         raise ParameterError(f"--missions {config.missions}: expected 1 with --vehicle {config.vehicle}")
     if "bridge" in nodes:
         from uav_dc_ros.nodes import vehicles
-        from uav_dc_ros.offboard import datums  # a simulated run needs no way to an autopilot
+        from uav_dc_ros.offboard import datums  # a simulated run needs no autopilot
 
         datums.parse(config.datum or "", scenario, config.vehicle, arm=config.arm)
         vehicles.check(config.vehicle, config.connect or "", config.system or 0, config.arm)
 
 
-def check_writable(summary: Path, bag: Path | None) -> None:
-    """Refuse a file for the summary that could not be written.
+def check_summary(summary: Path, bag: Path | None) -> None:
+    """Check that the summary can be written.
 
     Raises:
-        ParameterError: why.
+        ParameterError: it cannot.
     """
     if summary.absolute() == bag:
         raise ParameterError(f"--summary {summary}: it is the folder of the bag; expected another path")
@@ -149,29 +135,25 @@ def check_writable(summary: Path, bag: Path | None) -> None:
 
 
 def new_bag(wanted: Path | None) -> Path:
-    """Folder of the new bag: the one wanted, or a dated one.
+    """Folder of the new bag; by default a dated one.
 
     Raises:
-        BagError: it exists, or cannot be made.
+        BagError: it exists, or cannot be created.
     """
-    if wanted is None:
-        dated = Path("bags") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-        wanted = dated
-        again = 2
-        while wanted.exists():
-            wanted, again = dated.with_name(f"{dated.name}_{again}"), again + 1
-    elif wanted.exists():
-        raise BagError(
-            f"--bag {wanted}: it exists already, and no bag is ever overwritten; expected a new folder"
-        )
-    wanted = wanted.absolute()
+    bag = wanted
+    if bag is None:
+        dated = bag = Path("bags") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+        number = 2
+        while bag.exists():
+            bag, number = dated.with_name(f"{dated.name}_{number}"), number + 1
+    elif bag.exists():
+        raise BagError(f"--bag {bag}: it exists already, and is not overwritten; expected a new folder")
+    bag = bag.absolute()
     try:
-        str(wanted).encode()
+        str(bag).encode()
     except UnicodeEncodeError:
-        raise BagError(
-            f"--bag {wanted}: a ROS parameter cannot hold this path; expected one in UTF-8"
-        ) from None
-    above = next(parent for parent in wanted.parents if parent.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise BagError(f"--bag {wanted}: {above} is not a folder that can be written; expected one")
-    return wanted
+        raise BagError(f"--bag {bag}: a ROS parameter cannot hold this path; expected one in UTF-8") from None
+    existing = next(parent for parent in bag.parents if parent.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise BagError(f"--bag {bag}: {existing} is not a folder that can be written; expected one")
+    return bag

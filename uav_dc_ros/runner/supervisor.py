@@ -1,4 +1,4 @@
-"""Brings nodes up in order, watches them, starts dead ones again, and takes them down in reverse."""
+"""Starts and stops nodes in the order of their ranks, monitors them, and restarts those that end."""
 
 import time
 from collections import deque
@@ -13,23 +13,23 @@ from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.framework.process_control import ACTIVATE, CONFIGURE
 from uav_dc_ros.runner.node_process import NodeProcess
 
-RESTART_WINDOW_S = 60.0  # deaths longer ago are forgiven
-BACK_OFF_S = 0.2  # before the first restart; twice as long before each further one
-BEGIN_S = 25.0  # a process may be silent for so long while it starts, or its nodes configure and activate
-PASSED_MAX_S = 0.5  # from one look at reports to the next: more was a pause of this process itself
-STOP_S = 10.0  # for a node to end after it was asked to: a bridge waits for its vehicle to obey
-STOP_LOOK_S = 0.002  # from one look at a node that was asked to stop to the next
-UP = ("unconfigured", "inactive", "active")  # the way up; each transition leads to the next
+RESTART_WINDOW_S = 60.0  # the limit on restarts counts exits within this time
+BACK_OFF_S = 0.2  # before the first restart; doubles with each further one
+STARTUP_S = 25.0  # longest time without a report until all nodes of a process are active
+PASSED_MAX_S = 0.5  # between two checks of reports: run_all itself was suspended for the rest
+STOP_S = 10.0  # timeout for a process to end after SIGTERM: the bridge waits for its vehicle
+STOP_POLL_S = 0.002
+UP = ("unconfigured", "inactive", "active")  # states, in order
 TRANSITIONS = {"unconfigured": CONFIGURE, "inactive": ACTIVATE}
 
 
 class SupervisedNode:
-    """One node: its process, which others may share, and how far it has come.
+    """A node, and its process, which other nodes may share.
 
     Attributes:
-        state: of its life cycle, as reported last; none before its process has reported. Once it is active,
-            others may change it by the services of the life cycle: that is not undone.
-        restarts: how often it was started again.
+        state: last reported state; None before the first report. A change through ROS services after the
+            node was active is not reverted.
+        restarts: number of restarts.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, object]) -> None:
@@ -38,21 +38,21 @@ class SupervisedNode:
         self.state: str | None = None
         self.restarts = 0
         self.process: NodeProcess | None = None
-        self.start_s = 0.0  # when to start it, while there is no process
-        self.deaths_s: deque[float] = deque()
-        self._commanded: str | None = None  # the last transition
+        self.start_s = 0.0  # time of the next start, without a process
+        self.exits_s: deque[float] = deque()
+        self._commanded: str | None = None  # last transition
 
-    def begin(self, process: NodeProcess) -> None:
-        """Take charge of a new process."""
+    def attach(self, process: NodeProcess) -> None:
+        """Use a new process."""
         self.process, self.state, self._commanded = process, None, None
 
     def bring_up(self, may_activate: bool) -> None:
-        """Command the next transition on the way up, once.
+        """Command the next transition towards active, once.
 
         Raises:
-            NodeError: the node refuses it, or is in a state from which no way leads up.
+            NodeError: the node rejects it, or was shut down.
         """
-        assert self.process is not None, "otherwise there is nobody to command"
+        assert self.process is not None
         report = self.process.reports.get(self.row.name)
         if report is None:
             return
@@ -70,41 +70,41 @@ class SupervisedNode:
 
 
 class Supervisor:
-    """The nodes of a mission on this host; a context manager that leaves no process behind.
+    """The nodes of a mission on this host; a context manager that stops all processes.
 
     Args:
         namespace: of the mission.
-        parameters: ROS parameters of each node to run, by name.
-        together: names of those that share a process. After its end each gets one of its own: the one that
-            was to blame shows itself, and takes nobody with it.
-        folder: for files of the processes.
-        on_line: called, from threads, with each line that a node prints.
-        on_note: called with what the user should know.
+        parameters: ROS parameters by node name.
+        composed: names of nodes that share a process. After its end each gets its own, which isolates a
+            faulty node.
+        folder: for parameter files.
+        on_line: called from threads with each line that a process prints.
+        on_note: called with notes for the user.
 
     Attributes:
-        brought_up: were all nodes active at once?
+        brought_up: whether all nodes have been active at once.
     """
 
     def __init__(
         self,
         namespace: str,
         parameters: Mapping[str, Mapping[str, object]],
-        together: Collection[str],
+        composed: Collection[str],
         folder: Path,
         on_line: Callable[[str, str], None],
         on_note: Callable[[str], None],
     ) -> None:
         self._namespace = namespace
-        self._together, self._folder = together, folder
+        self._composed, self._folder = composed, folder
         self._on_line, self._on_note = on_line, on_note
         self.nodes = [SupervisedNode(name, values) for name, values in parameters.items()]
         self.brought_up = False
-        self._ticked_s = time.monotonic()
+        self._checked_s = time.monotonic()
 
     def __enter__(self) -> Self:
         """Start the processes."""
-        shared = [node for node in self.nodes if node.row.name in self._together]
-        for nodes in (shared, *([node] for node in self.nodes if node not in shared)):
+        composed = [node for node in self.nodes if node.row.name in self._composed]
+        for nodes in (composed, *([node] for node in self.nodes if node not in composed)):
             if nodes:
                 self._start(nodes)
         return self
@@ -112,21 +112,20 @@ class Supervisor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop whatever still runs."""
+        """Stop all processes."""
         self.stop()
 
     @property
     def restarts(self) -> dict[str, int]:
-        """How often each node was started again."""
+        """Number of restarts by node name."""
         return {node.row.name: node.restarts for node in self.nodes}
 
     @property
     def have_started(self) -> bool:
-        """Has every node started so far that it reports."""
+        """Whether all processes report."""
         return all(node.process is not None and bool(node.process.reports) for node in self.nodes)
 
     def _start(self, nodes: Sequence[SupervisedNode]) -> None:
-        """Start a process of these nodes."""
         parameters = {
             node.row.name: {
                 **node.parameters,
@@ -137,42 +136,42 @@ class Supervisor:
         }
         process = NodeProcess(parameters, self._namespace, nodes[0].restarts, self._folder, self._on_line)
         for node in nodes:
-            node.begin(process)
+            node.attach(process)
 
-    def tick(self, may_begin: bool) -> None:
-        """Go on with whatever is to be done; to be called often.
+    def tick(self, may_bring_up: bool) -> None:
+        """Bring nodes up and restart them; to be called often.
 
         Args:
-            may_begin: may the nodes be configured and activated by now?
+            may_bring_up: whether nodes may be configured and activated.
 
         Raises:
-            NodeError: a node that is needed refuses to start, gave up, or keeps dying.
+            NodeError: a required node cannot be brought up, gave up, or has too many restarts.
         """
-        self._watch_reports()
+        self._check_reports()
         for node in list(self.nodes):
             if node.process is None:
                 if time.monotonic() >= node.start_s:
                     self._start([node])
-            elif node.process.ended:
-                self._bury(node.process)
-            elif may_begin and node.state != "active":
+            elif node.process.has_ended:
+                self._handle_exit(node.process)
+            elif may_bring_up and node.state != "active":
                 try:
                     node.bring_up(self.brought_up or self._lower_ranks_are_active(node))
                 except NodeError as error:
-                    self._lose(node, str(error))
+                    self._drop(node, str(error))
         self.brought_up = self.brought_up or all(node.state == "active" for node in self.nodes)
 
-    def _watch_reports(self) -> None:
-        """Kill processes that hang: their ends are seen as any other."""
-        now_s, before_s = time.monotonic(), self._ticked_s
-        self._ticked_s = now_s
+    def _check_reports(self) -> None:
+        """Kill processes that hang."""
+        now_s, before_s = time.monotonic(), self._checked_s
+        self._checked_s = now_s
         for process in {node.process for node in self.nodes if node.process is not None}:
-            process.watch(min(now_s - before_s, PASSED_MAX_S))
+            process.receive_reports(min(now_s - before_s, PASSED_MAX_S))
             nodes = [node for node in self.nodes if node.process is process]
             active = all(node.state == "active" for node in nodes)
-            patience_s = max(node.row.hang_timeout_s for node in nodes) if active else BEGIN_S
-            if process.silent_s > patience_s and not process.ended:
-                process.kill(f"gave no sign of life for {patience_s:.0f} s")
+            timeout_s = max(node.row.hang_timeout_s for node in nodes) if active else STARTUP_S
+            if process.silent_s > timeout_s and not process.has_ended:
+                process.kill(f"gave no sign of life for {timeout_s:.0f} s")
 
     def _lower_ranks_are_active(self, node: SupervisedNode) -> bool:
         return all(
@@ -181,75 +180,72 @@ class Supervisor:
             if other.row.rank < node.row.rank and (other.row.needed or other.row.on_request)
         )
 
-    def _bury(self, process: NodeProcess) -> None:
-        """A process has ended: start its nodes again later, each by itself, or give up."""
-        told = f"{process.who} {process.how_it_ended()}"
+    def _handle_exit(self, process: NodeProcess) -> None:
+        """Schedule restarts of the nodes of an ended process, each in its own, or drop them."""
+        reason = f"{process.description} {process.exit_description()}"
         process.close()
         nodes = [node for node in self.nodes if node.process is process]
         for node in nodes:
             node.process, node.state = None, None
-        if process.process.returncode in (EXIT_NOT_STARTED, EXIT_FAILED):  # it told why; it would do so again
+        if process.process.returncode in (EXIT_NOT_STARTED, EXIT_FAILED):  # it would fail again
             for node in nodes:
-                self._lose(node, told)
+                self._drop(node, reason)
             return
         if len(nodes) > 1:
-            self._on_note(f"{told}; its nodes go on in processes of their own")
+            self._on_note(f"{reason}; its nodes go on in processes of their own")
         for node in nodes:
-            self._start_again_later(node, told if len(nodes) == 1 else f"node {node.row.name} ended with it")
+            self._schedule_restart(node, reason if len(nodes) == 1 else f"node {node.row.name} ended with it")
 
-    def _start_again_later(self, node: SupervisedNode, told: str) -> None:
-        """Let a node that died rest for a while, or, if it has died too often, give up."""
-        now_s, most = time.monotonic(), node.row.max_restarts
-        node.deaths_s.append(now_s)
-        while now_s - node.deaths_s[0] > RESTART_WINDOW_S:
-            node.deaths_s.popleft()
-        deaths = len(node.deaths_s)
-        if deaths > most:
-            self._lose(node, f"{told} ({deaths} times within {RESTART_WINDOW_S:.0f} s)")
+    def _schedule_restart(self, node: SupervisedNode, reason: str) -> None:
+        now_s, maximum = time.monotonic(), node.row.max_restarts
+        node.exits_s.append(now_s)
+        while now_s - node.exits_s[0] > RESTART_WINDOW_S:
+            node.exits_s.popleft()
+        exits = len(node.exits_s)
+        if exits > maximum:
+            self._drop(node, f"{reason} ({exits} times within {RESTART_WINDOW_S:.0f} s)")
             return
         node.restarts += 1
-        node.start_s = now_s + BACK_OFF_S * 2 ** (deaths - 1)
-        self._on_note(f"{told}; it is started again ({deaths} of {most} within {RESTART_WINDOW_S:.0f} s)")
+        node.start_s = now_s + BACK_OFF_S * 2 ** (exits - 1)
+        self._on_note(f"{reason}; it is restarted ({exits} of {maximum} within {RESTART_WINDOW_S:.0f} s)")
 
-    def _lose(self, node: SupervisedNode, why: str) -> None:
-        """Do without a node from now on.
+    def _drop(self, node: SupervisedNode, reason: str) -> None:
+        """Continue without a node.
 
         Raises:
-            NodeError: no mission can be flown without it.
+            NodeError: the mission requires it.
         """
         if node.row.needed or (node.row.on_request and not self.brought_up):
-            raise NodeError(why)
-        self._on_note(f"{why}; the mission goes on without it")
+            raise NodeError(reason)
+        self._on_note(f"{reason}; the mission goes on without it")
         if node.process is not None:
-            node.process.ask_to_stop()
+            node.process.terminate()
             node.process.wait(time.monotonic() + STOP_S)
         self.nodes.remove(node)
 
     def stop(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, int]:
-        """Stop all nodes, higher ranks of the node table first. Returns their exit statuses.
+        """Stop all nodes, higher ranks first; returns exit statuses by process name.
 
-        A rank is asked to stop when those above it have said their last, so that the recorder hears all of
-        it. The processes then end side by side.
+        A rank gets SIGTERM when all higher ranks are finalized, so that the recorder receives their last
+        messages. The processes then end in parallel.
 
         Args:
-            meanwhile: called when all were asked to stop, before their ends are waited for.
+            meanwhile: called after the last SIGTERM, before the ends are waited for.
         """
-        statuses: dict[str, int] = {}
-        asked: dict[NodeProcess, float] = {}  # and until when each may take its time, monotonic clock
+        deadlines_s: dict[NodeProcess, float] = {}
         running = {node.row.name: node.process for node in self.nodes if node.process is not None}
         for rank in sorted({NODES[name].rank for name in running}, reverse=True):
             group = {process for name, process in running.items() if NODES[name].rank == rank}
-            for process in group - asked.keys():
-                process.ask_to_stop()
-                asked[process] = time.monotonic() + STOP_S
+            for process in group - deadlines_s.keys():
+                process.terminate()
+                deadlines_s[process] = time.monotonic() + STOP_S
             for process in group:
-                while not process.is_silent:
-                    if time.monotonic() > asked[process]:
+                while not process.is_finalized:
+                    if time.monotonic() > deadlines_s[process]:
                         process.kill("did not stop")
                         break
-                    time.sleep(STOP_LOOK_S)
+                    time.sleep(STOP_POLL_S)
         meanwhile()
-        for process, deadline_s in asked.items():
-            statuses[process.name] = process.wait(deadline_s)
+        statuses = {process.name: process.wait(deadline_s) for process, deadline_s in deadlines_s.items()}
         self.nodes = []
         return statuses
