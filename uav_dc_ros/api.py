@@ -16,8 +16,8 @@ def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_S
     """Fly one mission per seed in parallel, in numpy, without ROS.
 
     Args:
-        act: a policy, or a function from the state of the missions (`core.world.State`, `[S, ...]`) to actions,
-            integers `[S]`.
+        act: a policy, or a function from the missions' state (`core.world.State`, `[S, ...]`) to their
+            actions, integers `[S]`.
         seeds: of the users, S of them.
 
     Returns:
