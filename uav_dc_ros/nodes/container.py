@@ -1,11 +1,10 @@
-"""Several nodes in one process: a container, as ROS 2 calls it.
+"""Several nodes in one process, which ROS 2 calls a container.
 
     python -m uav_dc_ros.nodes.container world channel_monitor policy --ros-args --params-file mission.yaml
 
-Nodes that wait for one another in every step gain nothing from a core each, and pay for each message on its
-way from process to process: a thread that sends, one that receives, and a node that is woken. Inside one
-process the middleware hands a message over in the thread that publishes it. The price: a node that dies
-takes the others with it.
+Nodes that wait for one another in every step do not run in parallel. In one process the middleware delivers a
+message in the thread that publishes it; between processes each message wakes two threads and a node. But a
+node that dies ends the others, too.
 """
 
 import importlib
@@ -19,7 +18,7 @@ from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
 
 
 def parser() -> cli.Parser:
-    """The command line, up to --ros-args."""
+    """The command line before --ros-args."""
     options = cli.Parser(
         prog="python -m uav_dc_ros.nodes.container",
         description="Run several nodes in one process. Parameters follow --ros-args, as of any node; those "
@@ -29,7 +28,7 @@ def parser() -> cli.Parser:
     return options
 
 
-def node_class(name: str) -> type[MissionNode]:
+def _node_class(name: str) -> type[MissionNode]:
     """The class of a composable node: `ChannelMonitorNode` in the module `channel_monitor`."""
     module = importlib.import_module(f"uav_dc_ros.nodes.{name}")
     found: type[MissionNode] = getattr(module, f"{name.title().replace('_', '')}Node")
@@ -37,11 +36,11 @@ def node_class(name: str) -> type[MissionNode]:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the nodes until they are asked to stop."""
+    """Run the nodes until a stop request."""
     own, for_ros = node_cli.split(sys.argv[1:] if arguments is None else arguments)
-    wanted = parser().parse_args(own).nodes
-    in_order = sorted(dict.fromkeys(wanted), key=lambda name: NODES[name].rank)
-    node_main.main(*(node_class(name) for name in in_order), arguments=for_ros)
+    names = dict.fromkeys(parser().parse_args(own).nodes)
+    in_order = sorted(names, key=lambda name: NODES[name].rank)
+    node_main.main(*map(_node_class, in_order), arguments=for_ros)
 
 
 if __name__ == "__main__":

@@ -6,5 +6,5 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Run the node after which this executable is called."""
+    """Run the node that has the name of this executable."""
     runpy.run_module(f"uav_dc_ros.nodes.{Path(sys.argv[0]).name}", run_name="__main__", alter_sys=True)

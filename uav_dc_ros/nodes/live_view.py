@@ -1,9 +1,8 @@
-"""The live view: serves the mission to Foxglove over WebSocket, every message as it came.
+"""The live view: serves the mission's messages to Foxglove over WebSocket, serialised.
 
-A client reads CDR with the definitions that are sent along, so it needs no ROS. Topics are called as in
-the graph, with their namespace. Times are those of receipt, on the wall clock: mission time may run a
-hundred times faster, and begins anew with every run, which a client's time line cannot; it is in the
-stamps, and on `clock`.
+A client reads CDR with the definitions that the server sends, so it needs no ROS. Topics have their full
+names. Times are those of receipt, on the wall clock: mission time may run a hundred times faster and restarts
+with every run, which a client's time line does not support; it is in the stamps, and on `clock`.
 """
 
 from typing import Any
@@ -15,21 +14,21 @@ from uav_dc_ros.nodes.view.foxglove_server import FoxgloveServer
 from uav_dc_ros.topics import TOPICS, Topic
 
 LAYOUT_FOLDER, LAYOUT = "share/foxglove", "mission.json"
-ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # listened on; where to find it on this machine
+LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # of the addresses that stand for all
 
 
 class LiveViewNode(MissionNode):
     """A WebSocket server with one channel for each topic."""
 
-    pause_s = 0.02  # nobody waits for it
+    pause_s = 0.02  # no node waits for it
 
     def __init__(self) -> None:
         super().__init__("live_view")
-        self._view: FoxgloveServer | None = None
+        self._server: FoxgloveServer | None = None
 
     def configure(self) -> None:
-        """Listen, and tell the clients which topics there are."""
-        self._view = FoxgloveServer(
+        """Start the server."""
+        self._server = FoxgloveServer(
             name=f"uav_dc_ros {self.get_namespace()}".removesuffix(" /"),
             address=self.values["address"],
             port=self.values["port"],
@@ -37,41 +36,36 @@ class LiveViewNode(MissionNode):
         )
 
     def activate(self) -> None:
-        """Serve from here on, and tell where."""
-        assert self._view is not None, "it was configured"
-        given = self.values["address"]
-        host = ANYWHERE.get(given, given)
-        where = f"[{host}]" if ":" in host else host
+        """Log the address."""
+        assert self._server is not None, "configure created it"
+        address = self.values["address"]
+        host = LOOPBACK.get(address, address)
+        host = f"[{host}]" if ":" in host else host
         layout = str(files.shipped_folder(LAYOUT_FOLDER) / LAYOUT)
         if self.get_namespace() != "/":
             layout += f" (put {self.get_namespace()} in front of its topics)"
         self.get_logger().info(
-            f"live view: ws://{where}:{self._view.port} (Foxglove: Open connection, Foxglove WebSocket); "
+            f"live view: ws://{host}:{self._server.port} (Foxglove: Open connection, Foxglove WebSocket); "
             f"layout: {layout}"
         )
 
     def cleanup(self) -> None:
         """Close the server."""
-        if self._view is not None:
-            self._view.stop()
-            self._view = None
+        if self._server is not None:
+            self._server.stop()
+            self._server = None
 
     def subscribe(self, topic: Topic) -> Any:
-        """Subscribe to a topic of the row, for its bytes."""
-        assert self._view is not None, "it was configured"
-        view, full_name = self._view, self.resolve_topic_name(topic.name)
-
-        def hear(data: bytes, info: Any) -> None:
-            if self.is_of_another_run(topic.name, data):
-                return
-            view.send(full_name, data, info["received_timestamp"])
-            self.statistics.count_received(topic.name, info)
-
-        return self.create_raw_subscription(topic, hear)
+        """Subscribe to a topic of the row, serialised."""
+        assert self._server is not None, "configure created it"
+        send, name = self._server.send, self.resolve_topic_name(topic.name)
+        return self.subscribe_serialised(
+            topic, lambda data, info: send(name, data, info["received_timestamp"])
+        )
 
     def diagnose(self) -> tuple[list[str], dict[str, str]]:
-        """Where it listens."""
-        return [], {} if self._view is None else {"port": str(self._view.port)}
+        """The port of the server."""
+        return [], {} if self._server is None else {"port": str(self._server.port)}
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""The policy: answers each step that the vehicle is ready for with a move. Needs no torch.
+"""The policy: decides a move for each step that the vehicle is ready for. Needs no torch.
 
-It is the same node in simulation and on an aircraft: it knows the vehicle by `mission` only.
+It is the same node in simulation and on an aircraft: it receives the vehicle's state in `mission` only.
 """
 
 import numpy as np
@@ -21,30 +21,30 @@ class PolicyNode(MissionNode):
         super().__init__("policy")
 
     def configure(self) -> None:
-        """Load the policy, and see whether it fits the mission's world."""
+        """Load the policy, and check that it fits the mission's scenario."""
         self.policy = policies.load(self.values["policy"])
         scenario = self.values["scenario"]
         self.scenario = scenarios.load(scenario) if scenario else self.policy.scenario
         self.policy.check(self.scenario)
-        nothing = np.zeros(self.scenario.n_users)
-        self._decide(self.scenario.start_cell, 0, nothing, nothing > 0)  # the first time takes longest
+        zeros = np.zeros(self.scenario.n_users)
+        self._decide(self.scenario.start_cell, 0, zeros, zeros > 0)  # the first call is the slowest
 
     def activate(self) -> None:
-        """Wait for a step that the vehicle is ready for."""
+        """Begin without a pending step."""
         self._steps = StepSynchronizer()
 
     def on_mission(self, payload: messages.Mission) -> None:
-        """Note a step that the vehicle is ready for."""
+        """Receive a step that the vehicle is ready for."""
         payloads.check(payload, self.scenario)
         if payload.phase is messages.Phase.READY:
-            self._hear(payload)
+            self._add(payload)
 
     def on_rates(self, payload: messages.Rates) -> None:
-        """Note what has been collected by a step."""
-        payloads.check(payload, self.scenario)  # before it waits
-        self._hear(payload)
+        """Receive the data collected by a step."""
+        payloads.check(payload, self.scenario)
+        self._add(payload)
 
-    def _hear(self, payload: messages.Mission | messages.Rates) -> None:
+    def _add(self, payload: messages.Mission | messages.Rates) -> None:
         pair = self._steps.add(payload)
         if pair is None:
             return
@@ -52,10 +52,8 @@ class PolicyNode(MissionNode):
         data_bits, collected = payloads.collection(rates, self.scenario)
         steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
         action = self._decide(mission.cell, steps_flown, data_bits, collected)
-        self.publish_payload(
-            "move",
-            messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label),
-        )
+        move = messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label)
+        self.publish_payload("move", move)
 
     def _decide(
         self, cell: tuple[int, int, int], steps_flown: int, data_bits: Array, collected: Array

@@ -1,7 +1,7 @@
-"""The recorder: everything in the mission's namespace into a bag, serialised as it came.
+"""The recorder: writes all topics in the mission's namespace into a bag, serialised.
 
-It waits for the topics of the table, and finds all others as they appear. A recorder that was killed goes on
-in the same bag, in a new part: latched topics tell it what it missed.
+It waits for the topics of the table, and finds others as they appear. A recorder that was killed continues
+the bag in a new part: from latched topics it receives the messages that it missed.
 """
 
 import json
@@ -19,7 +19,7 @@ from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 
 
 class RecorderNode(RecorderBase):
-    """Writes a mission's bag; what it is about (scenario, policy and its hash, seed) goes inside."""
+    """Writes a mission's bag, with metadata: scenario, policy and its hash, seed."""
 
     delays_new_topics = True  # a later scan tells whether another mission owns their namespace
 
@@ -27,40 +27,40 @@ class RecorderNode(RecorderBase):
         super().__init__("recorder")
 
     def about(self) -> Mapping[str, str]:
-        """Scenario, policy, seed, missions, pace, and what flies."""
-        given = self.values
-        scenario = scenarios.load(given["scenario"])
+        """Metadata of the bag: scenario, policy, seed, missions, pace, vehicle."""
+        values = self.values
+        scenario = scenarios.load(values["scenario"])
         about = {
             "version": __version__,
             "scenario": scenario.name,
             "scenario_fingerprint": scenario.fingerprint,
             "scenario_values": json.dumps(msgspec.to_builtins(scenario)),
-            "seed": str(given["seed"]),
-            "missions": str(given["missions"]),
-            "vehicle": given["vehicle"],
+            "seed": str(values["seed"]),
+            "missions": str(values["missions"]),
+            "vehicle": values["vehicle"],
         }
-        if given["vehicle"] == SIMULATED:  # a real one has its own
-            about["pace"] = pace.text(given["pace"])
-        if given["policy"]:
-            loaded = policies.load(given["policy"])
+        if values["vehicle"] == SIMULATED:  # a real one has no pace
+            about["pace"] = pace.text(values["pace"])
+        if values["policy"]:
+            loaded = policies.load(values["policy"])
             about |= {"policy": loaded.name, "policy_sha256": loaded.sha256}
         return about
 
     def on_peers(self) -> None:
-        """Enter every topic, also those that will stay silent; then say ready."""
+        """Add the topics of the row to the bag, also those without a message, before `ready`."""
         for name in self.row.subscribes:
             self.announce(self.resolve_topic_name(name), TOPICS[name])
         super().on_peers()
 
     def other_missions(self, found: Mapping[str, list[str]]) -> set[str]:
         """Namespaces inside ours in which another mission is flown: that has a bag of its own."""
-        ours = self.get_namespace().rstrip("/")
-        places = (
+        own = self.get_namespace().rstrip("/")
+        payload_topics = (
             name.rsplit("/", 1)
             for name, types in found.items()
             if name.rsplit("/", 1)[-1] in PAYLOADS and JSON in types
         )
-        return {place for place, _ in places if place != ours}
+        return {namespace for namespace, _ in payload_topics if namespace != own}
 
 
 if __name__ == "__main__":

@@ -13,11 +13,7 @@ from uav_dc_ros.errors import NodeError
 
 
 class Journal:
-    """Lines of the current mission. All methods raise NodeError if the file cannot be read or written.
-
-    Args:
-        path: the file; empty: nothing is kept.
-    """
+    """Lines of the current mission; path `""`: no file. NodeError: the file cannot be read or written."""
 
     def __init__(self, path: str) -> None:
         self._path = Path(path) if path else None

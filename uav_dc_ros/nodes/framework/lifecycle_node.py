@@ -3,6 +3,7 @@
 import difflib
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import rclpy
@@ -23,17 +24,10 @@ from uav_dc_ros.nodes.ros import rclpy_private
 
 
 class ManagedNode(LifecycleNode):
-    """A node of the table.
+    """A node of the table; a UavDcError in `configure` or `activate` is logged, undone, and fails it.
 
-    A UavDcError in `configure` or `activate` is logged, undone, and fails the transition.
-
-    Args:
-        name: name of its row.
-        overrides: parameter values that replace those of the command line.
-        context: ROS context; None: the default one.
-
-    Raises:
-        ParameterError: an invalid value, or a parameter that the node does not have.
+    `overrides` replace parameter values of the command line. Raises ParameterError for an invalid value, and
+    for a parameter that the node does not have.
 
     Attributes:
         row: its row of the node table.
@@ -52,6 +46,7 @@ class ManagedNode(LifecycleNode):
         self.values: dict[str, Any] = {}
         self.failure: UavDcError | None = None
         self._is_active = False
+        self._until_cleanup, self._until_inactive = ExitStack(), ExitStack()  # destroy what they hold
         self._change_state = rclpy_private.replace_change_state(self, self._reject_impossible)
         self._declare()
 
@@ -154,6 +149,7 @@ class ManagedNode(LifecycleNode):
 
     def _undo_activation(self) -> None:
         self._is_active = False
+        self._until_inactive.close()
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition to unconfigured."""
@@ -161,6 +157,7 @@ class ManagedNode(LifecycleNode):
 
     def _cleanup(self) -> None:
         self.cleanup()
+        self._until_cleanup.close()
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition to finalized, from any state."""

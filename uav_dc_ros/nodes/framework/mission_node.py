@@ -75,8 +75,6 @@ class MissionNode(ManagedNode):
         self._given_run = f'{{"run":"{self.run}"'.encode() if self.run else b""  # as our own payloads begin
         self.peers = [peer for peer in self.values["peers"] if peer != name]
         self.rows = mission_rows([name, *self.peers])
-        self._active_timers: list[Any] = []
-        self._diagnostics_timer: Any = None
         self._incompatible: set[tuple[str, str, str]] = set()  # at the last check: topic, peer, reason
         self._logged_incompatible: set[tuple[str, str]] = set()
 
@@ -87,19 +85,21 @@ class MissionNode(ManagedNode):
 
     def _configure(self) -> None:
         super()._configure()
+        self._until_cleanup.callback(self.publishers_of.clear)
         for name in self.row.publishes:
             topic = TOPICS[name]
             with qos.overridden(name):
-                self.publishers_of[name] = self.create_publisher(
+                publisher = self.create_publisher(
                     qos.MESSAGE_TYPES[topic.type],
                     name,
                     qos.offered(topic, self.message_bytes.get(name, 0)),
                     event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
                     qos_overriding_options=qos.OVERRIDES,
                 )
-        self._diagnostics_timer = self.create_timer(
-            diagnostics.PERIOD_S, self._publish_diagnostics, clock=self.steady
-        )
+            self.publishers_of[name] = publisher
+            self._until_cleanup.callback(self.destroy_publisher, publisher)
+        timer = self.create_timer(diagnostics.PERIOD_S, self._publish_diagnostics, clock=self.steady)
+        self._until_cleanup.callback(self.destroy_timer, timer)
 
     @property
     def is_vehicle(self) -> bool:
@@ -109,8 +109,11 @@ class MissionNode(ManagedNode):
     def _activate(self) -> None:
         self.run = self.values["run"] or (messages.new_run() if self.is_vehicle else "")
         super()._activate()
+        self._until_inactive.callback(self.subscriptions_of.clear)
         for name in self.row.subscribes:
-            self.subscriptions_of[name] = self.subscribe(TOPICS[name])
+            subscription = self.subscribe(TOPICS[name])
+            self.subscriptions_of[name] = subscription
+            self._until_inactive.callback(self.destroy_subscription, subscription)
         endpoints = [*self.subscriptions_of.values(), *self.publishers_of.values()]
         self._reject_unknown("qos", [f"qos_overrides.{end.topic_name}" for end in endpoints])
         self._peers_timer = self.timer(PEERS_PERIOD_S, self._find_peers)
@@ -120,30 +123,12 @@ class MissionNode(ManagedNode):
         for publisher in self.publishers_of.values():
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline_s - time.monotonic())))
 
-    def _undo_activation(self) -> None:
-        super()._undo_activation()
-        for timer in self._active_timers:
-            self.destroy_timer(timer)
-        for subscription in self.subscriptions_of.values():
-            self.destroy_subscription(subscription)
-        self._active_timers.clear()
-        self.subscriptions_of.clear()
-
-    def _cleanup(self) -> None:
-        super()._cleanup()
-        if self._diagnostics_timer is not None:
-            self.destroy_timer(self._diagnostics_timer)
-            self._diagnostics_timer = None
-        for publisher in self.publishers_of.values():
-            self.destroy_publisher(publisher)
-        self.publishers_of.clear()
-
     # Topics.
 
     def timer(self, period_s: float, callback: Callable[[], None], clock: Clock | None = None) -> Any:
         """Create a timer that ends with the node's activity; default: on the steady clock."""
         timer = self.create_timer(period_s, callback, clock=clock or self.steady)
-        self._active_timers.append(timer)
+        self._until_inactive.callback(self.destroy_timer, timer)
         return timer
 
     def subscribe(self, topic: Topic) -> Any:
@@ -168,11 +153,7 @@ class MissionNode(ManagedNode):
         return self.create_raw_subscription(topic, receive)
 
     def check_run(self, topic: str, run: str) -> None:
-        """Check the run of a message; without a run, adopt that of the only publisher.
-
-        Raises:
-            MessageError: the message belongs to another run.
-        """
+        """Raise MessageError for another run. Without a run, adopt that of the only publisher."""
         if run == self.run or (topic == "ready" and not run):
             return
         if self.is_vehicle or self.values["run"] or self.count_publishers(topic) > 1:
@@ -213,6 +194,20 @@ class MissionNode(ManagedNode):
                 qos_overriding_options=qos.OVERRIDES,
                 raw=True,
             )
+
+    def subscribe_serialised(self, topic: Topic, handle: Callable[[bytes, Any], None]) -> Any:
+        """Subscribe to the serialised messages of this run; `handle` takes a message and its info."""
+
+        def receive(data: bytes, info: Any) -> None:
+            if self.is_of_another_run(topic.name, data):
+                return
+            try:
+                handle(data, info)
+            except MessageError as error:
+                self.reject(topic.name, error)
+            self.statistics.count_received(topic.name, info)
+
+        return self.create_raw_subscription(topic, receive)
 
     def publish_payload(self, topic: str, payload: messages.Payload) -> None:
         """Check and publish a payload on a JSON topic."""
@@ -258,12 +253,9 @@ class MissionNode(ManagedNode):
         return {f"{namespace}/{peer}" for peer in peers} <= {qos.full_name(end) for end in endpoints}
 
     def check_other_publishers(self) -> None:
-        """Check that no other node publishes this mission's topics.
+        """Raise AnotherMissionError if other nodes publish this mission's topics.
 
-        The graph may still list a node that was killed, so only two publishers of this node itself count.
-
-        Raises:
-            AnotherMissionError: with the names of the other publishers.
+        The graph may still list nodes that were killed: a second node of a name counts only for this one.
         """
         others = [name for name in self.rows if name != self.row.name]
         found = other_publishers.find(

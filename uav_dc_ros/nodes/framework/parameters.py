@@ -65,11 +65,7 @@ class Parameter:
         return value
 
     def value(self, given: Any) -> Any:
-        """Check a value and return what the node uses.
-
-        Raises:
-            ParameterError: wrong type, out of range, or refused by `parse`.
-        """
+        """Check a value and return what the node uses; raises ParameterError for an invalid one."""
         value = self.typed(given)
         has_type = type(value) is type(self.default)
         if not has_type or (self.min is not None and not self.min <= value <= (self.max or 0)):

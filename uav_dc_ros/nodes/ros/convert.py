@@ -25,11 +25,7 @@ def stamp_ns(time: Time) -> int:
 
 
 def position_m(message: PoseStamped) -> Array:
-    """Position x, y, altitude, metres, `[3]`.
-
-    Raises:
-        MessageError: another frame than `map`, or a position that is not finite.
-    """
+    """Position x, y, altitude, metres, `[3]`; MessageError: not in frame `map`, or not finite."""
     point = message.pose.position
     position = point.x, point.y, point.z
     cdr.check_position(message.header.frame_id, position)

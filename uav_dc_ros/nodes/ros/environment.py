@@ -22,13 +22,9 @@ LOG_FOLDERS = (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"))  # rcl uses the first o
 
 
 def prepare(*, local_only: bool) -> None:
-    """Check the environment and set what it leaves open; to be called before ROS is imported.
+    """`check` the environment and set what it leaves open; to be called before ROS is imported.
 
-    Args:
-        local_only: all participants run on this host, so discovery is limited to it.
-
-    Raises:
-        ParameterError: ROS cannot start in this environment.
+    `local_only`: all participants run on this host, so discovery is limited to it.
     """
     check()
     os.environ.setdefault(RANGE, "LOCALHOST" if local_only else "SUBNET")
@@ -36,11 +32,7 @@ def prepare(*, local_only: bool) -> None:
 
 
 def check() -> None:
-    """Check the environment of a process that uses ROS.
-
-    Raises:
-        ParameterError: ROS cannot start, or its nodes cannot find each other.
-    """
+    """Raise ParameterError if ROS cannot start in this environment, or nodes cannot find each other."""
     check_import()
     _check_domain()
     _check_range()
@@ -49,7 +41,7 @@ def check() -> None:
     fastdds.remove_leftovers()
     free_mb = fastdds.free_mb()
     if free_mb < fastdds.RECOMMENDED_MB and fastdds.TRANSPORTS not in os.environ:
-        fastdds.use_udp_only()
+        os.environ[fastdds.TRANSPORTS] = "UDPv4"
         _note(
             f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "
             "travel over UDP alone"
@@ -57,10 +49,9 @@ def check() -> None:
 
 
 def check_import() -> None:
-    """Check what would end the process when rclpy is imported: by SIGBUS, or with status 102.
+    """Raise ParameterError if shared memory is full, or the chosen middleware is not installed.
 
-    Raises:
-        ParameterError: shared memory is full, or the chosen middleware is not installed.
+    The import of rclpy would end the process, by SIGBUS or with status 102.
     """
     if fastdds.free_mb() < fastdds.MIN_MB:
         fastdds.remove_leftovers()

@@ -50,12 +50,6 @@ class DirectExecutor:
         self._wait_set: Any = None
         self._subscriptions_wait_set: Any = None
         self._subscriptions: list[Any] = []  # as of the last full wait
-        self._handlers: dict[str, Callable[[Any], None]] = {  # in the order in which they run
-            "timer": _call_timer,
-            "subscription": self._take_messages,
-            "service": _serve,
-            "client": _complete,
-        }
         self._capacity: tuple[int, ...] = ()
         self._full_wait_s = 0.0  # time of the last full wait
         self._received_s = 0.0  # time of the last message
@@ -69,11 +63,7 @@ class DirectExecutor:
         self._guard.trigger()
 
     def spin(self, stop: Callable[[], bool], quiet_s: float | None = None) -> None:
-        """Run callbacks until `stop` holds, or no message came for `quiet_s` seconds.
-
-        Raises:
-            Exception: any that a callback raises.
-        """
+        """Run callbacks until `stop` holds, or no message came for `quiet_s` seconds."""
         received_s = self._received_s = time.monotonic()
         quiet_turns = 0
         with self._context.handle:
@@ -129,23 +119,24 @@ class DirectExecutor:
         return bool(ready) or wait_set.is_ready("guard_condition", 0)
 
     def _wait_for_all(self, timeout_s: float | None) -> None:
-        entities = {
-            kind: [entity for node in self._nodes for entity in getattr(node, f"{kind}s")]
-            for kind in self._handlers
-        }
-        count = {kind: len(found) for kind, found in entities.items()}
-        wait_set = self._empty_wait_set(
-            count["subscription"], 1, count["timer"], count["client"], count["service"]
-        )
+        timers = [timer for node in self._nodes for timer in node.timers]
+        subscriptions = [subscription for node in self._nodes for subscription in node.subscriptions]
+        services = [service for node in self._nodes for service in node.services]
+        clients = [client for node in self._nodes for client in node.clients]
+        wait_set = self._empty_wait_set(len(subscriptions), 1, len(timers), len(clients), len(services))
         added = [
-            (kind, getattr(wait_set, f"add_{kind}")(entity.handle), entity)
-            for kind, found in entities.items()
-            for entity in found
+            *(("timer", wait_set.add_timer(one.handle), one, _call_timer) for one in timers),
+            *(
+                ("subscription", wait_set.add_subscription(one.handle), one, self._take_messages)
+                for one in subscriptions
+            ),
+            *(("service", wait_set.add_service(one.handle), one, _serve) for one in services),
+            *(("client", wait_set.add_client(one.handle), one, _complete) for one in clients),
         ]
         wait_set.add_guard_condition(self._guard.handle)
         wait_set.wait(-1 if timeout_s is None else round(timeout_s * 1e9))
         # All that is ready is listed before a callback may create or destroy entities.
-        ready = [(self._handlers[kind], entity) for kind, at, entity in added if wait_set.is_ready(kind, at)]
+        ready = [(handle, entity) for kind, at, entity, handle in added if wait_set.is_ready(kind, at)]
         for handle, entity in ready:
             try:
                 handle(entity)

@@ -30,11 +30,6 @@ def use_profiles() -> None:
         os.environ.update(dict.fromkeys(NAMES, str(Path(__file__).with_name("fastdds.xml"))))
 
 
-def use_udp_only() -> None:
-    """Use no shared memory in this process and its children; to be called before ROS is initialised."""
-    os.environ[TRANSPORTS] = "UDPv4"
-
-
 def free_mb() -> float:
     """Free shared memory, megabytes; infinite where there is none."""
     try:

@@ -22,11 +22,7 @@ CONFIRMED_S = 0.25  # for which it then has to stay lost
 
 
 class LivelinessFilter:
-    """Confirms a loss of liveliness. To be updated several times in `CONFIRMED_S`.
-
-    Args:
-        clock: steady, seconds.
-    """
+    """Confirms a loss of liveliness. To be updated several times in `CONFIRMED_S`; the clock is steady."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

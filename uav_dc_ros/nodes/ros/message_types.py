@@ -34,10 +34,8 @@ def definition(type: str) -> bytes:
     """The definition of an installed message type and of all types inside it, in the encoding `ros2msg`.
 
     For the types of ROS 2 itself it is their text. For others it holds the names and types of all fields,
-    from the class, but neither constants nor defaults, which are not needed to decode messages.
-
-    Raises:
-        LookupError: it, or a type inside it, is not installed.
+    from the class, but neither constants nor defaults, which are not needed to decode messages. Raises
+    LookupError if it, or a type inside it, is not installed.
     """
     from uav_dc_ros.bags import message_definitions  # imports rosbags, which few callers need
 

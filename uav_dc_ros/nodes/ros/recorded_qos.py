@@ -28,12 +28,7 @@ FOREVER_S = 2**31 - 1  # and more: what recorders write for "no limit"; so is 0
 
 
 def offered(profile: QoSProfile, depth: int | None = None) -> Qos:
-    """The QoS that a publisher offers, as a bag stores it.
-
-    Args:
-        profile: as in the graph.
-        depth: messages that the publisher keeps; None: not known, since discovery does not carry it.
-    """
+    """A publisher's QoS as a bag stores it, from its profile in the graph; depth None: not known."""
     manual = profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC
     return Qos(
         history=QosHistory.UNKNOWN if depth is None else QosHistory.KEEP_LAST,
@@ -62,12 +57,9 @@ def profile(topic: RecordedTopic, *, message_bytes: int, per_s: float) -> QoSPro
     subscribers. The deadline and the lease are the strictest, the lifespan the longest of the publishers.
 
     Args:
-        topic: as recorded.
+        topic: as recorded; BagError: its QoS is not in rosbag2's format.
         message_bytes: approximate size of its messages: the larger, the fewer are kept.
         per_s: messages to be published in a second; infinite: as many as possible.
-
-    Raises:
-        BagError: the recorded QoS is not in rosbag2's format.
     """
     try:
         offers = parse_qos(topic.offered_qos)
