@@ -108,7 +108,7 @@ def test_a_file_that_counts_wrong_is_told(tmp_path: Path, capsys: pytest.Capture
     file = path.read_bytes()
     counted = struct.pack("<HQHQ", 1, N // 2, 2, N // 2)
     path.write_bytes(file.replace(counted, struct.pack("<HQHQ", 1, N // 2, 2, 7)))
-    assert "/b has 30 messages; its files tell of 7" in run(capsys, "info", path)
+    assert "/b has 30 messages; its index lists 7" in run(capsys, "info", path)
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object, status: int = 0) -> str:
@@ -143,7 +143,7 @@ def test_messages_that_are_compressed_one_by_one_are_read_and_named(
 ) -> None:
     path = by_message(tmp_path / name)
     assert [m.data for m in messages(path)] == [text(f"message {i}") for i in range(len(messages(path)))]
-    assert "each message by itself, of 2 topics (zstd)" in run(capsys, "info", path)
+    assert "message by message, on 2 topics (zstd)" in run(capsys, "info", path)
     if path.is_file():
         assert messages(path) == messages(path, torn=True)
         recover(path, tmp_path / "out")
@@ -177,7 +177,7 @@ def test_sqlite_storage_needs_no_metadata(tmp_path: Path, capsys: pytest.Capture
     assert "complete" in run(capsys, "info", bag).splitlines()[0]
     told = (bag / "metadata.yaml").read_text()
     (bag / "metadata.yaml").write_text(told.replace("message_count: 20", "message_count: 371", 1))
-    assert "metadata.yaml tells other files, or other numbers of messages" in run(capsys, "info", bag)
+    assert "metadata.yaml lists other files, or other numbers of messages" in run(capsys, "info", bag)
     (bag / "metadata.yaml").unlink()
     assert messages(bag) == expected
     assert "metadata.yaml is missing" in run(capsys, "info", bag)

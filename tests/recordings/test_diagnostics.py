@@ -2,7 +2,7 @@
 
 import pytest
 
-from uav_dc_ros.recordings.pages.diagnostics import Node, Report
+from uav_dc_ros.recordings.pages.diagnostics import NodeHistory, NodeStatus
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ from uav_dc_ros.recordings.pages.diagnostics import Node, Report
     ],
     ids=["older bags", "now"],
 )
-def test_one_row_tells_how_long_messages_took_until_they_were_handled(values: dict[str, str]) -> None:
-    node = Node("world")
-    node.add(1.0, Report(0, "active", values))
-    assert node.page()["heard"] == [{"topic": "move", "p50_ms": 2.0, "p99_ms": 5.0}]
+def test_one_row_per_topic_has_the_latency_until_handling(values: dict[str, str]) -> None:
+    node = NodeHistory("world")
+    node.add(1.0, NodeStatus(0, "active", values))
+    assert node.data()["latencies"] == [{"topic": "move", "p50_ms": 2.0, "p99_ms": 5.0}]

@@ -29,7 +29,7 @@ def act(mission, step):
 
 
 def export(capsys, bag, *options):
-    """Exit status and output; of a refusal its line."""
+    """Exit status and output; of an error its line."""
     with pytest.raises(SystemExit) as exit:
         command.main(["export", str(bag), *map(str, options)])
     out, err = capsys.readouterr()
@@ -63,7 +63,7 @@ def rows_of(path):
 
 
 @pytest.mark.parametrize("format", ["parquet", "csv"])
-def test_tables_hold_what_the_environment_tells(bag, tmp_path, capsys, format):
+def test_tables_hold_the_values_of_the_environment(bag, tmp_path, capsys, format):
     status, out = export(capsys, bag, "--out", tmp_path / "tables", "--format", format)
     assert status == 0
     n_users = TINY.n_users
@@ -115,7 +115,7 @@ def test_both_formats_hold_the_same(bag, tmp_path, capsys):
     assert schema.metadata[b"scenario_fingerprint"].decode() == TINY.fingerprint
 
 
-def test_only_the_tables_asked_for(bag, tmp_path, capsys):
+def test_only_the_tables_named(bag, tmp_path, capsys):
     status, _ = export(
         capsys, bag, "--out", tmp_path / "some", "--tables", "missions,steps", "--format", "csv"
     )
@@ -145,7 +145,7 @@ def test_transitions_are_those_of_the_environment(bag, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("observation", ["position", "map"])
-def test_in_other_eyes_and_paid_at_once(bag, tmp_path, capsys, observation):
+def test_other_observations_and_the_immediate_reward(bag, tmp_path, capsys, observation):
     check_transitions(capsys, bag, tmp_path / "t.npz", observation, "immediate")
 
 
@@ -201,15 +201,15 @@ def test_the_action_of_a_transition_is_what_was_flown(tmp_path, capsys):
     assert np.load(tmp_path / "t.npz")["action"][:3].tolist() == [Action.HOVER, Action.RIGHT, Action.FORWARD]
 
 
-def test_what_is_no_transition_is_left_out_and_counted(tmp_path, capsys):
+def test_what_is_no_transition_is_skipped_and_counted(tmp_path, capsys):
     hovering = flight(TINY, act=lambda mission, step: 6)
     jump = changing("mission", 0, 6, lambda one: msgspec.structs.replace(one, cell=(2, 0, 0)))
     told = [jump(m) for m in map(changing("rates", 0, 3, lambda _: None), hovering) if m]
     bag = write(tmp_path / "bag", told, about(TINY))
     status, out = export(capsys, bag, "--transitions", "--out", tmp_path / "t.npz")
     assert status == 0
-    assert "2 left out: a step whose beginning or end is not recorded" in out
-    assert "2 left out: a step between cells that are no neighbours" in out
+    assert "2 skipped: a step whose start or end is not recorded" in out
+    assert "2 skipped: a step between cells that are not adjacent" in out
     assert np.load(tmp_path / "t.npz")["step"].tolist() == [0, 1, 4, 7]
 
 
@@ -218,8 +218,8 @@ def test_what_is_no_transition_is_left_out_and_counted(tmp_path, capsys):
     [
         (["--out", "{taken}"], "exists; expected a new name, nothing is overwritten"),
         (["--transitions", "--out", "{taken}/t.csv"], "expected a file NAME.npz for transitions"),
-        (["--transitions", "--out", "{new}.npz", "--tables", "steps"], "--tables has a meaning without --tr"),
-        (["--out", "{new}", "--observation", "map"], "--observation has a meaning with --transitions only"),
+        (["--transitions", "--out", "{new}.npz", "--tables", "steps"], "--tables applies only without --tr"),
+        (["--out", "{new}", "--observation", "map"], "--observation applies only with --transitions"),
         (["--out", "{new}", "--tables", "steps,poses"], "'poses'; expected some of steps, users, missions"),
         (["--out", "/proc/new"], "/proc/new cannot be written"),
         (["--out", "{new}", "--scenario", "five_clusters"], "start this node with the mission's scenario"),
@@ -238,7 +238,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing(bag, tmp_path, capsys, options
     assert [path.name for path in (tmp_path / "taken").iterdir()] == ["mine"]
 
 
-def test_csv_needs_no_pyarrow_and_parquet_says_what_it_needs(bag, tmp_path):
+def test_csv_needs_no_pyarrow_and_parquet_reports_what_it_needs(bag, tmp_path):
     def without_pyarrow(*options):
         code = "import sys; sys.modules['pyarrow'] = sys.modules['torch'] = None\n"
         code += f"from uav_dc_ros.bag import main; main(['export', {str(bag)!r}, *{[*map(str, options)]!r}])"
@@ -262,7 +262,7 @@ def test_many_rows_come_in_row_groups(tmp_path, capsys, monkeypatch):
     assert len(rows_of(tmp_path / "t" / "users.parquet")) == 27 * TINY.n_users
 
 
-def test_two_flights_are_told_apart(tmp_path, capsys):
+def test_two_flights_are_distinguished(tmp_path, capsys):
     first = flight(TINY, steps=4)
     second = flight(TINY, begun_ns=first[-1].log_time_ns + 10**9)
     bag = write(tmp_path / "bag", first + second, about(TINY))

@@ -25,12 +25,11 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.recordings.info.missions import look_through
+from uav_dc_ros.recordings.info.missions import survey_missions
 from uav_dc_ros.recordings.pages import missions as pages
-from uav_dc_ros.recordings.pages.vehicle import WAY_MAX, Way
-from uav_dc_ros.recordings.recorded_step import TOLD_KEPT, RecordedPose
-from uav_dc_ros.recordings.recorded_vehicle import vehicle
-from uav_dc_ros.recordings.step_reader import Steps
+from uav_dc_ros.recordings.pages.vehicle import PATH_MAX, VehiclePath
+from uav_dc_ros.recordings.recorded_step import PHASE_REPORTS_MAX, RecordedPose
+from uav_dc_ros.recordings.step_reader import Steps, vehicle
 from uav_dc_ros.recordings.verify.command import verify
 
 TINY = tiny()
@@ -83,11 +82,11 @@ def not_reached(tmp_path_factory):
     return write(tmp_path_factory.mktemp("late") / "bag", changed, flights.flown_about(TINY, 5))
 
 
-def test_steps_that_were_not_reached_are_told(not_reached, capsys, tmp_path):
-    assert not any(step.others for step in steps_of(not_reached)[0])
+def test_steps_that_were_not_reached_are_reported(not_reached, capsys, tmp_path):
+    assert not any(step.conflicts for step in steps_of(not_reached)[0])
     status, printed = run(capsys, "verify", not_reached)
     assert status == 0
-    assert "2 flown steps were not reached within the tolerance, as the vehicle says" in printed
+    assert "2 flown steps did not reach their cell within the tolerance" in printed
     _, printed = run(capsys, "info", not_reached)
     assert re.search(r"steps +not reached +users collected", printed)
     _, printed = run(capsys, "info", not_reached, "--json")
@@ -96,12 +95,12 @@ def test_steps_that_were_not_reached_are_told(not_reached, capsys, tmp_path):
     (row,) = csv.DictReader((tmp_path / "tables" / "missions.csv").open())
     assert row["steps_not_reached"] == "2"
     with BagReader(not_reached) as reader:
-        (one,) = pages.flown(iter(Steps(reader, "", STEP_NS)), TINY, True)
+        (one,) = pages.read_missions(Steps(reader, "", STEP_NS), TINY, True)
     assert one.summary()["steps_not_reached"] == 2
 
 
 def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
-    """One that was told before it, for the same end, is not."""
+    """An earlier one for the same end is not."""
     told = flights.Flight(TINY, seed=5).fly()
     last = max(i for i, message in enumerate(told) if message.topic == "/mission")
     payload = messages.decode(cdr.decode_string(told[last].data), messages.Mission)
@@ -115,7 +114,7 @@ def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
     (row,) = csv.DictReader((tmp_path / "tables" / "missions.csv").open())
     assert (row["outcome"], row["reason"]) == ("aborted", "the motors were stopped: by hand")
     with BagReader(bag) as reader:
-        (one,) = pages.flown(iter(Steps(reader, "", STEP_NS)), TINY, True)
+        (one,) = pages.read_missions(Steps(reader, "", STEP_NS), TINY, True)
     assert one.summary()["reason"] == "the motors were stopped: by hand"
 
 
@@ -123,14 +122,14 @@ def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("fault", flights.FAULTS)
-def test_a_step_has_all_that_its_vehicle_told(bags, fault):
+def test_a_step_has_all_phase_reports_of_its_vehicle(bags, fault):
     """Nothing is lost, repeated or too late, whatever happens on the way."""
     found, stream = steps_of(bags[fault])
     with BagReader(bags[fault]) as reader:
         words = flights.phases(list(reader.messages()))
-    assert [(step.step, told.phase, told.reason) for step in found for told in step.told] == words
+    assert [(step.step, told.phase, told.reason) for step in found for told in step.phase_reports] == words
     assert not stream.orphans + stream.repeated + stream.rejected
-    assert not any(step.others or step.untold for step in found)
+    assert not any(step.conflicts or step.n_dropped_reports for step in found)
     ends = flights.FAULTS[fault][1]
     assert (found[-1].status.phase, found[-1].status.reason) == (ends, words[-1][2])
     for step in found[:-1]:
@@ -141,39 +140,41 @@ def test_a_step_has_all_that_its_vehicle_told(bags, fault):
         assert step.is_measured == (fault != "ground")
 
 
-def test_the_weightiest_word_is_the_status_in_any_order():
+def test_the_status_is_the_same_in_any_order():
     told = flights.Flight(TINY, beat=flights.FAULTS["battery"][0]).fly()
     words = [m for m in told if m.topic == "/mission"]
     expected, _ = read(told)
-    times = {m.log_ns: step.step for step in expected for m in step.told}
+    times = {m.log_ns: step.step for step in expected for m in step.phase_reports}
     late = []
     for number in range(len(expected)):  # those of a step the other way round
         of_step = [m for m in words if times[m.log_time_ns] == number]
         late += [m._replace(log_time_ns=o.log_time_ns) for m, o in zip(of_step, of_step[::-1], strict=True)]
     found, _ = read([*(m for m in told if m.topic != "/mission"), *late])
     assert [step.status for step in found] == [step.status for step in expected]
-    assert [[t[:2] for t in step.told] for step in found] == [[t[:2] for t in step.told] for step in expected]
+    assert [[t[:2] for t in step.phase_reports] for step in found] == [
+        [t[:2] for t in step.phase_reports] for step in expected
+    ]
 
 
 def test_a_vehicle_that_is_ready_again_has_the_same_users_at_another_time():
-    """It held while it was ready: the world tells the users again, with the time of a new pose."""
+    """After a fault while it was ready, the world publishes the users again, with the time of a new pose."""
     frozen = flights.all_of(
         flights.once(flights.in_phase(Phase.READY, 0, 1.0), flights.setting(frozen=True)),
         flights.once(flights.in_phase(Phase.READY, 0, 3.0), flights.setting(frozen=False)),
     )
     flight = flights.Flight(TINY, beat=frozen, patience_s=5.0)
     found, stream = read(flight.fly())
-    reasons = [told.reason for told in found[0].told if told.phase is Phase.READY]
+    reasons = [told.reason for told in found[0].phase_reports if told.phase is Phase.READY]
     assert reasons[1:] == ["no position for 0.5 s", f"goes on after: {reasons[1]}"]
-    kinds = [told.fault for told in found[0].told if told.phase is Phase.READY]
+    kinds = [told.fault for told in found[0].phase_reports if told.phase is Phase.READY]
     assert kinds == [None, FaultKind.POSITION, None]
     assert found[0].flight == found[-1].flight == 0, "it is no other flight"
-    assert found[0].others["users"].stamp_ns > found[0].users.stamp_ns
+    assert found[0].conflicts["users"].stamp_ns > found[0].users.stamp_ns
     assert stream.repeated == {"rates": 1}
     assert len(found) == LAST + 1
 
 
-def test_what_a_middleware_repeats_is_counted_and_told_once():
+def test_what_a_middleware_repeats_is_counted_and_kept_once():
     told = flights.Flight(TINY).fly()
     words = [
         m._replace(log_time_ns=told[-1].log_time_ns + i) for i, m in enumerate(told) if m.topic == "/mission"
@@ -181,7 +182,7 @@ def test_what_a_middleware_repeats_is_counted_and_told_once():
     found, stream = read([*told, *words])
     assert stream.repeated == {"mission": len(words)}
     assert not stream.orphans
-    assert [step.told for step in found] == [step.told for step in read(told)[0]]
+    assert [step.phase_reports for step in found] == [step.phase_reports for step in read(told)[0]]
 
 
 def test_a_vehicle_that_waits_for_hours_fills_no_memory():
@@ -190,13 +191,13 @@ def test_a_vehicle_that_waits_for_hours_fills_no_memory():
     status = messages.decode(cdr.decode_string(word.data), messages.Mission)
     again = [
         said("mission", msgspec.structs.replace(status, reason=f"waits {n}"), word.log_time_ns + n)
-        for n in range(1, TOLD_KEPT + 50)
+        for n in range(1, PHASE_REPORTS_MAX + 50)
     ]
     told[i:i] = again
     (step,), stream = read(told)
-    assert len(step.told) == TOLD_KEPT
-    assert step.untold == len(flights.phases(told)) - TOLD_KEPT
-    assert step.status.phase is step.told[-1].phase is Phase.ABORTED
+    assert len(step.phase_reports) == PHASE_REPORTS_MAX
+    assert step.n_dropped_reports == len(flights.phases(told)) - PHASE_REPORTS_MAX
+    assert step.status.phase is step.phase_reports[-1].phase is Phase.ABORTED
     assert not stream.repeated
 
 
@@ -240,8 +241,8 @@ def test_a_flight_verifies(bags, capsys, fault):
     )
     assert expected in out
     assert f"world: {n} of {n} steps recomputed, equal to the last bit" in out
-    assert f"vehicle (mavlink): phases of {n} of {n} steps looked at, each follows as it may" in out
-    assert "none of them twice" in out
+    assert f"vehicle (mavlink): phases of {n} of {n} steps checked, all changes are allowed" in out
+    assert "none twice" in out
 
 
 def test_a_policys_flight_verifies_wholly(bags, capsys):
@@ -251,7 +252,7 @@ def test_a_policys_flight_verifies_wholly(bags, capsys):
     assert out.endswith("\nverified\n")
 
 
-def test_how_far_the_vehicle_was_from_its_cells_is_told(bags, capsys):
+def test_the_distance_from_the_cells_is_reported(bags, capsys):
     found, _ = steps_of(bags["none"])
     off_m = [
         math.dist(s.poses[0].position_m, TINY.grid.centre_m(np.asarray(s.status.cell), like=np.zeros(1)))
@@ -260,8 +261,8 @@ def test_how_far_the_vehicle_was_from_its_cells_is_told(bags, capsys):
     _, out = run(capsys, "verify", bags["none"])
     at = found[int(np.argmax(off_m))].name
     mean, most = f"{np.mean(off_m):.2f} m", f"{max(off_m):.2f} m ({at})"
-    assert f"measured {mean} from the centre of its cell on average, at most {most}" in out
-    # One that cannot descend in the time of a step is told, and no difference.
+    assert f"distance from the centre of the cell: mean {mean}, max {most}" in out
+    # A vehicle that cannot descend in the time of a step is reported, and is no difference.
     assert "nearer to the centre of another cell" not in out
 
 
@@ -292,7 +293,7 @@ def test_what_is_changed_in_it_is_found(bags, capsys, tmp_path, topic, step, cha
 
 
 def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
-    """What a bridge would tell that began a move anew after it was killed."""
+    """What a bridge would publish that restarted a move after it was killed."""
     with BagReader(bags["none"]) as reader:
         told = list(reader.messages())
     where = [i for i, m in enumerate(told) if m.topic == "/mission"]
@@ -312,11 +313,11 @@ def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
     bag = write(tmp_path / "bag", told, flights.flown_about(TINY, 5))
     status, out = run(capsys, "verify", bag)
     assert status == 1
-    assert "phases of 9 of 9 steps looked at, 1 are not as they may be; first:" in out
+    assert "phases of 9 of 9 steps checked, 1 have a change that is not allowed; first:" in out
     assert "mission: mission 0, step 3, phase: recorded 'ready', recomputed 'one of landing" in out
 
 
-def test_a_bag_of_another_recorder_is_known_by_what_the_vehicle_tells(bags, capsys, tmp_path):
+def test_the_vehicle_of_another_recorders_bag_is_known_by_its_statuses(bags, capsys, tmp_path):
     with BagReader(bags["hold"]) as reader:
         told = list(reader.messages())
         assert vehicle(reader, "") == "mavlink"
@@ -337,7 +338,7 @@ def test_a_bag_of_another_recorder_is_known_by_what_the_vehicle_tells(bags, caps
     "seeds", [range(7, 13), pytest.param(range(300), marks=pytest.mark.long)], ids=["some", "many"]
 )
 def test_whatever_happens_on_the_way_the_bag_verifies(tmp_path, seeds):
-    """Faults at random moments: nothing that a bridge tells of them is taken for a difference."""
+    """Faults at random moments: no report of a bridge counts as a difference."""
     ends = set()
     for seed in seeds:
         told = flights.Flight(TINY, seed=seed, beat=flights.at_random(seed)).fly(cut_s=400.0)
@@ -345,9 +346,9 @@ def test_whatever_happens_on_the_way_the_bag_verifies(tmp_path, seeds):
         with BagReader(bag) as reader:
             found = verify(reader, "", TINY)
             assert not found.differs, (seed, found.lines)
-            (mission,) = look_through(reader, "", [])
+            (mission,) = survey_missions(reader, "", [])
         assert mission.reason
-        # A bridge that dies between its word and its next pose leaves a step that nobody measured.
+        # A bridge that dies between a status and the next pose leaves a step that is not measured.
         assert max(mission.missing.values(), default=0) <= 1, (seed, mission.missing)
         ends.add(mission.outcome)
         shutil.rmtree(bag)
@@ -379,8 +380,8 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
     status, out = run(capsys, "verify", bag, "--policy-dir", low[-1], "--complete")
     assert status == 0, out
     assert out.endswith("\nverified\n")
-    assert "phases of 8 of 8 steps looked at, each follows as it may; 7 moves were begun" in out
-    told = [one for step in steps_of(bag)[0] for one in step.told]
+    assert "phases of 8 of 8 steps checked, all changes are allowed; 7 moves were started" in out
+    told = [one for step in steps_of(bag)[0] for one in step.phase_reports]
     gone = (True, FaultKind.POLICY, "the policy is gone")
     assert gone in {(one.held, one.fault, one.reason) for one in told}
     assert sum(one.phase is Phase.TAKEOFF for one in told) == 2
@@ -389,12 +390,12 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
     assert "pace" not in out, "it has its own"
     assert "bridge 1, policy 1" in out
     assert "mission 0: landed: step 7: at the dock" in out
-    journey = page_of(capsys, bag, ros.folder)["mission-0"]["journey"]
-    assert max(journey["way"]["z"]) == pytest.approx(10.0, abs=2.0)
+    timeline = page_of(capsys, bag, ros.folder)["mission-0"]["timeline"]
+    assert max(timeline["path"]["z"]) == pytest.approx(10.0, abs=2.0)
 
 
 def as_version_0_1(message):
-    """A word of the vehicle as it was once said: a fault had no field, and stood in the reason."""
+    """A status as in version 0.1: a fault had no field, and was part of the reason."""
     payload = json.loads(cdr.decode_string(message.data))
     held, _ = payload.pop("held"), payload.pop("fault")
     payload["reason"] = f"holds: {payload['reason']}" if held else payload["reason"]
@@ -405,7 +406,7 @@ def test_a_bag_of_version_0_1_is_read_as_before(bags, capsys, tmp_path):
     told = flights.Flight(TINY, seed=5, beat=flights.FAULTS["hold"][0]).fly()
     old = [as_version_0_1(one) if one.topic == "/mission" else one for one in told]
     bag = write(tmp_path / "old", old, flights.flown_about(TINY, 5))
-    words = [[one for step in steps_of(it)[0] for one in step.told] for it in (bag, bags["hold"])]
+    words = [[one for step in steps_of(it)[0] for one in step.phase_reports] for it in (bag, bags["hold"])]
     assert [one.held for one in words[0]] == [one.held for one in words[1]]
     prefixes = ["holds: " if one.held else "" for one in words[1]]
     assert any(prefixes)
@@ -423,7 +424,7 @@ def test_a_bag_of_version_0_1_is_read_as_before(bags, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("fault", ["none", "pilot", "ground"])
-def test_info_tells_the_outcome_with_its_reason(bags, capsys, fault):
+def test_info_shows_the_outcome_with_its_reason(bags, capsys, fault):
     status, out = run(capsys, "info", bags[fault])
     found, _ = steps_of(bags[fault])
     ended = found[-1].status
@@ -453,12 +454,14 @@ def test_an_export_has_reasons_phases_and_times(bags, capsys, tmp_path):
     assert [row["phase"] for row in rows] == ["ready"] * LAST + ["landed"]
     assert rows[0]["flown_s"] == ""
     for before, step, row in zip(found, found[1:], rows[1:], strict=False):
-        begun = next(t for t in before.told if t.phase is Phase.MOVING)
-        there = next(t for t in step.told if t.phase in (Phase.READY, Phase.LANDING))
+        begun = next(t for t in before.phase_reports if t.phase is Phase.MOVING)
+        there = next(t for t in step.phase_reports if t.phase in (Phase.READY, Phase.LANDING))
         assert float(row["flown_s"]) == pytest.approx((there.publish_ns - begun.publish_ns) / 1e9)
     assert sum(float(row["flown_s"]) for row in rows[1:5]) > 40.0, "a hundred metres take ten seconds"
     words = [(int(r["step"]), r["phase"], r["reason"], r["held"]) for r in table(tmp_path / "t", "phases")]
-    assert words == [(s.step, t.phase.value, t.reason, str(t.held).lower()) for s in found for t in s.told]
+    assert words == [
+        (s.step, t.phase.value, t.reason, str(t.held).lower()) for s in found for t in s.phase_reports
+    ]
     (mission,) = table(tmp_path / "t", "missions")
     assert (mission["vehicle"], mission["outcome"], mission["reason"]) == (
         "mavlink", "landed", found[-1].status.reason,
@@ -468,7 +471,7 @@ def test_an_export_has_reasons_phases_and_times(bags, capsys, tmp_path):
 def test_a_simulated_flight_has_none_of_these(capsys, tmp_path):
     bag = write(tmp_path / "bag", flight(TINY), flights.about(TINY))
     status, out = run(capsys, "export", bag, "--out", tmp_path / "t", "--tables", "phases")
-    assert (status, "--tables phases: of a real vehicle only; expected steps, users" in out) == (2, True)
+    assert (status, "--tables phases: for real vehicles only; expected steps, users" in out) == (2, True)
     assert run(capsys, "export", bag, "--out", tmp_path / "t", "--format", "csv")[0] == 0
     assert sorted(path.name for path in (tmp_path / "t").iterdir()) == [
         "missions.csv",
@@ -500,48 +503,48 @@ def page_of(capsys, bag, tmp_path):
 
 
 @pytest.mark.parametrize("fault", flights.FAULTS)
-def test_a_report_tells_phases_faults_and_the_way(bags, capsys, tmp_path, fault):
+def test_a_report_shows_phases_faults_and_the_path(bags, capsys, tmp_path, fault):
     data = page_of(capsys, bags[fault], tmp_path)
     found, _ = steps_of(bags[fault])
-    told = [(step.step, one.phase.value, one.reason) for step in found for one in step.told]
-    journey = data["mission-0"]["journey"]
-    assert [(row["step"], row["phase"], row["reason"]) for row in journey["words"]] == told
-    assert [row["s"] for row in journey["words"]] == sorted(row["s"] for row in journey["words"])
+    told = [(step.step, one.phase.value, one.reason) for step in found for one in step.phase_reports]
+    timeline = data["mission-0"]["timeline"]
+    assert [(row["step"], row["phase"], row["reason"]) for row in timeline["phases"]] == told
+    assert [row["s"] for row in timeline["phases"]] == sorted(row["s"] for row in timeline["phases"])
     (mission,) = data["data"]["missions"]
     assert (mission["outcome"], mission["reason"]) == (told[-1][1], told[-1][2])
     whats = [one["what"] for one in data["data"]["health"]["faults"]]
-    held = [f"step {step.step}: {one.reason}" for step in found for one in step.told if one.held]
+    held = [f"step {step.step}: {one.reason}" for step in found for one in step.phase_reports if one.held]
     assert bool(held) == (fault in ("hold", "frozen"))
     ended = [f"aborted, after step {found[-1].step}: {told[-1][2]}"] if told[-1][1] == "aborted" else []
     assert whats == held + ended
-    cells = journey["cells"]
+    cells = timeline["cells"]
     assert cells["step"] == ([] if fault == "ground" else [step.step for step in found])
-    assert all(off_m < 2.0 for off_m in cells["off_m"])
-    way = journey["way"]
-    assert len(way["s"]) == len(way["x"]) == len(way["z"])
+    assert all(distance_m < 2.0 for distance_m in cells["distance_m"])
+    path = timeline["path"]
+    assert len(path["s"]) == len(path["x"]) == len(path["z"])
     if fault in ("none", "hold", "restart", "battery"):
-        assert max(way["z"]) == pytest.approx(100.0, abs=1.0)
-        assert way["z"][-1] < 3.0, "down to the ground"
-        assert np.hypot(np.diff(way["x"]), np.diff(way["y"])).sum() > 300.0
+        assert max(path["z"]) == pytest.approx(100.0, abs=1.0)
+        assert path["z"][-1] < 3.0, "down to the ground"
+        assert np.hypot(np.diff(path["x"]), np.diff(path["y"])).sum() > 300.0
 
 
-def test_the_way_of_a_long_flight_stays_small():
+def test_the_path_of_a_long_flight_stays_small():
     """Ten hours of poses, now flying, now standing."""
-    way = Way(TINY)
+    path = VehiclePath(TINY)
     for i in range(0, 36_000 * 20, 7):
         at_ns = round(i / 20 * 1e9)
         x_m = (i // 20_000) * 500.0 + (i % 20_000) * 0.5 * (i // 20_000 % 2)
-        way.add(RecordedPose(at_ns, np.asarray([x_m, 0.0, 100.0]), at_ns, at_ns))
-    columns = way.columns(0, 10**18)
-    assert 1000 < len(columns["s"]) == len(columns["x"]) == len(columns["z"]) <= WAY_MAX
+        path.add(RecordedPose(at_ns, np.asarray([x_m, 0.0, 100.0]), at_ns, at_ns))
+    columns = path.columns(0, 10**18)
+    assert 1000 < len(columns["s"]) == len(columns["x"]) == len(columns["z"]) <= PATH_MAX
     assert columns["s"][0] == 0.0
     assert max(np.diff(columns["s"])) < 80.0, "no part of it is lost"
-    part = way.columns(10**12, 2 * 10**12)
+    part = path.columns(10**12, 2 * 10**12)
     assert (part["s"][0] >= 0.0, part["s"][-1] <= 1000.0) == (True, True)
 
 
 def test_a_long_flight_has_a_report(long_flight, capsys, tmp_path):
     data = page_of(capsys, write(tmp_path / "bag", long_flight, flights.flown_about(LONG)), tmp_path)
-    journey = data["mission-0"]["journey"]
-    assert len(journey["cells"]["step"]) == LONG.mission.max_steps + 1
+    timeline = data["mission-0"]["timeline"]
+    assert len(timeline["cells"]["step"]) == LONG.mission.max_steps + 1
     assert (tmp_path / "page.html").stat().st_size < 3_000_000

@@ -166,24 +166,24 @@ def test_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         "metadata.yaml is missing",
         "5 messages of /pose were dropped",
         "steps lack messages: 1 pose, 1 rates",
-        "2 of 3 missions are there to their end",
+        "2 of 3 missions have an end",
     ]
     assert {topic["name"]: topic["dropped"] for topic in told["topics"]}["/pose"] == 5
     assert "dropped" in info(bag, capsys)
 
 
-def test_metadata_that_tells_something_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_metadata_that_differs_from_the_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = flown(tmp_path / "bag")
     shutil.copy(bag / "bag_0.mcap", bag / "bag_1.mcap")
-    assert "metadata.yaml tells other files, or other numbers of messages, than there are" in info(
+    assert "metadata.yaml lists other files, or other numbers of messages, than the bag has" in info(
         bag, capsys
     )
     (bag / "metadata.yaml").write_text("[}")
-    assert "metadata.yaml says nothing of a bag" in info(bag, capsys)
+    assert "metadata.yaml describes no bag" in info(bag, capsys)
 
 
 def test_a_torn_bag_and_a_damaged_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Told as far as they go, and how to go on."""
+    """Info shows the readable part, and how to recover."""
     file = content(flown(tmp_path / "bag"))["bag_0.mcap"]
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(file[:-700])
@@ -200,11 +200,11 @@ def test_a_torn_bag_and_a_damaged_one(tmp_path: Path, capsys: pytest.CaptureFixt
     assert told["about"]["seed"] == "7"
 
 
-def test_a_bag_of_somebody_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bag_of_another_recorder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "foreign.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
-        writer.start("", "somebody [bold]")
+        writer.start("", "other [bold]")
         schema = writer.register_schema("Thing", "jsonschema", b"{}")
         channel = writer.register_channel("/a/topic/of/a/very/long/name/" + 80 * "x", "json", schema)
         for i in range(3):
@@ -212,7 +212,7 @@ def test_a_bag_of_somebody_else(tmp_path: Path, capsys: pytest.CaptureFixture[st
         writer.finish()
     text = info(path, capsys)
     assert "foreign.mcap complete" in text
-    assert "written by somebody [bold]" in text
+    assert "written by other [bold]" in text
     assert max(map(len, text.splitlines()[1:])) <= 80
 
 
@@ -265,7 +265,7 @@ def test_what_is_no_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         ),
     ],
 )
-def test_payloads_that_cannot_be_decoded_are_told_by_every_verb(
+def test_payloads_that_cannot_be_decoded_are_reported_by_every_verb(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[bytes], bytes], why: str
 ) -> None:
     bag = made.copy(

@@ -44,14 +44,14 @@ def made(tmp_path):
 
 
 def whats(data):
-    return [(fault["who"], fault["what"]) for fault in data["data"]["health"]["faults"]]
+    return [(fault["source"], fault["what"]) for fault in data["data"]["health"]["faults"]]
 
 
-def test_the_page_of_flown_missions_tells_what_run_all_told(module_ros):
+def test_the_page_of_missions_equals_the_summary_of_run_all(module_ros):
     ros = module_ros
     (ros.folder / "small.toml").write_text(SMALL)
     saved(ros.folder / "untrained", scenarios.load(ros.folder / "small.toml"), name="untrained")
-    # Two seconds: long enough for every node to tell its diagnostics.
+    # Two seconds: long enough for every node to publish its diagnostics.
     flown = ("--scenario", "small.toml", "--policy", "untrained", "--pace", 300, "--missions", 2)
     status, output = ros.run_all(*flown, "--bag", "flown", "--summary", "told.json")
     assert status == 0, output
@@ -69,19 +69,19 @@ def test_the_page_of_flown_missions_tells_what_run_all_told(module_ros):
             assert summary[key] == pytest.approx(wanted[key], rel=1e-12), key
     assert data["data"]["policy"] == "untrained"
     for key in ("mission-0", "mission-1"):
-        assert [step["step"] for step in data[key]["course"]] == list(range(31))
+        assert [step["step"] for step in data[key]["steps"]] == list(range(31))
 
     health = data["data"]["health"]
     latencies = {topic["name"]: topic for topic in health["topics"]}
     for topic, count in (("/users", 62), ("/rates", 62), ("/mission", 62), ("/move", 60), ("/pose", 62)):
-        assert latencies[topic]["count"] >= count, topic  # a lockstep that stands still says its step again
+        assert latencies[topic]["count"] >= count, topic  # a lockstep that stands still repeats its step
         assert 0 < latencies[topic]["p50_ms"] <= latencies[topic]["p99_ms"] <= latencies[topic]["max_ms"]
     chain = {row["name"]: row for row in health["chain"]}
     assert chain["users → rates"]["count"] == 62
     assert chain["users → move"]["p50_ms"] > chain["rates → move"]["p50_ms"] > 0
     assert {node["name"] for node in health["nodes"]} >= {"world", "channel_monitor", "policy", "recorder"}
-    # A machine that has no time may start steps late, and a node says so; nothing else went wrong.
-    assert all("step" in fault["what"] and fault["who"] == "world" for fault in health["faults"])
+    # On a busy machine steps start late, and a node reports it; nothing else may go wrong.
+    assert all("step" in fault["what"] and fault["source"] == "world" for fault in health["faults"])
 
     text = (ros.folder / "flown.html").read_text("utf-8")
     assert "default-src 'none'" in text
@@ -91,7 +91,7 @@ def test_the_page_of_flown_missions_tells_what_run_all_told(module_ros):
 def test_users_and_rewards_are_those_of_the_core(made):
     scenario = tiny(mission={"r_min_bits": 4e6, "d_cons_m": 150.0})
     data = made(scenario, seeds=(5,))
-    course, table = data["mission-0"]["course"], data["mission-0"]["table"]
+    course, table = data["mission-0"]["steps"], data["mission-0"]["table"]
     flown = list(report_bags.states(scenario, 5))
     collected_at = np.full(scenario.n_users, -1)
     for step, (state, link, _) in zip(course, flown, strict=True):
@@ -116,7 +116,7 @@ def test_users_and_rewards_are_those_of_the_core(made):
         assert table["sinr_db"][user] == pytest.approx(10 * np.log10(sinr[mine, user].mean()), abs=0.01)
 
 
-def test_faults_are_told_and_a_good_bag_has_none(made):
+def test_faults_are_reported_and_a_good_bag_has_none(made):
     scenario = tiny()
     assert whats(made(scenario)) == []
     bad_text = ("/rates", "std_msgs/msg/String", b"\0\1\0\0\5\0\0\0nope\0")
@@ -155,7 +155,7 @@ def test_a_long_mission_is_thinned_out_and_its_figures_are_not(made):
     scenario = tiny(mission={"max_steps": 1301}, grid={"n_x": 9, "n_y": 9})
     data = made(scenario)
     mission = data["mission-0"]
-    steps = [step["step"] for step in mission["course"]]
+    steps = [step["step"] for step in mission["steps"]]
     assert mission["stride"] > 1
     assert len(steps) <= 402
     assert (steps[0], steps[1], steps[-1]) == (0, mission["stride"], 1301), "first and last are there"
@@ -185,13 +185,13 @@ def test_as_many_missions_as_fit_and_the_others_on_request(tmp_path, capsys, mon
     monkeypatch.setattr(pages, "PAGE_MAX", 2_250_000)  # some of eight
     assert report(folder, "--out", out) == 0
     data, told = report_bags.unpacked(out), capsys.readouterr().out
-    held = data["data"]["held"]
-    assert held == list(range(len(held)))
-    assert 0 < len(held) < 8
+    shown = data["data"]["shown"]
+    assert shown == list(range(len(shown)))
+    assert 0 < len(shown) < 8
     assert out.stat().st_size <= 2_250_000
-    assert set(data) == {"data", *(f"mission-{i}" for i in held)}
+    assert set(data) == {"data", *(f"mission-{i}" for i in shown)}
     assert len(data["data"]["missions"]) == data["data"]["missions_total"] == 8
-    assert f"{len(held)} of 8 (as many as fit; --mission N shows others) missions" in told
+    assert f"{len(shown)} of 8 (as many as fit; --mission N shows others) missions" in told
     assert report(folder, "--out", out, "--mission", 7) == 0
     assert [summary["mission"] for summary in report_bags.unpacked(out)["data"]["missions"]] == [7]
 
@@ -258,7 +258,7 @@ def test_missions_of_a_bag_side_by_side(tmp_path):
     assert groups[0]["metrics"]["reward"]["low"] is None, "of one mission there is no interval"
 
 
-def test_other_worlds_are_told_and_not_paired(tmp_path):
+def test_other_worlds_are_reported_and_not_paired(tmp_path):
     first = report_bags.write(tmp_path / "first", tiny(), seeds=(1, 2))
     other = report_bags.write(tmp_path / "other", tiny(mission={"max_steps": 9}), seeds=(1, 2))
     out = tmp_path / "page.html"
@@ -275,11 +275,11 @@ def test_bad_input_gets_one_line(tmp_path, capsys):
     cases = {
         (tmp_path / "none",): "no such folder",
         (good, "--mission", 99): "no step of a mission 99",
-        (good, "--out", precious): "it exists, and is no report",
-        (good, "--out", tmp_path): "it exists, and is no report",
+        (good, "--out", precious): "exists and is not a report",
+        (good, "--out", tmp_path): "exists and is not a report",
         (good, "--out", tmp_path / "no" / "page.html"): "expected a file in an existing folder",
         (good, "--namespace", "other"): "no mission in namespace 'other'",
-        (good, "--compare"): "more missions than can be told apart",
+        (good, "--compare"): "more missions than a picture shows",
         (good, *["--compare", *[good] * 8]): "9 bags; expected at most 8",
     }
     for arguments, wanted in cases.items():

@@ -92,22 +92,22 @@ class Opened:
     """A page in a browser.
 
     Attributes:
-        wrong: errors that it said, and addresses that it asked for.
+        wrong: errors that it logged, and addresses that it requested.
     """
 
     def __init__(self, browser: Any, path: Path, size: dict[str, int], **how: Any) -> None:
         self.wrong: list[str] = []
         self.context = browser.new_context(viewport=size, offline=True, **how)
         self.page = self.context.new_page()
-        self.page.on("console", lambda said: said.type == "error" and self.wrong.append(said.text))
+        self.page.on("console", lambda message: message.type == "error" and self.wrong.append(message.text))
         self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on("request", self._asked)
+        self.page.on("request", self._requested)
         self.page.goto(path.as_uri())
         self.page.locator("main:not([aria-busy])").wait_for(timeout=DRAWN_MS)
 
-    def _asked(self, request: Any) -> None:
+    def _requested(self, request: Any) -> None:
         if not re.match(r"file:.*/page\.html$|data:|blob:", request.url):
-            self.wrong.append(f"asked for {request.url}")
+            self.wrong.append(f"requested {request.url}")
 
     def check(self) -> None:
         """Nothing went wrong until now."""
@@ -155,13 +155,13 @@ def contrast(page: Any, element: str) -> float:
 
 
 def test_the_slider_moves_the_uav_and_colours_the_users(page, mission_page):
-    course = report_bags.unpacked(mission_page)["mission-0"]["course"]
+    course = report_bags.unpacked(mission_page)["mission-0"]["steps"]
     seen = set()
     for step, wanted in enumerate(course):
         assert page.evaluate(UAV)[:2] == wanted["uav_m"][:2], step
         assert page.evaluate(SHOWN) == [wanted["state"].count(code) for code in "012"]
         assert page.evaluate(CURSOR) == step
-        assert f"step {step} of 12" in page.locator("#told").inner_text()
+        assert f"step {step} of 12" in page.locator("#position").inner_text()
         seen.add(tuple(wanted["uav_m"]))
         page.keyboard.press("ArrowRight")
     assert len(seen) > 3, "the UAV flies"
@@ -170,14 +170,14 @@ def test_the_slider_moves_the_uav_and_colours_the_users(page, mission_page):
 def test_play_flies_step_by_step_to_the_end(page):
     page.evaluate("""() => {
         window.seen = [];
-        const told = document.getElementById("told");
+        const told = document.getElementById("position");
         const note = () => window.seen.push(Number(told.textContent.match(/step (\\d+)/)[1]));
         new MutationObserver(note).observe(told, { childList: true });
     }""")
     page.get_by_role("button", name="Play").click()
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Play").click()
-    page.locator("#told", has_text="step 12 of 12").wait_for()
+    page.locator("#position", has_text="step 12 of 12").wait_for()
     page.get_by_role("button", name="Play").wait_for()
     seen = page.evaluate("() => window.seen")
     assert seen == sorted(seen)
@@ -188,7 +188,7 @@ def test_another_mission_and_tables_in_order(page, mission_page):
     data = report_bags.unpacked(mission_page)
     page.get_by_label("Mission", exact=True).select_option("1")
     page.locator("#about", has_text="mission 1, seed 6").wait_for()
-    assert page.evaluate(UAV)[:2] == data["mission-1"]["course"][-1]["uav_m"][:2]
+    assert page.evaluate(UAV)[:2] == data["mission-1"]["steps"][-1]["uav_m"][:2]
     table = data["mission-1"]["table"]
     wanted = sorted(table["user"], key=lambda user: (-table["data_bits"][user], user))
     head = page.get_by_role("region", name="Table of users").get_by_role("button", name="data")
@@ -199,7 +199,7 @@ def test_another_mission_and_tables_in_order(page, mission_page):
     assert page.locator("#users th[aria-sort]").get_attribute("aria-sort") == "descending"
     rows.first.click()
     chosen = "() => document.getElementById('scene').data.find((trace) => trace.name === 'chosen').x"
-    users_m = data["mission-1"]["course"][-1]["users_m"]
+    users_m = data["mission-1"]["steps"][-1]["users_m"]
     assert page.evaluate(chosen) == [users_m[0][wanted[0]]]
 
 
@@ -244,7 +244,7 @@ def test_a_phone_shows_all_of_a_mission(browser, mission_page):
 
 
 def test_the_scene_is_drawn_in_3d(browser_3d, mission_page):
-    course = report_bags.unpacked(mission_page)["mission-0"]["course"]
+    course = report_bags.unpacked(mission_page)["mission-0"]["steps"]
     opened = Opened(browser_3d, mission_page, SMALL)
     assert scene_kinds(opened.page) == {"scatter3d", "mesh3d"}
     opened.page.get_by_label("Step", exact=True).focus()
@@ -260,7 +260,7 @@ def test_without_webgl_there_is_a_map(page):
 
 
 def test_the_flight_of_a_real_vehicle(browser, tmp_path):
-    """Its reason is told, its phases are listed, and its way is drawn as far as the slider stands."""
+    """The page shows its reason and phases, and draws its path up to the slider's step."""
     scenario = tiny()
     flight = flights.Flight(scenario, beat=flights.FAULTS["battery"][0])
     said = [cdr.decode_string(m.data) for m in flight.fly() if m.topic == "/mission"]
@@ -268,22 +268,22 @@ def test_the_flight_of_a_real_vehicle(browser, tmp_path):
     told = [said_with(m, words[-1], HOSTILE) for m in flight.told]
     bag = flights.write(tmp_path / "bag", told, flights.flown_about(scenario))
     assert report(bag, "--out", tmp_path / "page.html") == 0
-    journey = report_bags.unpacked(tmp_path / "page.html")["mission-0"]["journey"]
+    timeline = report_bags.unpacked(tmp_path / "page.html")["mission-0"]["timeline"]
     opened = Opened(browser, tmp_path / "page.html", DESKTOP)
     page = opened.page
     assert page.locator("#why").inner_text() == f"aborted: {HOSTILE}"
     rows = page.get_by_role("region", name="Phases").locator("tbody tr")
-    assert rows.count() == len(journey["words"]) == len(words)
+    assert rows.count() == len(timeline["phases"]) == len(words)
     drawn = "() => document.getElementById('altitude').data.find((trace) => trace.name === 'flown').y"
-    assert page.evaluate(drawn) == journey["way"]["z"]
+    assert page.evaluate(drawn) == timeline["path"]["z"]
     flown_x = "() => document.getElementById('scene').data.find((trace) => trace.name === 'flown').x"
-    assert page.evaluate(flown_x) == journey["way"]["x"]
+    assert page.evaluate(flown_x) == timeline["path"]["x"]
     page.get_by_label("Step", exact=True).focus()
     page.keyboard.press("Home")
-    way, began_s = journey["way"], journey["cells"]["s"][0]
-    climb = [x for x, s in zip(way["x"], way["s"], strict=True) if s <= began_s]
+    path, began_s = timeline["path"], timeline["cells"]["s"][0]
+    climb = [x for x, s in zip(path["x"], path["s"], strict=True) if s <= began_s]
     assert page.evaluate(flown_x) == climb
-    assert 0 < len(climb) < len(journey["way"]["x"])
+    assert 0 < len(climb) < len(timeline["path"]["x"])
     page.set_viewport_size(PHONE)
     page.wait_for_function("() => document.querySelector('#altitude .main-svg').clientWidth < 360")
     check_on_a_phone(page)
@@ -304,7 +304,7 @@ def test_a_comparison_is_drawn_and_fits_a_phone_too(browser_3d, comparison_page)
     opened = Opened(browser_3d, comparison_page, SMALL)
     page = opened.page
     drawn = page.evaluate("() => document.getElementById('scene').data.slice(-2).map((t) => t.x.length)")
-    assert drawn == [sum(len(track[0]) + 1 for track in group["tracks"]) for group in groups]
+    assert drawn == [sum(len(track[0]) + 1 for track in group["paths"]) for group in groups]
     row = page.get_by_role("region", name="Paired differences").locator("tbody tr td")
     assert row.nth(0).inner_text().strip() == groups[1]["label"]
     assert row.nth(1).inner_text() == "2"
@@ -317,7 +317,7 @@ def test_a_comparison_is_drawn_and_fits_a_phone_too(browser_3d, comparison_page)
     opened.context.close()
 
 
-def test_a_browser_that_cannot_unpack_says_so(browser, mission_page):
+def test_a_browser_that_cannot_unpack_reports_it(browser, mission_page):
     context = browser.new_context(viewport=DESKTOP)
     context.add_init_script("delete window.DecompressionStream")
     page = context.new_page()

@@ -68,7 +68,7 @@ def test_a_flight_in_order():
         assert step.position_m.tolist() == [100.0 * step.status.cell[0], 100.0 * step.status.cell[1], 100.0]
         assert set(step.log_ns) == set(step_reader.STEP_TOPICS) - ({"move"} if over else set())
         assert step.log_ns == step.publish_ns
-        assert not step.others
+        assert not step.conflicts
     assert not stream.orphans + stream.repeated + stream.rejected
 
 
@@ -192,7 +192,7 @@ def test_two_flights_in_one_bag(steps_of_first, same_seed):
     assert [plain(s)[1:] for s in found if s.flight == 0] == one
     assert [plain(s)[1:] for s in found if s.flight == 1] == two
     assert not stream.orphans + stream.repeated
-    assert not any(step.others for step in found)
+    assert not any(step.conflicts for step in found)
 
 
 @given(st.integers(0, 2**32))
@@ -211,7 +211,7 @@ def test_two_flights_of_which_topics_are_late(seed):
 def test_an_abort_ends_the_step_that_was_ready():
     found, _ = read(flight(SCENARIO, steps=3))
     assert [step.status.phase for step in found] == [Phase.READY] * 3 + [Phase.ABORTED]
-    assert not found[-1].others
+    assert not found[-1].conflicts
 
 
 def test_a_vehicle_that_was_stopped_and_goes_on_is_ready_again():
@@ -222,7 +222,7 @@ def test_a_vehicle_that_was_stopped_and_goes_on_is_ready_again():
     told.insert(i + 1, said("mission", aborted, ready.log_time_ns + 1))
     told.insert(i + 2, said("mission", status, ready.log_time_ns + 2))
     found, stream = read(told)
-    assert not any(step.others for step in found)
+    assert not any(step.conflicts for step in found)
     assert stream.repeated == {"mission": 1}
     assert found[-1].status.phase is not Phase.ABORTED
 
@@ -233,7 +233,7 @@ def test_what_is_said_again_differently_is_kept_beside_the_first():
     told = [*FLIGHT, said("move", other, one.log_time_ns + 1)]
     found, _ = read(told)
     assert found[0].move.action == "left"
-    assert found[0].others == {"move": other}
+    assert found[0].conflicts == {"move": other}
     assert [plain(step) for step in found] == WHOLE
     assert i < PER_STEP
 

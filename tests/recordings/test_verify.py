@@ -24,7 +24,7 @@ POLICY = "five_clusters_dueling"
 
 
 def verify(capsys, bag, *options):
-    """Exit status and output of `bag verify`; of a refusal its line."""
+    """Exit status and output of `bag verify`; of an error its line."""
     with pytest.raises(SystemExit) as exit:
         command.main(["verify", str(bag), *map(str, options)])
     out, err = capsys.readouterr()
@@ -178,7 +178,7 @@ def test_a_user_collected_early_is_one_difference_and_what_follows_stands_on_wha
     assert "first:\n  rates: mission 1, step 31, user" in out
 
 
-def test_what_was_said_a_second_time_and_differently_is_found(flown, tmp_path, capsys):
+def test_a_differing_repetition_is_found(flown, tmp_path, capsys):
     other = said("rates", nudged("data_bits", 2)(payload(flown, "rates", 1, 31)), 0)
     told = []
     with BagReader(flown) as reader:
@@ -189,7 +189,7 @@ def test_what_was_said_a_second_time_and_differently_is_found(flown, tmp_path, c
         bag = write(tmp_path / "bag", told, reader.about)
     status, out = verify(capsys, bag)
     assert status == 1
-    assert "rates: mission 1, step 31, data_bits[2], said again: recorded" in out
+    assert "rates: mission 1, step 31, data_bits[2], repeated: recorded" in out
 
 
 @pytest.mark.parametrize(
@@ -233,15 +233,15 @@ def test_another_policy(flown, capsys):
     assert ", recorded " in found[0]
     n = [int(line.split(": ")[1].split()[0]) for line in out.splitlines() if line.endswith("of 60 moves")]
     assert len(n) == 2
-    assert f"'five_clusters_position' would have decided otherwise in {sum(n)} of 120 steps" in out
+    assert f"'five_clusters_position' decides differently in {sum(n)} of 120 steps" in out
     status, out = verify(capsys, flown, "--policy", POLICY)
     assert status == 0
-    assert "would have decided otherwise in 0 of 120 steps" in out
+    assert "decides differently in 0 of 120 steps" in out
     status, err = verify(capsys, flown, "--policy", "three_clusters_dueling")
     assert (status, "does not fit scenario 'five_clusters'" in err) == (2, True)
 
 
-def test_a_policy_that_is_not_here_is_told_and_found_by_its_hash(flown, tmp_path, capsys):
+def test_a_missing_policy_is_reported_and_found_by_its_hash(flown, tmp_path, capsys):
     with BagReader(flown) as reader:
         told, told_about = list(reader.messages()), reader.about
     bag = write(tmp_path / "elsewhere", told, told_about | {"policy": "mine"})
@@ -249,7 +249,7 @@ def test_a_policy_that_is_not_here_is_told_and_found_by_its_hash(flown, tmp_path
     bag = write(tmp_path / "other", told, told_about | {"policy_sha256": "ab" * 32})
     status, out = verify(capsys, bag)
     assert status == 0
-    assert f"decisions: not verified: policy '{POLICY}' (sha256 abababababab) is not here" in out
+    assert f"decisions: not verified: policy '{POLICY}' (sha256 abababababab) is missing" in out
     assert (
         f"'{POLICY}' is another one (sha256 {told_about['policy_sha256'][:12]}); expected it from --po" in out
     )
@@ -261,7 +261,7 @@ def test_a_policy_that_is_not_here_is_told_and_found_by_its_hash(flown, tmp_path
 
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_policy_of_ones_own(tmp_path, capsys, inside):
-    """In a folder of policies, or as a folder; a neighbour that is no policy disturbs nobody."""
+    """In a folder of policies, or as a folder; a neighbour that is no policy has no effect."""
     from uav_dc_ros.agents import policy as policies
 
     folder = saved(tmp_path / "mine" / "p", TINY, name="own")
@@ -304,7 +304,7 @@ def test_a_bag_without_a_topic_is_refused(tmp_path, capsys, topic):
 
 
 def test_a_bag_of_another_recorder(tmp_path, capsys):
-    """Nothing is known about it: what follows from a seed, and who decided, stays open."""
+    """Its metadata names no seed and no policy."""
     bag = write(tmp_path / "bag", flight(TINY, missions=2), namespace="/uav2")
     status, err = verify(capsys, bag)
     assert (status, "expected --scenario NAME|FILE" in err) == (2, True)
@@ -315,15 +315,15 @@ def test_a_bag_of_another_recorder(tmp_path, capsys):
     assert status == 0
     n_steps = len([message for message in shipped if message.topic == "/users"])
     assert f"channel: {n_steps} of {n_steps} steps recomputed, equal to the last bit" in out
-    assert "not flown by our own world, as far as the bag tells: poses and users are as recorded" in out
-    assert "decisions: not verified: the bag does not tell which policy flew; --policy NAME|DIR" in out
+    assert "the bag names no seed of a simulated world: poses and users are not recomputed" in out
+    assert "decisions: not verified: the bag does not name the policy that flew; --policy NAME|DIR" in out
     assert out.splitlines()[-1] == "verified in part"
     status, out = verify(capsys, bag, "--policy", "three_clusters_dueling")
-    assert (status, "would have decided otherwise in" in out) == (0, True)
+    assert (status, "decides differently in" in out) == (0, True)
 
 
 def test_where_rates_are_missing_both_pasts_are_possible(tmp_path, capsys):
-    """The monitor booked a step whose rates were lost, or did not hear it and booked nothing."""
+    """The monitor counted a step whose rates were lost, or missed it."""
     scenario = tiny(mission={"r_min_bits": 6e7})
     told = flight(scenario, act=lambda mission, step: 6 if step else 1)  # to the users, and stay
 
@@ -335,12 +335,12 @@ def test_where_rates_are_missing_both_pasts_are_possible(tmp_path, capsys):
     status, out = found("booked", told)
     assert (status, "channel: 8 of 9 steps recomputed, equal to the last bit" in out) == (0, True)
 
-    deaf = without_step(told, scenario, 3)
-    assert deaf[-1] != told[-1]
-    status, out = found("deaf", deaf)
+    missed = without_step(told, scenario, 3)
+    assert missed[-1] != told[-1]
+    status, out = found("missed", missed)
     assert (status, "channel: 8 of 9 steps recomputed, equal to the last bit" in out) == (0, True)
 
-    # What fits neither is no difference, since nobody knows; but SINR and rate stand on no books.
+    # What fits neither is unknown, and no difference; but SINR and rate do not depend on it.
     status, out = found("odd", told, changing("rates", 0, 4, more_data))
     assert "1 not recomputed: what was collected before it is not recorded" in out
     status, out = found("false", told, changing("rates", 0, 4, nudged("sinr", 1)))
@@ -348,8 +348,8 @@ def test_where_rates_are_missing_both_pasts_are_possible(tmp_path, capsys):
 
 
 def without_step(told, scenario, number):
-    """A flight whose monitor did not hear a step, and booked nothing for it."""
-    made, books = [], None
+    """A flight whose monitor missed a step."""
+    made, collection = [], None
     uav_m = users_m = None
     for message in told:
         kind = messages.PAYLOADS.get(message.topic[1:])
@@ -359,11 +359,11 @@ def without_step(told, scenario, number):
         elif isinstance(one, messages.Users):
             users_m = payloads.users_m(one, scenario)
         elif isinstance(one, messages.Rates) and one.step == number - 1:
-            books = payloads.collection(one, scenario)
+            collection = payloads.collection(one, scenario)
         elif isinstance(one, messages.Rates) and one.step > number:
-            link = world.measure(scenario, uav_m, users_m, books[1])
-            books = world.collect(scenario, link, *books)
-            rates = payloads.rates(link, *books, mission=one.mission, step=one.step)
+            link = world.measure(scenario, uav_m, users_m, collection[1])
+            collection = world.collect(scenario, link, *collection)
+            rates = payloads.rates(link, *collection, mission=one.mission, step=one.step)
             message = message._replace(data=said("rates", rates, 0).data)
         made.append(message)
     return made
@@ -384,14 +384,14 @@ def test_a_recording_that_begins_late_two_flights_and_an_abort(tmp_path, capsys)
     assert "equal to the last bit" in out
 
 
-def test_a_recorder_that_was_told_another_seed_is_no_difference(tmp_path, capsys):
-    """Nodes that were started by hand: what counts is the seed that the missions tell."""
+def test_another_seed_in_the_metadata_is_no_difference(tmp_path, capsys):
+    """Nodes that were started by hand: the seed in the missions counts."""
     first = flight(TINY, seed=3, missions=2)
     second = flight(TINY, seed=8, begun_ns=first[-1].log_time_ns + 10**9)
     status, out = verify(capsys, write(tmp_path / "bag", first + second, about(TINY, seed=0)))
     assert status == 0
     assert "world: 27 of 27 steps recomputed, equal to the last bit" in out
-    assert "flown with seed 3, 8, though the bag is said to be of seed 0" in out
+    assert "flown with seed 3, 8; the bag's metadata names seed 0" in out
     false = [changing("mission", 1, 0, higher("seed"))(message) for message in first]
     status, out = verify(capsys, write(tmp_path / "false", false, about(TINY, seed=3)))
     assert (status, "mission 1, step 0, seed: recorded 5, recomputed 4" in out) == (1, True)
@@ -415,7 +415,7 @@ def test_a_paced_flight_may_hover_where_a_move_came_too_late(tmp_path, capsys):
 
 @pytest.mark.long
 def test_missions_whose_nodes_were_killed_verify(ros: Ros, capsys):
-    """What a monitor that was killed booked is in its journal; a world flies again what it had flown."""
+    """A killed monitor restores its data from its journal; a world repeats what it had flown."""
     bag = ros.folder / "bag"
     process = ros.start(
         "uav_dc_ros.run_all", "--missions", 25, "--pace", "lockstep", "--no-compose", "--bag", bag

@@ -1,1 +1,1 @@
-"""What bags report of missions: bags of any recorder that has the topics."""
+"""Missions in bags of any recorder that has the topics: info, export, verification and report pages."""

@@ -1,4 +1,4 @@
-"""How a recorded mission went, in numbers: one account of it for info, export and report."""
+"""Result of a recorded mission, in numbers, for info, export and report."""
 
 from dataclasses import dataclass
 
@@ -11,16 +11,16 @@ UNFINISHED = "unfinished"  # outcome of a mission whose end is not in the bag
 
 @dataclass(kw_only=True)
 class MissionTotals:
-    """A mission, brought together step by step.
+    """Result of a mission.
 
     Attributes:
         steps: steps flown.
         outcome: `landed`, `timeout`, `aborted`, or `unfinished`.
-        reason: of its phase, as a real vehicle tells; may be empty.
-        steps_not_reached: steps flown whose cell a real vehicle did not reach, as it says itself.
-        collected, users: users collected as the last rates tell, and all; None without rates.
-        data_bits: data collected from all users, bit, likewise.
-        seed, scenario, fingerprint: as the vehicle says.
+        reason: reason of the last phase; empty in simulation.
+        steps_not_reached: steps flown whose cell a real vehicle did not reach, as it reports.
+        collected, users: users collected at the last rates, and all users; None without rates.
+        data_bits: data collected from all users at the last rates, bit; None without rates.
+        seed, scenario, fingerprint: as the vehicle reports; None without a status.
     """
 
     steps: int = 0
@@ -36,11 +36,11 @@ class MissionTotals:
 
     @property
     def is_over(self) -> bool:
-        """Is its end in the bag."""
+        """Whether the bag holds the end of the mission."""
         return self.outcome != UNFINISHED
 
     def add(self, step: int, status: Mission | None, rates: Rates | None) -> None:
-        """The next step, with what the vehicle and the monitor said of it."""
+        """Add the next step."""
         self.steps = max(self.steps, step)
         if rates is not None:
             self.collected, self.users = sum(rates.collected), len(rates.collected)

@@ -13,67 +13,51 @@ from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.pages import compare
 from uav_dc_ros.recordings.pages.health import Health
-from uav_dc_ros.recordings.pages.missions import Flown, flown
-from uav_dc_ros.recordings.pages.page import Page
-from uav_dc_ros.recordings.pages.vehicle import Way, way
-from uav_dc_ros.recordings.pages.world import world
+from uav_dc_ros.recordings.pages.missions import read_missions
+from uav_dc_ros.recordings.pages.page import Page, world_data
+from uav_dc_ros.recordings.pages.vehicle import read_path
 from uav_dc_ros.recordings.recorded_step import RecordedStep, printable
-from uav_dc_ros.recordings.recorded_vehicle import vehicle
 from uav_dc_ros.topics import SIMULATED
 
 SUMMARIES_MAX = 2_000  # rows in the list of missions
-SYSTEM_ROOM = 150_000  # bytes kept for it, for latencies, nodes and faults
-OURS = b'<meta name="generator" content="uav_dc_ros report">'
-BEGINNING = 1_000  # bytes of a page, within which it says whose it is
+SYSTEM_ROOM = 150_000  # bytes kept for latencies, nodes and faults
+GENERATOR = b'<meta name="generator" content="uav_dc_ros report">'
+HEAD_SIZE = 1_000  # bytes of a page that contain the generator
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help="a bag's folder, or one of its files")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE.html",
-        help="the page; a report that is there already is replaced (default: BAG.html, here)",
-    )
-    parser.add_argument(
-        "--mission",
-        type=cli.whole_number(0),
-        nargs="+",
-        metavar="N",
-        help="indices of missions (default: all, as many as a page of 3 MB holds)",
-    )
-    parser.add_argument(
-        "--compare",
-        type=Path,
-        nargs="*",
-        metavar="BAG",
-        help="bags to put beside the first one; without any, the missions of the first one side by side",
-    )
-    parser.add_argument("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
-    parser.add_argument("--namespace", metavar="NAME", help="of the missions, where there are several")
+    """Options of the verb."""
+    add = parser.add_argument
+    add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
+    out = "the page; replaces an existing report (default: BAG.html in the current folder)"
+    add("--out", type=Path, metavar="FILE.html", help=out)
+    missions = "indices of missions (default: all, as many as a page of 3 MB holds)"
+    add("--mission", type=cli.whole_number(0), nargs="+", metavar="N", help=missions)
+    bags = "bags to compare with the first one; without any, the missions of the first one side by side"
+    add("--compare", type=Path, nargs="*", metavar="BAG", help=bags)
+    add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
+    add("--namespace", metavar="NAME", help="of the missions, for a bag with several")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the page, and tell about it."""
+    """Write the page and print its content; the exit status."""
     out: Path = options.out or Path(f"{options.bag.absolute().stem}.html")
     _check_out(out)
     if options.compare is None:
-        page, told = _of_bag(options)
+        page, summary = _report(options)
     else:
-        page, told = compare.page(
-            [options.bag, *options.compare], options.mission, options.scenario, options.namespace
-        )
+        bags = [options.bag, *options.compare]
+        page, summary = compare.page(bags, options.mission, options.scenario, options.namespace)
     content = page.content()
     files.write(out, content)
-    # Beside a page that goes to the output itself, not into it.
-    beside = sys.stdout if files.is_replaced(out) else sys.stderr
-    print(f"{out}: {told}, {len(content) / 1e6:.2f} MB", file=beside)
+    # To standard error if the page goes to standard output.
+    stream = sys.stdout if files.is_replaced(out) else sys.stderr
+    print(f"{out}: {summary}, {len(content) / 1e6:.2f} MB", file=stream)
     return 0
 
 
-def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
-    """The page of one bag, and what is in it, in words."""
+def _report(options: argparse.Namespace) -> tuple[Page, str]:
+    """The page of one bag, and its content in a few words."""
     with BagReader(options.bag) as reader:
         name = step_reader.namespace(reader, options.namespace)
         scenario = step_reader.scenario(reader, name, options.scenario)
@@ -81,71 +65,63 @@ def _of_bag(options: argparse.Namespace) -> tuple[Page, str]:
         title = f"{scenario.name}: {bag}"
         page, health = Page("mission", title), Health(reader, name)
         recorded = step_reader.Steps(reader, name, scenario.step_ns)
-        flew = vehicle(reader, name)
-        real = flew != SIMULATED
-        taken = way(reader, name, scenario) if real else None
+        vehicle = step_reader.vehicle(reader, name)
+        real = vehicle != SIMULATED
+        path = read_path(reader, name, scenario) if real else None
         summaries: list[dict[str, Any]] = []
-        held: list[int] = []
+        shown: list[int] = []
         total = 0
-        full = False
-        for one in flown(_heard(recorded, health), scenario, real):
-            if options.mission is not None and one.index not in options.mission:
+
+        def steps() -> Iterator[RecordedStep]:
+            for step in recorded:
+                health.add_step(step)
+                yield step
+
+        for mission in read_missions(steps(), scenario, real):
+            if options.mission is not None and mission.index not in options.mission:
                 continue
             total += 1
-            health.missed(one)
+            health.add_mission(mission)
             if len(summaries) >= SUMMARIES_MAX:
                 continue
-            summaries.append(one.summary())
-            # Missions are shown from the first one on: no later and smaller one fills a gap.
-            full = full or not page.add(f"mission-{total - 1}", _of_mission(one, taken), SYSTEM_ROOM)
-            if not full:
-                held.append(total - 1)
+            summaries.append(mission.summary())
+            # The first missions are shown: a later and smaller one fills no gap.
+            if len(shown) == len(summaries) - 1:
+                data = {"stride": mission.stride, "steps": mission.steps(), "table": mission.table()}
+                if path is not None and mission.timeline is not None:
+                    data["timeline"] = mission.timeline.data(path)
+                if page.add(f"mission-{total - 1}", data, SYSTEM_ROOM):
+                    shown.append(total - 1)
         if not total:
-            wanted = "" if options.mission is None else f" {', '.join(map(str, options.mission))}"
-            why = "; ".join(recorded.rejected.lines())
-            raise BagError(f"bag {options.bag}: no step of a mission{wanted} is in it{why and f': {why}'}")
-        health.count(recorded)
+            raise BagError(compare.no_step(options.bag, options.mission, recorded))
+        health.add_losses(recorded)
         health.read()
-        data = {
+        start = datetime.fromtimestamp(reader.first_ns * 1e-9, UTC)
+        overview = {
             "title": title,
             "bag": bag,
-            "recorded": _date(reader.first_ns),
+            "recorded": start.strftime("%Y-%m-%d %H:%M UTC"),
             "policy": reader.about.get("policy", "unknown"),
             "about": {k: reader.about[k] for k in ("pace", "policy_sha256") if k in reader.about},
-            **({"vehicle": flew} if real else {}),
+            **({"vehicle": vehicle} if real else {}),
             "version": __version__,
-            "world": world(scenario),
+            "world": world_data(scenario),
             "missions": summaries,
             "missions_total": total,
-            "held": held,
-            "health": health.page(),
+            "shown": shown,
+            "health": health.data(),
         }
-    if not held or not page.add("data", data):
+    if not shown or not page.add("data", overview):
         raise BagError(f"bag {options.bag}: its report does not fit into 3 MB; expected --mission N")
-    left = "" if len(held) == total else f" of {total} (as many as fit; --mission N shows others)"
-    return page, f"{len(held)}{left} mission{'s' if total > 1 else ''}"
-
-
-def _heard(recorded: step_reader.Steps, health: Health) -> Iterator[RecordedStep]:
-    for step in recorded:
-        health.hear(step)
-        yield step
-
-
-def _of_mission(one: Flown, taken: Way | None) -> dict[str, Any]:
-    told = {} if one.journey is None or taken is None else {"journey": one.journey.page(taken)}
-    return {"stride": one.stride, "course": one.course(), "table": one.table(), **told}
-
-
-def _date(at_ns: int) -> str:
-    return datetime.fromtimestamp(at_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    left = "" if len(shown) == total else f" of {total} (as many as fit; --mission N shows others)"
+    return page, f"{len(shown)}{left} mission{'s' if total > 1 else ''}"
 
 
 def _check_out(out: Path) -> None:
-    """Refuse to replace what is no report: a bag's file is soon named by mistake.
+    """Refuse to replace a file that is no report, such as one of a bag.
 
     Raises:
-        ParameterError: something else is there, or the folder is not.
+        ParameterError: the file exists and is no report, or its folder does not exist.
     """
     if not out.absolute().parent.is_dir():
         raise ParameterError(f"--out {out}: expected a file in an existing folder")
@@ -153,6 +129,6 @@ def _check_out(out: Path) -> None:
         return
     if out.is_file():
         with out.open("rb") as file:
-            if OURS in file.read(BEGINNING):
+            if GENERATOR in file.read(HEAD_SIZE):
                 return
-    raise ParameterError(f"--out {out}: it exists, and is no report; expected a new file, or a report")
+    raise ParameterError(f"--out {out} exists and is not a report; expected a new file, or a report")

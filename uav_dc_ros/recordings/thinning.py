@@ -1,4 +1,4 @@
-"""Series of any length in bounded memory: what is thinned out while it grows, and what is shown of many."""
+"""Series of any length in bounded memory."""
 
 from typing import Generic, TypeVar
 
@@ -10,60 +10,48 @@ T = TypeVar("T")
 
 
 class EveryNth(Generic[T]):
-    """All values of few; of many every second, every fourth, ... and the first.
+    """Keeps at most `max_kept` values: the first, and those whose number `stride` divides."""
 
-    Args:
-        most: how many are kept.
-
-    Attributes:
-        stride: every how many one is kept.
-    """
-
-    def __init__(self, most: int) -> None:
+    def __init__(self, max_kept: int) -> None:
         self.stride = 1
-        self._most = most
-        self._kept: list[tuple[int, T]] = []
+        self._max_kept = max_kept
+        self._numbered: list[tuple[int, T]] = []
 
     def add(self, number: int, value: T) -> None:
-        """The next value; its number, such as that of its step, tells whether it is kept."""
-        if self._kept and number % self.stride:
+        """Keep the value if the stride divides its number. A full series doubles its stride."""
+        if self._numbered and number % self.stride:
             return
-        self._kept.append((number, value))
-        if len(self._kept) > self._most:
+        self._numbered.append((number, value))
+        if len(self._numbered) > self._max_kept:
             self.stride *= 2
-            first, *others = self._kept
-            self._kept = [first, *(one for one in others if one[0] % self.stride == 0)]
+            first, *others = self._numbered
+            self._numbered = [first, *(one for one in others if one[0] % self.stride == 0)]
 
     @property
     def kept(self) -> list[T]:
         """The values, in order."""
-        return [value for _, value in self._kept]
+        return [value for _, value in self._numbered]
 
 
-class Apart(Generic[T]):
-    """Values that lie apart: of too many every second is lost, and the others have to lie twice as far apart.
+class SpacedSeries(Generic[T]):
+    """Keeps at most `max_kept` values. A full series drops every second one and doubles `factor`.
 
-    Args:
-        most: how many are kept.
-
-    Attributes:
-        kept: the values, in order.
-        factor: by how much farther apart than at first the next one has to lie.
+    The caller adds a value that lies `factor` times the initial spacing from the last one kept.
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, max_kept: int) -> None:
         self.kept: list[T] = []
         self.factor = 1
-        self._most = most
+        self._max_kept = max_kept
 
     def add(self, value: T) -> None:
-        """The next one that lies apart."""
+        """Keep the value."""
         self.kept.append(value)
-        if len(self.kept) > self._most:
+        if len(self.kept) > self._max_kept:
             self.kept = self.kept[::2]
             self.factor *= 2
 
 
-def spread(n: int, most: int) -> Array:
-    """Indices of at most `most` of `n`, evenly spread, the first and the last among them."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
+def spread(n: int, max_count: int) -> Array:
+    """At most `max_count` indices of `n` values, evenly spaced, with the first and the last."""
+    return np.unique(np.linspace(0, n - 1, min(n, max_count)).round().astype(int))

@@ -1,8 +1,7 @@
-"""Transitions (s, a, r, s', terminated) of recorded missions: what a policy learns from.
+"""Transitions (s, a, r, s', terminated) of recorded missions, for training.
 
-They are those that the Gymnasium environment gives for the same missions, bit for bit: observations are made
-from recorded cells and books as the policy node makes them, and the reward is computed anew, since no node
-tells it.
+They equal those of the Gymnasium environment bit for bit: observations come from recorded cells and data, as
+in the policy node, and rewards are computed, since bags hold none.
 """
 
 from collections import Counter
@@ -23,16 +22,15 @@ from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
 class Transition(NamedTuple):
-    """One step of a mission as an agent sees it.
+    """One step of a mission as an agent observes it.
 
     Attributes:
-        flight, mission, step: which; `step` is that of s.
+        flight, mission, step: source; `step` is that of s.
         observation: s, float32 `[D]`.
-        action: what was flown, value of a `core.grid.Action`.
+        action: the action flown, value of a `core.grid.Action`.
         reward: r.
         next_observation: s', float32 `[D]`.
-        terminated: the episode ended at s'.
-        truncated: it was cut off there.
+        terminated, truncated: whether the episode ended, or was cut off, at s'.
     """
 
     flight: int
@@ -47,28 +45,26 @@ class Transition(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What an agent knows of a step: its observation, and r^t (eq. 7)."""
-
     flight: int
     mission: int
     step: int
     cell: tuple[int, int, int]
     observation: Array
-    total: float
+    total_reward: float  # r^t (eq. 7)
 
 
-class Transitions:
-    """Iterates over the transitions of recorded steps, in order; one step is in memory at a time.
+class RecordedTransitions:
+    """Iterates over the transitions of recorded steps, in order, with one step in memory.
 
     Args:
-        steps: as `Steps` hands them out.
-        scenario: the world, and how its agents are paid.
-        observation: what the agent sees.
+        steps: as `Steps` releases them.
+        scenario: the world and the reward.
+        observation: what the agent observes.
 
     Attributes:
-        skipped: steps that are no transition, by reason.
-        deduced: transitions whose action is deduced from the cells: none was recorded, or another one, which
-            came too late and was not flown.
+        skipped: steps without a transition, by reason.
+        deduced: transitions whose action is deduced from the cells, since no move was recorded, or one that
+            was not flown.
     """
 
     def __init__(self, steps: Iterable[RecordedStep], scenario: Scenario, observation: Observation) -> None:
@@ -79,16 +75,16 @@ class Transitions:
     def __iter__(self) -> Iterator[Transition]:
         """Start at the first step; once."""
         before: _State | None = None
-        said: Action | None = None
+        move: Action | None = None
         for step in self._steps:
             after = self._state(step)
             if after and before and (step.flight, step.mission, step.step - 1) == before[:3]:
-                action = self._flown(before.cell, after.cell, said)
+                action = self._action(before.cell, after.cell, move)
                 if action is not None:
                     yield self._transition(before, after, action)
             elif step.step > 0:
-                self.skipped["a step whose beginning or end is not recorded"] += 1
-            before, said = after, Action[step.move.action.upper()] if step.move else None
+                self.skipped["a step whose start or end is not recorded"] += 1
+            before, move = after, Action[step.move.action.upper()] if step.move else None
 
     def _state(self, step: RecordedStep) -> _State | None:
         if step.status is None or step.rates is None:
@@ -109,21 +105,21 @@ class Transitions:
             data_bits=data_bits,
             collected=collected,
         )
-        # A mission starts from r = 0, whatever R_plus is where it starts.
+        # A mission starts from r = 0, whatever R_plus its start cell has.
         total = float(world.total_reward(scenario, cell, data_bits)) if step.step else 0.0
         return _State(step.flight, step.mission, step.step, step.status.cell, observation, total)
 
-    def _flown(
-        self, cell: tuple[int, int, int], after: tuple[int, int, int], said: Action | None
+    def _action(
+        self, cell: tuple[int, int, int], after: tuple[int, int, int], move: Action | None
     ) -> Action | None:
-        """The action between two cells: the one that was said, if it leads there."""
+        """The action between two cells: the recorded move if it leads there."""
         others = (Action.HOVER, *Action)
-        for action in others if said is None else (said, *others):
+        for action in others if move is None else (move, *others):
             reached = self._scenario.grid.move(np.asarray(cell), np.asarray(int(action)))
             if reached.tolist() == list(after):
-                self.deduced += action is not said
+                self.deduced += action is not move
                 return action
-        self.skipped["a step between cells that are no neighbours"] += 1
+        self.skipped["a step between cells that are not adjacent"] += 1
         return None
 
     def _transition(self, before: _State, after: _State, action: Action) -> Transition:
@@ -135,7 +131,7 @@ class Transitions:
             step=before.step,
             observation=before.observation,
             action=int(action),
-            reward=float(core_reward.earned(after.total, before.total, scenario.reward.form)),
+            reward=float(core_reward.earned(after.total_reward, before.total_reward, scenario.reward.form)),
             next_observation=after.observation,
             terminated=bool(terminated),
             truncated=bool(truncated),

@@ -47,7 +47,7 @@ def prefill_replay(training: "Training", bags: Sequence[Path]) -> PrefilledRepla
     """
     from uav_dc_ros.bags.read import BagReader
     from uav_dc_ros.recordings import step_reader
-    from uav_dc_ros.recordings.transitions import Transitions
+    from uav_dc_ros.recordings.transitions import RecordedTransitions
 
     population = training.population
     rewards = {run.reward for run in population.runs}
@@ -64,7 +64,7 @@ def prefill_replay(training: "Training", bags: Sequence[Path]) -> PrefilledRepla
             for namespace in step_reader.namespaces(reader):
                 steps = step_reader.Steps(reader, namespace, scenario.step_ns)
                 recorded = _of_scenario(steps, scenario, bag)
-                for transition in Transitions(recorded, scenario, population.observation):
+                for transition in RecordedTransitions(recorded, scenario, population.observation):
                     training.add_recorded(transition)
                     missions.add((i, namespace, transition.flight, transition.mission))
                     n += 1

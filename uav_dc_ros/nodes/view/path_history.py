@@ -4,7 +4,7 @@ import math
 
 from uav_dc_ros.cdr import Pose
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.recordings.thinning import Apart
+from uav_dc_ros.recordings.thinning import SpacedSeries
 
 MIN_DISTANCE_CELLS = 0.05  # a pose that is nearer than this to the last one, and sooner than ...
 MIN_PERIOD_NS = 2 * 10**9  # ... this after it, is left out: a real vehicle publishes twenty a second
@@ -28,7 +28,7 @@ class PathHistory:
         self._step_ns = scenario.step_ns
         self._min_distance_m = MIN_DISTANCE_CELLS * scenario.grid.cell_m
         self.version = 0
-        self._path: Apart[tuple[int, Pose]] = Apart(POSES_MAX)  # with the time of publication
+        self._path: SpacedSeries[tuple[int, Pose]] = SpacedSeries(POSES_MAX)  # with the time of publication
         self._last: tuple[int, Pose] | None = None  # also if the path leaves it out
         self._targets: list[Pose] = []
         self._start_ns = -1  # of the mission
@@ -71,7 +71,7 @@ class PathHistory:
             return None
         self._start_ns = stamp_ns - step * self._step_ns
         self.version += 1
-        before, self._path = self._path.kept, Apart(POSES_MAX)
+        before, self._path = self._path.kept, SpacedSeries(POSES_MAX)
         self._path.kept += (each for each in before if self._is_current(each, before_ns))
         if self._last is not None and not self._is_current(self._last, before_ns):
             self._last = None

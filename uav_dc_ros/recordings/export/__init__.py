@@ -1,1 +1,1 @@
-"""The verb `export`: missions as tables, or as transitions to learn from."""
+"""The verb `export`: missions as tables, or as transitions for training."""

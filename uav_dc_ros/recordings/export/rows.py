@@ -12,16 +12,16 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.phases import BEFORE_START
-from uav_dc_ros.recordings.export.tables import Columns
+from uav_dc_ros.recordings.export.tables import Columns, Rows
 from uav_dc_ros.recordings.mission_totals import MissionTotals
 from uav_dc_ros.recordings.recorded_step import RecordedStep
 from uav_dc_ros.topics import SIMULATED
 
-_WHICH: Columns = {"flight": "int", "mission": "int", "step": "int"}
-# Of each table its columns. What is recorded per step holds at its end; `action` is decided there.
+_SOURCE: Columns = {"flight": "int", "mission": "int", "step": "int"}
+# Columns of each table. Values of a step are those at its end; `action` is decided there.
 TABLES: dict[str, Columns] = {
     "steps": {
-        **_WHICH,
+        **_SOURCE,
         "time_s": "float",  # of the users, ROS time; in simulation mission time
         "received_ns": "int",  # the first of its messages, since the epoch
         "x_m": "float",
@@ -38,10 +38,10 @@ TABLES: dict[str, Columns] = {
         "users_collected": "int",
         "data_bits": "float",  # of all users
         "total_reward": "float",  # r^t (eq. 7)
-        "reward": "float",  # what the step paid
+        "reward": "float",  # of the step
     },
     "users": {
-        **_WHICH,
+        **_SOURCE,
         "user": "int",
         "cluster": "int",
         "x_m": "float",
@@ -68,46 +68,39 @@ TABLES: dict[str, Columns] = {
         "users_total": "int",
         "users_collected": "int",
         "data_bits": "float",
-        "mean_sum_rate_bps": "float",  # over the steps flown that have one
+        "mean_sum_rate_bps": "float",  # over the flown steps that have one
         "total_reward": "float",
     },
 }
-# And more of a flight with a real vehicle.
+# Further columns of flights with a real vehicle.
 REAL: dict[str, Columns] = {
     "steps": {
         "reason": "text",  # of the phase
-        "flown_s": "float",  # from the begin of the move that led here until the vehicle was told to be here
+        "flown_s": "float",  # from the start of the move to this step until the vehicle reported the step
     },
     "missions": {"vehicle": "text", "reason": "text", "steps_not_reached": "int"},
     "phases": {
-        **_WHICH,
-        "time_s": "float",  # when it was published, since the epoch
+        **_SOURCE,
+        "time_s": "float",  # of publication, since the epoch
         "phase": "text",
         "reason": "text",
         "held": "bool",  # by a fault
         "fault": "text",  # its kind
     },
 }
-Rows = Mapping[str, Sequence[Any]]
 
 
-def tables(real: bool) -> dict[str, Columns]:
-    """Columns of each table: those of a flight with a real vehicle, or with our own world's."""
-    if not real:
+def tables(vehicle: str) -> dict[str, Columns]:
+    """Columns of each table for flights with this vehicle, as `step_reader.vehicle` names it."""
+    if vehicle == SIMULATED:
         return TABLES
     return {name: {**TABLES.get(name, {}), **REAL.get(name, {})} for name in (*TABLES, "phases")}
 
 
-class Mission:
-    """Rows of one mission, which is handed over step by step.
+class MissionRows:
+    """Rows of one mission, step by step; `about`: metadata of the bag."""
 
-    Args:
-        scenario: the world, and how its agents are paid.
-        about: what the recorder wrote about the bag.
-        vehicle: as `vehicles.vehicle` tells it.
-    """
-
-    def __init__(self, scenario: Scenario, about: Mapping[str, str], vehicle: str = SIMULATED) -> None:
+    def __init__(self, scenario: Scenario, about: Mapping[str, str], vehicle: str) -> None:
         self._scenario, self._about, self._vehicle = scenario, about, vehicle
         self._total: tuple[int, float] | None = None  # step, and r^t there
         self._last: RecordedStep | None = None
@@ -118,40 +111,40 @@ class Mission:
         self._last_ns = 0
 
     def add(self, step: RecordedStep) -> dict[str, Rows]:
-        """The rows of a step: of `steps` one, of `users` one per user.
+        """The rows of a step: one of `steps`, one of `users` per user.
 
         Raises:
-            BagError: it is of another world.
+            BagError: the step is of another world.
         """
         try:
             for payload in filter(None, (step.status, step.users, step.rates)):
                 payloads.check(payload, self._scenario)
         except MessageError as error:
             raise BagError(f"{step.name}: {error}") from None
-        before = self._last
+        before, self._last = self._last, step
         self._recorded += 1
-        self._last = step
         self._totals.add(step.step, step.status, step.rates)
         self._first_ns = min(self._first_ns, *step.log_ns.values())
         self._last_ns = max(self._last_ns, *step.log_ns.values())
         if step.rates is not None and step.step > 0:
             self._sum_rates.append(step.rates.sum_rate_bps)
-        rows: dict[str, Rows] = {"steps": self._step(step), "users": self._users(step)}
+        row = self._step(step)
+        rows: dict[str, Rows] = {"users": self._users(step)}
         if self._vehicle != SIMULATED:
-            told = {"reason": step.status and step.status.reason, "flown_s": _flown_s(before, step)}
-            rows["steps"] = {**rows["steps"], **{name: [value] for name, value in told.items()}}
+            row |= {"reason": step.status and step.status.reason, "flown_s": _flown_s(before, step)}
             rows["phases"] = _phases(step)
-        return rows
+        return rows | {"steps": _as_rows(row)}
 
-    def _step(self, step: RecordedStep) -> Rows:
-        users, rates, status, position_m = step.users, step.rates, step.status, step.position_m
-        total, reward = self._paid(step)
-        row = {
-            **_which(step),
+    def _step(self, step: RecordedStep) -> dict[str, Any]:
+        users, rates, status = step.users, step.rates, step.status
+        position_m = [None] * 3 if step.position_m is None else step.position_m.tolist()
+        total, reward = self._rewards(step)
+        return {
+            **_source(step),
             "time_s": None if users is None else users.stamp_ns / 1e9,
             "received_ns": min(step.log_ns.values()),
-            **_spread(("x_m", "y_m", "altitude_m"), None if position_m is None else position_m.tolist()),
-            **_spread(("cell_x", "cell_y", "cell_z"), status and status.cell),
+            **dict(zip(("x_m", "y_m", "altitude_m"), position_m, strict=True)),
+            **dict(zip(("cell_x", "cell_y", "cell_z"), status.cell if status else [None] * 3, strict=True)),
             "phase": status and status.phase.value,
             "remaining_steps": status and status.remaining_steps,
             "action": step.move and step.move.action,
@@ -162,10 +155,9 @@ class Mission:
             "total_reward": total,
             "reward": reward,
         }
-        return {name: [value] for name, value in row.items()}
 
-    def _paid(self, step: RecordedStep) -> tuple[float | None, float | None]:
-        """r^t, and what the step paid; None where it is not known. A mission starts from r = 0."""
+    def _rewards(self, step: RecordedStep) -> tuple[float | None, float | None]:
+        """r^t and the reward of the step; None where unknown. A mission starts from r = 0."""
         before, self._total = self._total, None
         total = 0.0
         if step.step > 0:
@@ -182,20 +174,19 @@ class Mission:
         if step.users is None and step.rates is None:
             return {name: [] for name in TABLES["users"]}
         n = self._scenario.n_users
-        nothing = [None] * n
-        rows: dict[str, Sequence[Any]] = {name: [value] * n for name, value in _which(step).items()}
+        rows: dict[str, Sequence[Any]] = {name: [value] * n for name, value in _source(step).items()}
         rows |= {"user": range(n), "cluster": self._scenario.user_cluster.tolist()}
         for name in ("x_m", "y_m"):
-            rows[name] = getattr(step.users, name) if step.users else nothing
+            rows[name] = getattr(step.users, name, [None] * n)
         for name in ("sinr", "rate_bps", "data_bits", "served", "collected"):
-            rows[name] = getattr(step.rates, name) if step.rates else nothing
+            rows[name] = getattr(step.rates, name, [None] * n)
         return rows
 
     def summary(self) -> Rows:
         """The row of the mission, after its last step."""
         last, totals = self._last, self._totals
         assert last is not None, "a mission has a step"
-        known = totals.seed is not None  # has the vehicle said anything
+        known = totals.seed is not None  # a status is recorded
         row = {
             "flight": last.flight,
             "mission": last.mission,
@@ -214,42 +205,39 @@ class Mission:
             "data_bits": totals.data_bits,
             "mean_sum_rate_bps": float(np.mean(self._sum_rates)) if self._sum_rates else None,
             "total_reward": self._total and self._total[1],
+            "vehicle": self._vehicle,
+            "reason": totals.reason if known else None,
+            "steps_not_reached": totals.steps_not_reached if known else None,
         }
-        if self._vehicle != SIMULATED:
-            row |= {
-                "vehicle": self._vehicle,
-                "reason": totals.reason if known else None,
-                "steps_not_reached": totals.steps_not_reached if known else None,
-            }
-        return {name: [value] for name, value in row.items()}
+        return _as_rows(row)
 
 
 def _flown_s(before: RecordedStep | None, step: RecordedStep) -> float | None:
-    """How long the move to a step took, by the clock of who flew it, seconds; None where it is not known."""
+    """Duration of the move to a step by publish times, seconds; None where unknown."""
     if before is None or before.step != step.step - 1:
         return None
-    begun = next((told for told in before.told if told.phase is Phase.MOVING), None)
-    there = next((told for told in step.told if told.phase not in BEFORE_START), None)
-    if begun is None or there is None or begun.clock != there.clock:
+    start = next((one for one in before.phase_reports if one.phase is Phase.MOVING), None)
+    end = next((one for one in step.phase_reports if one.phase not in BEFORE_START), None)
+    if start is None or end is None or start.clock_resets != end.clock_resets:
         return None
-    return (there.publish_ns - begun.publish_ns) / 1e9
+    return (end.publish_ns - start.publish_ns) / 1e9
 
 
 def _phases(step: RecordedStep) -> Rows:
-    n = len(step.told)
+    reports = step.phase_reports
     return {
-        **{name: [value] * n for name, value in _which(step).items()},
-        "time_s": [told.publish_ns / 1e9 for told in step.told],
-        "phase": [told.phase.value for told in step.told],
-        "reason": [told.reason for told in step.told],
-        "held": [told.held for told in step.told],
-        "fault": [told.fault for told in step.told],
+        **{name: [value] * len(reports) for name, value in _source(step).items()},
+        "time_s": [one.publish_ns / 1e9 for one in reports],
+        "phase": [one.phase.value for one in reports],
+        "reason": [one.reason for one in reports],
+        "held": [one.held for one in reports],
+        "fault": [one.fault for one in reports],
     }
 
 
-def _which(step: RecordedStep) -> dict[str, Any]:
-    return {"flight": step.flight, "mission": step.mission, "step": step.step}
+def _source(step: RecordedStep) -> dict[str, Any]:
+    return {name: getattr(step, name) for name in _SOURCE}
 
 
-def _spread(names: tuple[str, ...], values: Any) -> dict[str, Any]:
-    return dict.fromkeys(names) if values is None else dict(zip(names, values, strict=True))
+def _as_rows(row: Mapping[str, Any]) -> Rows:
+    return {name: [value] for name, value in row.items()}

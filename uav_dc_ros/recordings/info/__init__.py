@@ -1,1 +1,1 @@
-"""The verb `info`: what a bag holds, and whether it is complete."""
+"""The verb `info`: content and completeness of a bag."""

@@ -1,4 +1,4 @@
-"""The missions of a bag: how each ended, and what the bag lacks of its steps."""
+"""The missions of a bag: how each ended, and which messages of its steps are missing."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -7,36 +7,35 @@ from dataclasses import dataclass, field
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagDamagedError, BagError, UavDcError
 from uav_dc_ros.recordings.mission_totals import MissionTotals
-from uav_dc_ros.recordings.recorded_step import RecordedStep
+from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps, scenario
 
 
 @dataclass(kw_only=True)
 class MissionSurvey(MissionTotals):
-    """A mission: of one that is not over, `reason` tells why it is as it is.
+    """A mission. Before its end, `reason` is that of the latest phase report.
 
     Attributes:
-        namespace: where it was flown, without a slash at its end.
-        flight: counts runs in one bag from 0.
-        mission: its index in its flight.
+        namespace: its namespace, without a slash at the end.
+        flight, mission: counts runs in the bag from 0; index of the mission in its flight.
         missing: messages of its steps that the bag lacks, by topic.
     """
 
     namespace: str
     flight: int
     mission: int
-    missing: dict[str, int] = field(default_factory=dict)
+    missing: Counter[str] = field(default_factory=Counter)
 
 
-def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list[MissionSurvey]:
-    """The missions of a namespace, and what is missing of their steps."""
+def survey_missions(reader: BagReader, namespace: str, problems: list[str]) -> list[MissionSurvey]:
+    """The missions of a namespace; adds what cannot be read to `problems`."""
     where = f" in {namespace}" if namespace else ""
     found: list[MissionSurvey] = []
     try:
         try:
             step_ns = scenario(reader, namespace).step_ns
         except UavDcError:
-            step_ns = 2**63  # the scenario is not known: the bag of another one
+            step_ns = 2**63  # unknown scenario, in a bag of another recorder
         steps = Steps(reader, namespace, step_ns)
         before: RecordedStep | None = None
         for step in steps:
@@ -45,15 +44,16 @@ def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list
                 next_step = 0
             else:
                 next_step = before.step + 1
-                _enter_missing(found[-1], before, last=False)
+                found[-1].missing.update(_missing(before, last=False))
+            mission = found[-1]
             if step.step > next_step:
-                _lack(found[-1], dict.fromkeys(STEP_TOPICS, step.step - next_step))
-            found[-1].add(step.step, step.status, step.rates)
-            if step.status is not None and not found[-1].is_over:
-                found[-1].reason = step.told[-1].reason if step.told else ""
+                mission.missing.update(dict.fromkeys(STEP_TOPICS, step.step - next_step))
+            mission.add(step.step, step.status, step.rates)
+            if step.status is not None and not mission.is_over:
+                mission.reason = step.phase_reports[-1].reason if step.phase_reports else ""
             before = step
             if step.status is not None and step.status.phase.is_over:
-                _enter_missing(found[-1], step, last=True)
+                mission.missing.update(_missing(step, last=True))
     except BagDamagedError:
         raise
     except BagError as error:
@@ -63,25 +63,16 @@ def look_through(reader: BagReader, namespace: str, problems: list[str]) -> list
     return found
 
 
-def _enter_missing(mission: MissionSurvey, step: RecordedStep, *, last: bool) -> None:
-    """Enter what a step lacks. The last one has no move, and one that is not over may be without the rest.
-
-    A real vehicle that has not come to a step yet is not measured.
-    """
-    waits = not step.is_measured
+def _missing(step: RecordedStep, *, last: bool) -> list[str]:
+    """Topics without a message of this step. The last step has no move."""
     has = {
-        "pose": step.position_m is not None or waits,
-        "users": step.users is not None or waits,
-        "rates": step.rates is not None or waits,
+        "pose": step.position_m is not None or not step.is_measured,
+        "users": step.users is not None or not step.is_measured,
+        "rates": step.rates is not None or not step.is_measured,
         "mission": step.status is not None,
         "move": step.move is not None or last,
     }
-    _lack(mission, {topic: 1 for topic, there in has.items() if not there})
-
-
-def _lack(mission: MissionSurvey, missing: dict[str, int]) -> None:
-    for topic, n in missing.items():
-        mission.missing[topic] = mission.missing.get(topic, 0) + n
+    return [topic for topic, recorded in has.items() if not recorded]
 
 
 def mission_problems(reader: BagReader, missions: list[MissionSurvey]) -> Iterator[str]:
@@ -93,13 +84,12 @@ def mission_problems(reader: BagReader, missions: list[MissionSurvey]) -> Iterat
         for mission in flown:
             missing.update(mission.missing)
         if missing:
-            told = ", ".join(f"{n:,} {topic}" for topic, n in missing.items())
-            yield f"steps{where} lack messages: {told}"
+            yield f"steps{where} lack messages: {', '.join(f'{n:,} {topic}' for topic, n in missing.items())}"
         for mission in flown:
             if not mission.is_over:
-                flight = f" of flight {mission.flight}" if mission.flight else ""
-                yield f"mission {mission.mission}{flight}{where} is not over at its step {mission.steps}"
+                name = mission_name(mission.mission, mission.flight)
+                yield f"{name}{where} has no end; its last step is {mission.steps}"
         wanted = reader.about.get("missions", "")
-        n_flown = len({mission.mission for mission in flown if mission.is_over})
-        if wanted.isdecimal() and n_flown < int(wanted):
-            yield f"{n_flown:,} of {int(wanted):,} missions{where} are there to their end"
+        n_over = len({mission.mission for mission in flown if mission.is_over})
+        if wanted.isdecimal() and n_over < int(wanted):
+            yield f"{n_over:,} of {int(wanted):,} missions{where} have an end"

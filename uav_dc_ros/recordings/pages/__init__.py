@@ -1,11 +1,5 @@
-"""Pages about recorded missions: one HTML file that needs no network.
+"""Report pages: one HTML file without network access.
 
-missions   the missions of a bag, step by step
-health     when messages came, what nodes told about themselves, what went wrong
-world      what a page draws, and tells, of a world
-compare    missions or policies side by side
-page       a page from its template, its data and Plotly, all in one file
-
-`page.html` is the template; `common.js`, `mission.js`, `system.js` and `compare.js` draw what the data says;
-`style.css` is how it looks. They know no formula of the world: whatever is computed is computed here.
+`page.html` is the template, `style.css` its style; `common.js`, `mission.js`, `vehicle.js`, `system.js` and
+`compare.js` draw the data. They hold no formula: the Python modules compute all values.
 """

@@ -1,6 +1,6 @@
 "use strict";
-// What both kinds of page share: unpacking, elements, numbers, tables, and how a figure looks.
-// Text that comes from a bag is only ever set as text, or as `plain` inside a figure: never as markup.
+// Shared by both kinds of page: unpacking, elements, numbers, tables, and the style of figures.
+// Text of a bag is set as text, or as `plain` inside a figure, never as markup.
 
 async function unpack(id) {
   const packed = document.getElementById(id).textContent.trim();
@@ -107,7 +107,7 @@ function table(columns, rows, { caption, sorted = null, label, onmake = () => {}
     lines.sort(([a], [b]) => {
       const [u, v] = [column.value(a), column.value(b)];
       if (u === v) return 0;
-      if (u === null || u === undefined) return 1; // what is not known stays at the end
+      if (u === null || u === undefined) return 1; // unknown values stay at the end
       if (v === null || v === undefined) return -1;
       return down ? order(v, u) : order(u, v);
     });
@@ -136,7 +136,7 @@ function ring([x, y], radius) {
   return { x: turns.map((a) => x + radius * Math.cos(a)), y: turns.map((a) => y + radius * Math.sin(a)) };
 }
 
-// A figure in space, or without WebGL (or when asked) on a map, seen from above.
+// A figure in space; without WebGL, or on request, a map from above.
 const webgl = (() => {
   try { return Boolean(document.createElement("canvas").getContext("webgl")); } catch { return false; }
 })();
@@ -163,7 +163,7 @@ const space = {
   },
   layout(world, element) {
     const [wide, deep] = [(world.n_x - 1) * world.cell_m, (world.n_y - 1) * world.cell_m];
-    // Room for whom the UAV reaches from a corner; in a large world that is next to nothing.
+    // Room for users in reach of a corner.
     const pad = Math.max(0.6 * world.cell_m, Math.min(world.reach_m, 0.22 * Math.max(wide, deep)));
     const range = { x: [-pad, wide + pad], y: [-pad, deep + pad] };
     if (this.flat) {
@@ -177,8 +177,8 @@ const space = {
       title: { text: title, font: { size: 12, color: colour("muted") } }, color: colour("muted"),
       gridcolor: colour("faint"), zerolinecolor: colour("faint"), showbackground: false, showspikes: false, ...more,
     });
-    const most = Math.max(wide, deep) + 2 * pad;
-    // A narrow figure is looked at from further away, and more from above: it has height to fill.
+    const longest = Math.max(wide, deep) + 2 * pad;
+    // A narrow figure is seen from further away and from a steeper angle, to fill its height.
     const narrow = Math.min(1.4, Math.max(1, (1.3 * element.clientHeight) / element.clientWidth));
     const eye = { x: -0.8 * narrow, y: -1.18 * narrow, z: 1.05 * narrow ** 2 };
     return layout({
@@ -187,12 +187,12 @@ const space = {
         xaxis: side("east, m", { range: range.x }), yaxis: side("north, m", { range: range.y }),
         zaxis: side("altitude, m", { range: [0, 1.15 * world.top_m], nticks: 4 }),
         aspectmode: "manual",
-        aspectratio: { x: 1.4 * (wide + 2 * pad) / most, y: 1.4 * (deep + 2 * pad) / most, z: 0.42 },
+        aspectratio: { x: 1.4 * (wide + 2 * pad) / longest, y: 1.4 * (deep + 2 * pad) / longest, z: 0.42 },
         camera: { eye, center: { x: 0, y: 0, z: -0.16 } },
       },
     });
   },
-  // What both kinds of page show of the world itself.
+  // The world, for both kinds of page.
   world(world) {
     const discs = world.clusters.map((centre) => ring(centre, world.cluster_radius_m));
     const join = (of) => discs.flatMap((disc) => [...disc[of], null]);
@@ -216,7 +216,7 @@ const space = {
   },
 };
 
-// Draw again when the colours change; figures follow the window by themselves.
+// Redraw after a change of the colour scheme. Figures resize without it.
 function whenColoursChange(draw) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
 }

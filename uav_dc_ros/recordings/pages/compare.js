@@ -6,7 +6,7 @@ const METRICS = [
   ["sum_rate_bps", "mean sum-rate", "bit/s", null], ["distance_m", "distance flown", "m", null], ["steps", "steps", "", 1],
   ["reward", "reward", "", 3],
 ];
-// Okabe and Ito's, yellow left out: it cannot be seen on paper. Dashes tell groups apart without colour.
+// Okabe and Ito's colours without yellow, which is invisible on paper. Dashes distinguish groups without colour.
 const SHADES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c7853", "#7f7f9f"];
 const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "5px,2px", "2px,6px"];
 
@@ -17,8 +17,8 @@ open(async (page, data) => {
   page.querySelector("header").prepend(make("div", {}, page.querySelector("h1"),
     make("p", { class: "sub" }, policies.length === 1 ? `policy ${policies[0]}` : `policies ${policies.join(", ")}`)));
   const warnings = [
-    data.worlds_differ ? "These groups flew in different worlds: their figures are not of the same task." : "",
-    data.rewards_differ ? "These groups were paid by different rewards: their rewards cannot be compared." : "",
+    data.worlds_differ ? "These groups flew in different worlds: their results are not comparable." : "",
+    data.rewards_differ ? "These groups have different reward parameters: their rewards are not comparable." : "",
   ].filter(Boolean);
   const key = (i) => {
     const drawn = make("span", { "aria-hidden": "true" });
@@ -30,15 +30,15 @@ open(async (page, data) => {
   const legend = () => make("ul", { class: "legend" }, ...groups.map((_, i) => make("li", {}, name(i))));
 
   // A mean, and below it its interval in the same unit.
-  function range(told, unit, digits, sign = "") {
-    const [scale, prefix] = digits === null ? siScale(Math.abs(told.mean)) : [unit === "%" ? 0.01 : 1, ""];
+  function range(interval, unit, digits, sign = "") {
+    const [scale, prefix] = digits === null ? siScale(Math.abs(interval.mean)) : [unit === "%" ? 0.01 : 1, ""];
     const number = (value) => {
       const scaled = Math.abs(value / scale);
       const text = digits === null ? Number(scaled.toPrecision(3)).toLocaleString("en") : fixed(scaled, digits);
       return (value < 0 ? "−" : value > 0 ? sign : "") + text;
     };
-    return make("span", {}, `${number(told.mean)} ${prefix}${unit}`.trim(),
-      told.low === null ? null : make("div", { class: "range" }, `${number(told.low)} … ${number(told.high)}`));
+    return make("span", {}, `${number(interval.mean)} ${prefix}${unit}`.trim(),
+      interval.low === null ? null : make("div", { class: "range" }, `${number(interval.low)} … ${number(interval.high)}`));
   }
 
   const cell = (...parts) => make("span", {}, ...parts);
@@ -63,7 +63,7 @@ open(async (page, data) => {
           ...METRICS.map(([metric, words, unit, digits]) => ({
             name: words, text: (row) => range(row.paired.differences[metric], unit, digits, "+"), value: (row) => row.paired.differences[metric].mean,
           })),
-        ], paired, { label: "Paired differences", caption: "Same seed, same users at the same places. An interval without zero in it is a difference that chance does not explain." })) : null)),
+        ], paired, { label: "Paired differences", caption: "Equal seeds give equal users at equal positions. An interval without zero is a significant difference." })) : null)),
     make("section", { "aria-labelledby": "flights" }, make("h2", { id: "flights" }, "Flights"),
       make("div", { class: "grid wide-left" },
         make("div", { class: "card flight" },
@@ -73,13 +73,13 @@ open(async (page, data) => {
           card("Users collected", make("div", { class: "chart", id: "n_collected" })),
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum_rate_bps" })),
           card("Reward so far, r of eq. 7", make("div", { class: "chart", id: "reward" }))))),
-    make("footer", {}, `A mission that is over stays as it ended, at no rate. ${one ? "" : "Bands are 95% bootstrap intervals of the mean. "}At most 20 paths of a bag are drawn. World ${world.name} ${world.fingerprint} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`));
+    make("footer", {}, `After its end a mission keeps its values, at rate 0. ${one ? "" : "Bands are 95% bootstrap intervals of the mean. "}At most 20 paths of a bag are drawn. World ${world.name} ${world.fingerprint} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`));
 
   function drawScene() {
     Plotly.purge("scene");
     const paths = groups.map((group, i) => {
-      const alone = group.tracks.length === 1;
-      const join = (axis) => group.tracks.flatMap((track) => [...track[axis], null]);
+      const alone = group.paths.length === 1;
+      const join = (axis) => group.paths.flatMap((path) => [...path[axis], null]);
       return space.trace({
         name: plain(group.label), mode: "lines", x: join(0), y: join(1), z: join(2), opacity: alone ? 1 : 0.62, hoverinfo: "name",
         line: { color: SHADES[i], width: (space.flat ? 1.6 : 4) * (alone ? 1.5 : 1), dash: DASHES[i] === "solid" ? "solid" : DASHES[i].includes("px") ? "dot" : DASHES[i] },
@@ -91,11 +91,11 @@ open(async (page, data) => {
   function drawCharts() {
     const chart = (id, title, last, divide = 1) => {
       const traces = groups.flatMap((group, i) => {
-        const told = Object.fromEntries(Object.entries(group.curves[id]).map(([key, values]) => [key, values.map((value) => value / divide)]));
+        const curve = Object.fromEntries(Object.entries(group.curves[id]).map(([key, values]) => [key, values.map((value) => value / divide)]));
         const edge = { type: "scatter", mode: "lines", x: data.steps, line: { width: 0, shape: "hv" }, hoverinfo: "skip", showlegend: false };
         return [
-          ...(group.missions > 1 ? [{ ...edge, y: told.low }, { ...edge, y: told.high, fill: "tonexty", fillcolor: `${SHADES[i]}38` }] : []),
-          { type: "scatter", mode: "lines", name: plain(group.label), x: data.steps, y: told.mean, line: { color: SHADES[i], width: 2, dash: DASHES[i], shape: "hv" }, hovertemplate: "%{y:.3~f}" },
+          ...(group.missions > 1 ? [{ ...edge, y: curve.low }, { ...edge, y: curve.high, fill: "tonexty", fillcolor: `${SHADES[i]}38` }] : []),
+          { type: "scatter", mode: "lines", name: plain(group.label), x: data.steps, y: curve.mean, line: { color: SHADES[i], width: 2, dash: DASHES[i], shape: "hv" }, hovertemplate: "%{y:.3~f}" },
         ];
       });
       Plotly.react(id, traces, layout({ xaxis: axis({ zeroline: false, title: last ? `step, ${world.step_s} s each` : "" }), yaxis: axis({ rangemode: "tozero", title, nticks: 5 }) }), CONFIG);

@@ -1,8 +1,8 @@
-"""Missions or policies side by side: means with their intervals, curves, and paths.
+"""Missions or policies side by side: means with intervals, curves, and paths.
 
-A group is a bag; or, where one bag alone is looked at, each of its missions. Intervals are 95% bootstrap
-intervals over the missions of a group. Groups that flew the same seeds are also compared seed by seed: the
-same users stand at the same places there, so that less than chance is left in the difference.
+A group is a bag; or, with one bag only, a mission. Intervals are 95% bootstrap intervals over the missions of
+a group. Groups with the same seeds are also compared seed by seed: their users are at the same positions,
+which leaves less chance in the difference.
 """
 
 from dataclasses import dataclass, field
@@ -19,14 +19,13 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings import step_reader
-from uav_dc_ros.recordings.pages.missions import Flown, flown, significant
-from uav_dc_ros.recordings.pages.page import PAGE_MAX, Page
-from uav_dc_ros.recordings.pages.world import world
-from uav_dc_ros.recordings.recorded_step import printable
+from uav_dc_ros.recordings.pages.missions import MissionData, read_missions, significant
+from uav_dc_ros.recordings.pages.page import PAGE_MAX, Page, world_data
+from uav_dc_ros.recordings.recorded_step import mission_name, printable
 from uav_dc_ros.recordings.thinning import spread
 
-GROUPS_MAX = 8  # more colours and dashes nobody tells apart
-TRACKS_MAX = 20  # of a group, in a picture
+GROUPS_MAX = 8  # distinguishable colours and dashes
+PATHS_MAX = 20  # of a group, in a picture
 POINTS_MAX = 400  # of a curve
 METRICS = ("landed", "users_collected", "data_bits", "sum_rate_bps", "distance_m", "steps", "reward")
 CURVES = ("n_collected", "sum_rate_bps", "reward")
@@ -34,7 +33,7 @@ CURVES = ("n_collected", "sum_rate_bps", "reward")
 
 @dataclass
 class Group:
-    """Missions that are told together."""
+    """Missions whose results are combined."""
 
     label: str
     scenario: Scenario
@@ -42,169 +41,160 @@ class Group:
     bag: str
     summaries: list[dict[str, Any]] = field(default_factory=list)
     curves: list[dict[str, Array]] = field(default_factory=list)  # by name of CURVES, and `step`
-    tracks: list[list[list[float]]] = field(default_factory=list)  # x, y, z of a path, metres
+    paths: list[list[list[float]]] = field(default_factory=list)  # x, y, z, metres
 
-    def add(self, one: Flown) -> None:
-        """One more mission."""
-        course = one.course()
-        summary = one.summary()
+    def add(self, mission: MissionData) -> None:
+        """Add a mission."""
+        steps, summary = mission.steps(), mission.summary()
         self.summaries.append(summary | {"landed": float(summary["outcome"] == Phase.LANDED)})
         self.curves.append(
             {
-                "step": np.asarray([it["step"] for it in course]),
-                "n_collected": np.asarray([it["n_collected"] for it in course], np.float64),
-                "sum_rate_bps": _held([it["sum_rate_bps"] for it in course]),
-                "reward": _held([it["reward"][2] for it in course]),
+                "step": np.asarray([it["step"] for it in steps]),
+                "n_collected": np.asarray([it["n_collected"] for it in steps], np.float64),
+                "sum_rate_bps": _filled([it["sum_rate_bps"] for it in steps]),
+                "reward": _filled([it["reward"][2] for it in steps]),
             }
         )
-        if len(self.tracks) < TRACKS_MAX:
-            path = np.asarray([it["uav_m"] for it in course if it["uav_m"] is not None]).reshape(-1, 3)
-            self.tracks.append(path.T.tolist())
+        if len(self.paths) < PATHS_MAX:
+            path = np.asarray([it["uav_m"] for it in steps if it["uav_m"] is not None]).reshape(-1, 3)
+            self.paths.append(path.T.tolist())
 
-    def values(self, metric: str) -> Array:
-        """A metric of each mission, `[n]`."""
-        return np.asarray([summary[metric] for summary in self.summaries], np.float64)
+    def data(self, first: "Group", axis: Array) -> dict[str, Any]:
+        """Page data; `first`: the group to compare with; `axis`: steps of the curves, `[T]`."""
+        return {
+            "label": self.label,
+            "bag": self.bag,
+            "policy": self.policy,
+            "scenario": self.scenario.name,
+            "users": self.scenario.n_users,
+            "missions": len(self.summaries),
+            "seeds": self._seeds(),
+            "metrics": {name: _interval([it[name] for it in self.summaries]) for name in METRICS},
+            "paired": None if self is first else self._paired(first),
+            "curves": {name: self._band(name, axis) for name in CURVES},
+            "paths": self.paths,
+        }
+
+    def _by_seed(self) -> dict[int, dict[str, Any]]:
+        return {summary["seed"]: summary for summary in self.summaries if summary["seed"] is not None}
+
+    def _seeds(self) -> str:
+        seeds = sorted(self._by_seed())
+        if len(seeds) > 1 and seeds == list(range(seeds[0], seeds[-1] + 1)):
+            return f"{seeds[0]} to {seeds[-1]}"
+        listed = ", ".join(map(str, seeds[:10]))
+        return f"{listed}, …" if len(seeds) > 10 else listed
+
+    def _paired(self, first: "Group") -> dict[str, Any] | None:
+        """Differences to the first group, seed by seed; None without two common seeds in the same world."""
+        if self.scenario.fingerprint != first.scenario.fingerprint:
+            return None
+        mine, theirs = self._by_seed(), first._by_seed()
+        common = sorted(set(mine) & set(theirs))
+        if len(common) < 2:
+            return None
+        differences = {
+            metric: _interval([mine[seed][metric] - theirs[seed][metric] for seed in common])
+            for metric in METRICS
+        }
+        return {"seeds": len(common), "differences": differences}
+
+    def _band(self, name: str, axis: Array) -> dict[str, list[float]]:
+        """Mean and interval at each step of the axis. After its end a mission keeps its values, at rate 0."""
+        rows = []
+        for curve in self.curves:
+            index = np.searchsorted(curve["step"], axis, side="right") - 1
+            row = curve[name][np.maximum(index, 0)]
+            rows.append(np.where(axis > curve["step"][-1], 0.0, row) if name == "sum_rate_bps" else row)
+        band = stats.band(np.asarray(rows))
+        return {key: significant(values) for key, values in zip(("mean", "low", "high"), band, strict=True)}
 
 
 def page(
     bags: list[Path], missions: list[int] | None, scenario: str | None, namespace: str | None
 ) -> tuple[Page, str]:
-    """The page, and what is in it, in words.
+    """The page, and its content in a few words.
 
     Args:
-        bags: one: its missions side by side; several: those bags.
-        missions: indices of those to look at; all, unless told.
-        scenario, namespace: as `steps.scenario` and `steps.namespace` take them.
+        bags: one, for its missions side by side; or several.
+        missions: indices of missions; None: all.
+        scenario, namespace: as `step_reader.scenario` and `step_reader.namespace` take them.
 
     Raises:
-        BagError: a bag cannot be read, or has none of these missions.
-        ParameterError: more groups than a picture can tell apart.
+        BagError: a bag cannot be read, or holds none of these missions.
+        ParameterError: more than `GROUPS_MAX` groups.
     """
     if len(bags) > GROUPS_MAX:
         raise ParameterError(f"--compare: {len(bags)} bags; expected at most {GROUPS_MAX}")
+    labels = [printable(bag.absolute().name) for bag in bags]
+    if len(set(labels)) < len(labels):
+        labels = [printable(str(bag)) for bag in bags]
     groups: list[Group] = []
-    for bag, label in zip(bags, _labels(bags), strict=True):
-        groups += _groups(bag, label, missions, scenario, namespace, apart=len(bags) == 1)
-    first = groups[0].scenario
-    title = f"{first.name}: {len(groups)} {'bags' if len(bags) > 1 else 'missions'} side by side"
-    made = Page("compare", title)
-    last = max(int(curve["step"][-1]) for group in groups for curve in group.curves)
-    axis = spread(last + 1, POINTS_MAX)
+    for bag, label in zip(bags, labels, strict=True):
+        groups += _groups(bag, label, missions, scenario, namespace, split=len(bags) == 1)
+    first = groups[0]
+    title = f"{first.scenario.name}: {len(groups)} {'bags' if len(bags) > 1 else 'missions'} side by side"
+    axis = spread(max(int(curve["step"][-1]) for group in groups for curve in group.curves) + 1, POINTS_MAX)
     data = {
         "title": title,
         "version": __version__,
-        "world": world(first),
+        "world": world_data(first.scenario),
         "steps": axis.tolist(),
         "worlds_differ": len({group.scenario.fingerprint for group in groups}) > 1,
         "rewards_differ": len({repr(group.scenario.reward) for group in groups}) > 1,
-        "groups": [_group(group, groups[0], axis) for group in groups],
+        "groups": [group.data(first, axis) for group in groups],
     }
+    made = Page("compare", title)
     if not made.add("data", data):
         raise BagError(f"the comparison does not fit into {PAGE_MAX / 1e6:.0f} MB; expected fewer bags")
-    n_missions = sum(len(group.summaries) for group in groups)
-    return made, f"{n_missions} missions in {len(groups)} groups"
-
-
-def _labels(bags: list[Path]) -> list[str]:
-    """Names of bags; with their folders, where names alone are equal."""
-    names = [printable(bag.absolute().name) for bag in bags]
-    return names if len(set(names)) == len(names) else [printable(str(bag)) for bag in bags]
+    return made, f"{sum(len(group.summaries) for group in groups)} missions in {len(groups)} groups"
 
 
 def _groups(
-    bag: Path, label: str, missions: list[int] | None, wanted: str | None, namespace: str | None, apart: bool
+    bag: Path, label: str, missions: list[int] | None, wanted: str | None, namespace: str | None, split: bool
 ) -> list[Group]:
-    """The group of a bag; or, `apart`, a group for each of its missions."""
+    """The group of a bag; or, with `split`, a group for each of its missions."""
     groups: list[Group] = []
     with BagReader(bag) as reader:
         name = step_reader.namespace(reader, namespace)
         scenario = step_reader.scenario(reader, name, wanted)
         policy = reader.about.get("policy", "unknown policy")
         recorded = step_reader.Steps(reader, name, scenario.step_ns)
-        for one in flown(iter(recorded), scenario):
-            if missions is not None and one.index not in missions:
+        for mission in read_missions(recorded, scenario):
+            if missions is not None and mission.index not in missions:
                 continue
-            if apart and len(groups) == GROUPS_MAX:
+            if split and len(groups) == GROUPS_MAX:
                 raise ParameterError(
-                    f"--compare: bag {bag} has more missions than can be told apart; expected up to "
+                    f"--compare: bag {bag} has more missions than a picture shows; expected up to "
                     f"{GROUPS_MAX}: --mission N ..."
                 )
-            if apart or not groups:
-                flight = f" of flight {one.flight}" if one.flight else ""
-                told = f"mission {one.index}{flight}" if apart else label
-                groups.append(Group(told, scenario, policy, label))
-            groups[-1].add(one)
+            if split or not groups:
+                own = mission_name(mission.index, mission.flight) if split else label
+                groups.append(Group(own, scenario, policy, label))
+            groups[-1].add(mission)
     if not groups:
-        wanted, why = "that is wanted " if missions else "", "; ".join(recorded.rejected.lines())
-        raise BagError(f"bag {bag}: no step of a mission {wanted}is in it{why and f': {why}'}")
+        raise BagError(no_step(bag, missions, recorded))
     return groups
 
 
-def _group(group: Group, first: Group, axis: Array) -> dict[str, Any]:
-    """A group as the page's data."""
-    return {
-        "label": group.label,
-        "bag": group.bag,
-        "policy": group.policy,
-        "scenario": group.scenario.name,
-        "users": group.scenario.n_users,
-        "missions": len(group.summaries),
-        "seeds": _seeds(group),
-        "metrics": {metric: _interval(group.values(metric)) for metric in METRICS},
-        "paired": None if group is first else _paired(group, first),
-        "curves": {name: _band(group, name, axis) for name in CURVES},
-        "tracks": group.tracks,
-    }
+def no_step(bag: Path, missions: list[int] | None, recorded: step_reader.Steps) -> str:
+    """Why a bag has no page."""
+    wanted = "" if missions is None else f" {', '.join(map(str, missions))}"
+    why = "; ".join(recorded.rejected.lines())
+    return f"bag {bag} holds no step of a mission{wanted}{why and f': {why}'}"
 
 
-def _seeds(group: Group) -> str:
-    seeds = sorted({s["seed"] for s in group.summaries if s["seed"] is not None})
-    if len(seeds) > 1 and seeds == list(range(seeds[0], seeds[-1] + 1)):
-        return f"{seeds[0]} to {seeds[-1]}"
-    told = ", ".join(map(str, seeds[:10]))
-    return f"{told}, …" if len(seeds) > 10 else told
+def _interval(values: list[float]) -> dict[str, float | None]:
+    """Mean and 95% interval; None of one value."""
+    array = np.asarray(values, np.float64)
+    if len(array) < 2:
+        return {"mean": float(array.mean()), "low": None, "high": None}
+    return stats.interval(array)._asdict()
 
 
-def _interval(values: Array) -> dict[str, float | None]:
-    """Mean, and the ends of its interval; of one value there is none."""
-    if len(values) < 2:
-        return {"mean": float(values.mean()), "low": None, "high": None}
-    return stats.interval(values)._asdict()
-
-
-def _paired(group: Group, first: Group) -> dict[str, Any] | None:
-    """What a group has more than the first one, seed by seed; None without two seeds in common.
-
-    In another world the same seed makes other users: nothing is compared there.
-    """
-    if group.scenario.fingerprint != first.scenario.fingerprint:
-        return None
-    mine, theirs = ({s["seed"]: s for s in it.summaries if s["seed"] is not None} for it in (group, first))
-    common = sorted(set(mine) & set(theirs))
-    if len(common) < 2:
-        return None
-    differences = {
-        metric: _interval(np.asarray([mine[seed][metric] - theirs[seed][metric] for seed in common]))
-        for metric in METRICS
-    }
-    return {"seeds": len(common), "differences": differences}
-
-
-def _band(group: Group, name: str, axis: Array) -> dict[str, list[float]]:
-    """Mean and interval at each step of the axis; a mission that is over stays as it ended, at no rate."""
-    rows = []
-    for curve in group.curves:
-        place = np.searchsorted(curve["step"], axis, side="right") - 1
-        row = curve[name][np.maximum(place, 0)]
-        over = axis > curve["step"][-1]
-        rows.append(np.where(over, 0.0, row) if name == "sum_rate_bps" else row)
-    told = stats.band(np.asarray(rows))
-    return {key: significant(values) for key, values in zip(("mean", "low", "high"), told, strict=True)}
-
-
-def _held(values: list[float | None]) -> Array:
-    """Values `[T]`; where one is not known, the one before it; 0 before the first."""
-    held: list[float] = []
+def _filled(values: list[float | None]) -> Array:
+    """Values `[T]`. An unknown one equals the one before; it is 0 at the start."""
+    filled: list[float] = []
     for value in values:
-        held.append(value if value is not None else (held[-1] if held else 0.0))
-    return np.asarray(held)
+        filled.append(value if value is not None else (filled[-1] if filled else 0.0))
+    return np.asarray(filled)

@@ -1,4 +1,4 @@
-"""What a node tells about itself once a second, followed over a whole recording in bounded memory."""
+"""Diagnostics of a node over a whole recording, in bounded memory."""
 
 import math
 import re
@@ -8,15 +8,15 @@ import numpy as np
 
 from uav_dc_ros.recordings.thinning import EveryNth
 
-SERIES_MAX = 400  # points of a curve, and values of which a median is taken
-COUNTERS = ("restarts", "rejected", "step overruns", "hovered steps")  # values that only ever rise
-# Until the end of the handling; without a word, as older bags have it, of some nodes until the receipt only.
+SERIES_MAX = 400  # points of a curve, and values for a median
+COUNTERS = ("restarts", "rejected", "step overruns", "hovered steps")  # values that only increase
+# `handling` is missing in older bags, where the latency of some nodes ends at the receipt.
 LATENCY = re.compile(r"(?P<topic>\S+)(?: handling)? latency (?P<percentile>p50|p99) \[ms\]")
-LATENCIES_MAX = 50  # topics of a node: more has none of ours
+LATENCIES_MAX = 50  # topics of a node: more than any node of ours has
 
 
-class Report(NamedTuple):
-    """One status of a diagnostic_msgs/DiagnosticArray: above level 0 something is wrong."""
+class NodeStatus(NamedTuple):
+    """One status of a diagnostic_msgs/DiagnosticArray; levels above 0 are warnings and errors."""
 
     level: int
     message: str
@@ -24,35 +24,31 @@ class Report(NamedTuple):
 
 
 class Series:
-    """Points in time, evenly thinned out when there are many."""
+    """A curve, evenly thinned when it is long."""
 
     def __init__(self) -> None:
         self.max = -math.inf
         self._points: EveryNth[tuple[float, float]] = EveryNth(SERIES_MAX)
-        self._seen = 0
+        self._count = 0
 
     def add(self, at_s: float, value: float) -> None:
-        """The next one."""
-        self._points.add(self._seen, (round(at_s, 2), value))
-        self._seen += 1
+        """Add the next point."""
+        self._points.add(self._count, (round(at_s, 2), value))
+        self._count += 1
         self.max = max(self.max, value)
 
     @property
     def points(self) -> list[tuple[float, float]]:
-        """Those kept: time, value."""
+        """Time and value of the points kept."""
         return self._points.kept
 
     def median(self) -> float:
-        """Of the values kept."""
+        """Median of the values kept."""
         return float(np.median([value for _, value in self.points]))
 
 
-class Node:
-    """A node, from report to report.
-
-    Args:
-        name: its name.
-    """
+class NodeHistory:
+    """The statuses of a node."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -60,32 +56,32 @@ class Node:
         self._warnings = 0
         self._silence_s = 0.0
         self._last_s = 0.0
-        self._last = Report(0, "", {})
+        self._last = NodeStatus(0, "", {})
         self._cpu = Series()
         self._latencies: dict[str, dict[str, Series]] = {}
 
-    def add(self, at_s: float, report: Report) -> list[str]:
-        """The next report; returns what in it is worse than before, in words."""
+    def add(self, at_s: float, status: NodeStatus) -> list[str]:
+        """Add the next status; returns what has become worse, as text."""
         if self._reports:
             self._silence_s = max(self._silence_s, at_s - self._last_s)
-        news = self._news(report)
+        news = self._news(status)
         self._reports += 1
-        self._warnings += report.level > 0
-        self._last_s, self._last = at_s, report
-        for key, text in report.values.items():
+        self._warnings += status.level > 0
+        self._last_s, self._last = at_s, status
+        for key, text in status.values.items():
             value = _number(text)
             latency = LATENCY.fullmatch(key)
             if value is None:
                 continue
             if key == "cpu [%]":
                 self._cpu.add(at_s, value)
-            elif latency is not None and self._may_be_new(latency["topic"]):
+            elif latency and (latency["topic"] in self._latencies or len(self._latencies) < LATENCIES_MAX):
                 percentiles = self._latencies.setdefault(latency["topic"], {})
                 percentiles.setdefault(latency["percentile"], Series()).add(at_s, value)
         return news
 
-    def page(self) -> dict[str, Any]:
-        """The page's data: the last state and counters, the usual and the worst latencies, CPU over time."""
+    def data(self) -> dict[str, Any]:
+        """Page data: last state and counters, median and worst latencies, CPU load over time."""
         values = self._last.values
         return {
             "name": self.name,
@@ -98,7 +94,7 @@ class Node:
             "cpu": self._cpu.points,
             "restarts": values.get("restarts"),
             "counters": {key: text for key, text in values.items() if _is_counter(key) and text != "0"},
-            "heard": [
+            "latencies": [
                 {
                     "topic": topic,
                     "p50_ms": series["p50"].median() if "p50" in series else None,
@@ -108,14 +104,11 @@ class Node:
             ],
         }
 
-    def _may_be_new(self, topic: str) -> bool:
-        return topic in self._latencies or len(self._latencies) < LATENCIES_MAX
-
-    def _news(self, report: Report) -> list[str]:
+    def _news(self, status: NodeStatus) -> list[str]:
         news = []
-        if report.level > 0 and (report.level, report.message) != self._last[:2]:
-            news.append(report.message)
-        for key, text in report.values.items():
+        if status.level > 0 and (status.level, status.message) != self._last[:2]:
+            news.append(status.message)
+        for key, text in status.values.items():
             before = _number(self._last.values.get(key, "0")) or 0.0
             now = _number(text)
             if _is_counter(key) and now is not None and now > before:
@@ -124,7 +117,7 @@ class Node:
 
 
 def _is_counter(key: str) -> bool:
-    """Whether it is a counter, such as `restarts`, `restarts of world` or `pose rejected: malformed`."""
+    """Whether a key is a counter, such as `restarts`, `restarts of world` or `pose rejected: malformed`."""
     return key.partition(":")[0].partition(" of ")[0].endswith(COUNTERS)
 
 

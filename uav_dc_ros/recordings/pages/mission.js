@@ -1,4 +1,4 @@
-// The page of one bag: a mission in space and time, its users, and how the system did.
+// The page of one bag: a mission in space and time, its users, and the state of the system.
 
 const STATES = [["waiting", "not collected", "circle"], ["served", "being served", "diamond"], ["collected", "collected", "square"]];
 const SIZES = { circle: [4.5, 8], diamond: [7.5, 13], square: [5, 9] }; // in space, on the map
@@ -9,11 +9,11 @@ open(async (page, data) => {
   const state = { mission: null, at: 0, chosen: null, timer: null };
   const at = (name) => document.getElementById(name);
 
-  // The skeleton. What depends on the mission is filled in by `show`.
+  // The skeleton. `show` fills in what depends on the mission.
   const sub = make("p", { class: "sub", id: "about" });
-  page.querySelector("header").append(data.held.length > 1 ? make("label", {}, "Mission ", make("select", {
+  page.querySelector("header").append(data.shown.length > 1 ? make("label", {}, "Mission ", make("select", {
     id: "missions", "aria-label": "Mission", onchange: (event) => show(event.target.value),
-  }, ...data.held.map((key) => {
+  }, ...data.shown.map((key) => {
     const one = data.missions[key];
     return make("option", { value: key }, `${missionName(one)} · seed ${one.seed ?? "?"} · ${one.outcome} · ${one.users_collected}/${one.users_total}`);
   }))) : "");
@@ -22,7 +22,7 @@ open(async (page, data) => {
 
   const play = make("button", { type: "button", class: "play", id: "play", onclick: toggle }, "▶ Play");
   const slider = make("input", { type: "range", id: "step", min: 0, max: 0, value: 0, step: 1, oninput: () => { stop(); go(Number(slider.value)); } });
-  const told = make("output", { for: "step", id: "told" });
+  const position = make("output", { for: "step", id: "position" });
   const counts = STATES.map(() => make("b", {}, "0"));
   page.append(
     make("div", { id: "tiles" }),
@@ -43,7 +43,7 @@ open(async (page, data) => {
           card("Reward so far, r of eq. 7", make("div", { class: "chart", id: "reward" }),
             make("ul", { class: "legend" }, key("ink", "total"), key("accent", `data: β = ${world.beta} × mean data / ${si(world.data_scale_bits, "bit")}`),
               key("warm", `trajectory: ζ = ${world.zeta} × R₊ (${world.r_plus})`))))),
-      make("div", { class: "card transport" }, play, make("div", { class: "slide" }, make("label", { for: "step" }, "Step"), slider), told)),
+      make("div", { class: "card transport" }, play, make("div", { class: "slide" }, make("label", { for: "step" }, "Step"), slider), position)),
     make("section", { "aria-labelledby": "users-title" },
       make("h2", { id: "users-title" }, "Users"), make("p", { class: "note", id: "users-note" }),
       make("div", { class: "grid wide-right" },
@@ -70,13 +70,13 @@ open(async (page, data) => {
 
   // The figures.
 
-  function steps() { return state.mission.course; }
+  function steps() { return state.mission.steps; }
 
   function drawScene() {
     const scene = at("scene");
     Plotly.purge(scene);
-    const { journey } = state.mission;
-    const flown = journey ? flownWay(journey, Infinity) : steps().map((one) => one.uav_m);
+    const { timeline } = state.mission;
+    const flown = timeline ? flownPath(timeline, Infinity) : steps().map((one) => one.uav_m);
     const column = (i) => flown.map((p) => (p ? p[i] : null));
     const users = STATES.map(([name, words, shape]) => space.trace({
       name: words, mode: "markers", x: [], y: [], z: [], text: [], hovertemplate: "%{text}<extra></extra>",
@@ -93,7 +93,7 @@ open(async (page, data) => {
     ];
     const still = [
       ...space.world(world),
-      ...(journey ? [space.trace({ name: "cells", mode: "markers", x: journey.cells.x, y: journey.cells.y, z: journey.cells.z, hoverinfo: "skip", marker: { symbol: "square-open", size: space.flat ? 9 : 4, color: colour("dock"), line: { color: colour("dock"), width: 1.5 } } })] : []),
+      ...(timeline ? [space.trace({ name: "cells", mode: "markers", x: timeline.cells.x, y: timeline.cells.y, z: timeline.cells.z, hoverinfo: "skip", marker: { symbol: "square-open", size: space.flat ? 9 : 4, color: colour("dock"), line: { color: colour("dock"), width: 1.5 } } })] : []),
       space.trace({ name: "path", mode: "lines", x: column(0), y: column(1), z: column(2), line: { color: colour("ahead"), width: space.flat ? 1.5 : 2.5 }, hoverinfo: "skip" }),
     ];
     state.moving = moving.map((_, i) => still.length + i);
@@ -105,7 +105,7 @@ open(async (page, data) => {
     const now = steps()[state.at];
     const measured = steps().slice(0, state.at + 1).map((one) => one.uav_m).filter(Boolean);
     const here = measured.at(-1);
-    const flown = state.mission.journey ? flownWay(state.mission.journey, now.step) : measured;
+    const flown = state.mission.timeline ? flownPath(state.mission.timeline, now.step) : measured;
     const users = lastKnown("users_m");
     const foot = ring(here ?? [0, 0], here ? now.reach_m || 0.001 : 0.001);
     const disc = space.flat ? foot : space.disc(foot, 0.4, "");
@@ -128,7 +128,7 @@ open(async (page, data) => {
     Plotly.restyle("scene", update, state.moving);
   }
 
-  // What was known last, where a step lacks it.
+  // The latest known value, where a step lacks it.
   function lastKnown(what) {
     for (let i = state.at; i >= 0; i--) if (steps()[i][what] !== null) return steps()[i][what];
     return null;
@@ -152,15 +152,15 @@ open(async (page, data) => {
     draw("sum-rate", [line("sum-rate", rates.map((rate) => (rate === null ? null : rate / rateScale)), "accent", { hovertemplate: `%{y:.3f} ${ratePrefix}bit/s<extra></extra>`, line: { color: colour("accent"), width: 2, shape: "vh" } })],
       { yaxis: axis({ rangemode: "tozero", title: `${ratePrefix}bit/s`, nticks: 5 }) });
     const reward = (i) => steps().map((one) => one.reward[i]);
-    const paid = (name, i, shade, more) => line(name, reward(i), shade, { hovertemplate: "%{y:.3f}", line: { color: colour(shade), width: 2, shape: "hv", ...more } });
-    draw("reward", [paid("data", 0, "accent", { dash: "dash" }), paid("trajectory", 1, "warm", { dash: "dot" }), paid("total", 2, "ink")],
+    const term = (name, i, shade, more) => line(name, reward(i), shade, { hovertemplate: "%{y:.3f}", line: { color: colour(shade), width: 2, shape: "hv", ...more } });
+    draw("reward", [term("data", 0, "accent", { dash: "dash" }), term("trajectory", 1, "warm", { dash: "dot" }), term("total", 2, "ink")],
       { yaxis: axis({ rangemode: "tozero", nticks: 5 }), xaxis: stepAxis(stepTitle()) });
     const { user, cluster } = state.mission.table;
     const [dataScale, dataPrefix] = siScale(Math.max(world.r_min_bits, ...user.map((_, i) => state.mission.table.data_bits[i])));
-    const held = user.map((_, u) => steps().map((one) => (one.data_bits ? one.data_bits[u] / dataScale : null)));
+    const data_bits = user.map((_, u) => steps().map((one) => (one.data_bits ? one.data_bits[u] / dataScale : null)));
     const borders = cluster.flatMap((one, i) => (i && one !== cluster[i - 1] ? [i - 0.5] : []));
     draw("data", [{
-      type: "heatmap", x, y: user.map((_, i) => i), z: held, zmin: 0, colorscale: "Cividis", hoverongaps: false,
+      type: "heatmap", x, y: user.map((_, i) => i), z: data_bits, zmin: 0, colorscale: "Cividis", hoverongaps: false,
       customdata: user.map((u, i) => x.map(() => [u, cluster[i]])),
       hovertemplate: `user %{customdata[0]}, cluster %{customdata[1]}, step %{x}: %{z:.2f} ${dataPrefix}bit<extra></extra>`,
       colorbar: { title: { text: `${dataPrefix}bit`, font: { size: 12 } }, thickness: 10, outlinewidth: 0, tickcolor: colour("faint"), len: 0.95, tickfont: { color: colour("muted") } },
@@ -182,12 +182,12 @@ open(async (page, data) => {
     return { tickvals: [...places.values()].map((rows) => rows[Math.floor(rows.length / 2)]), ticktext: [...places.keys()].map(String) };
   }
 
-  // A real vehicle takes the time that it needs, up to that of a step.
-  function stepTitle() { return `step, ${state.mission.journey ? "up to " : ""}${world.step_s} s each`; }
+  // A step of a real vehicle may end before its time.
+  function stepTitle() { return `step, ${state.mission.timeline ? "up to " : ""}${world.step_s} s each`; }
 
   function secondsAt(step) {
-    const { journey } = state.mission;
-    return journey ? journey.cells.s[journey.cells.step.indexOf(step)] ?? 0 : step * world.step_s;
+    const { timeline } = state.mission;
+    return timeline ? timeline.cells.s[timeline.cells.step.indexOf(step)] ?? 0 : step * world.step_s;
   }
 
   function nearest(step) {
@@ -203,7 +203,7 @@ open(async (page, data) => {
     const now = steps()[i];
     slider.value = i;
     const words = `step ${now.step} of ${state.summary.steps} · ${clock(secondsAt(now.step))} · ${now.n_collected}/${world.users} collected`;
-    told.textContent = words + (now.action ? ` · next: ${now.action}` : "");
+    position.textContent = words + (now.action ? ` · next: ${now.action}` : "");
     slider.setAttribute("aria-valuetext", words);
     moveScene();
     for (const id of CHARTS) Plotly.relayout(id, { "shapes[0].x0": now.step, "shapes[0].x1": now.step });
@@ -250,18 +250,18 @@ open(async (page, data) => {
     ]));
     at("why").hidden = !one.reason || landed;
     at("why").textContent = one.reason ? `${one.outcome}: ${one.reason}` : "";
-    at("vehicle").replaceChildren(state.mission.journey ? vehicle(state.mission.journey) : "");
+    at("vehicle").replaceChildren(state.mission.timeline ? vehicle(state.mission.timeline) : "");
     slider.max = steps().length - 1;
     const notes = ["SINR and rate are means over the steps in which a user was served; click a user to find it in the trajectory."];
-    if (state.mission.stride > 1) notes.push(`Shown is every ${state.mission.stride}th step; all figures are of all steps.`);
-    if (state.mission.table.user.length < world.users) notes.push(`Shown are ${state.mission.table.user.length} of ${world.users} users, evenly picked.`);
+    if (state.mission.stride > 1) notes.push(`The page shows every ${state.mission.stride}th step; totals are of all steps.`);
+    if (state.mission.table.user.length < world.users) notes.push(`The page shows ${state.mission.table.user.length} of ${world.users} users, evenly spaced.`);
     at("users-note").textContent = notes.join(" ");
     at("users").replaceChildren(userTable());
     draw();
     go(steps().length - 1);
   }
 
-  function draw() { drawScene(); drawCharts(); drawSystem(data.health); if (state.mission.journey) drawVehicle(state.mission.journey); if (steps().length) go(state.at); }
+  function draw() { drawScene(); drawCharts(); drawSystem(data.health); if (state.mission.timeline) drawVehicle(state.mission.timeline); if (steps().length) go(state.at); }
 
   function userTable() {
     const columns = state.mission.table;
@@ -292,13 +292,13 @@ open(async (page, data) => {
 
   function missionList() {
     if (data.missions.length < 2) return "";
-    const left = data.missions_total - data.held.length;
+    const left = data.missions_total - data.shown.length;
     const by = (name) => (row) => row[name];
-    const held = new Set(data.held.map((key) => data.missions[key]));
+    const shown = new Set(data.shown.map((key) => data.missions[key]));
     return make("section", { "aria-labelledby": "missions-title" }, make("h2", { id: "missions-title" }, "Missions of this bag"),
-      left > 0 ? make("p", { class: "note" }, `${data.held.length} of ${data.missions_total} missions fit into the page; --mission N shows another one.`) : null,
+      left > 0 ? make("p", { class: "note" }, `${data.shown.length} of ${data.missions_total} missions fit into the page; --mission N shows another one.`) : null,
       card(null, table([
-        { name: "mission", text: (row) => (held.has(row) ? make("button", { type: "button", onclick: () => { const key = String(data.missions.indexOf(row)); at("missions").value = key; show(key); scrollTo({ top: 0 }); } }, missionName(row)) : missionName(row)), value: (row) => data.missions.indexOf(row) },
+        { name: "mission", text: (row) => (shown.has(row) ? make("button", { type: "button", onclick: () => { const key = String(data.missions.indexOf(row)); at("missions").value = key; show(key); scrollTo({ top: 0 }); } }, missionName(row)) : missionName(row)), value: (row) => data.missions.indexOf(row) },
         { name: "seed", text: (row) => String(row.seed ?? NONE), value: by("seed") },
         { name: "outcome", text: by("outcome"), value: by("outcome") },
         { name: "steps", text: (row) => String(row.steps), value: by("steps") },
@@ -316,6 +316,6 @@ open(async (page, data) => {
   }
 
   await loadPlotly();
-  await show(String(data.held[0]));
+  await show(String(data.shown[0]));
   whenColoursChange(draw);
 });

@@ -1,12 +1,13 @@
-"""The missions of a bag as a page shows them: numbers of the whole mission, and what happened step by step.
+"""The missions of a bag as page data: totals of each mission, and its steps.
 
-A mission of any length is kept in bounded memory: a long one is thinned out while it is read, to every second
-step, every fourth, and so on. Its numbers (data, distance, rates) are always those of all steps.
+The steps of a long mission are thinned while they are read. Totals (data, distance, rates) are of all steps.
 """
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -17,31 +18,31 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.recordings.mission_totals import MissionTotals
-from uav_dc_ros.recordings.pages.vehicle import Journey
+from uav_dc_ros.recordings.pages.vehicle import VehicleTimeline
 from uav_dc_ros.recordings.recorded_step import RecordedStep
 from uav_dc_ros.recordings.thinning import EveryNth, spread
 
-STEPS_MAX = 400  # shown of a mission: as many as a slider tells apart
-VALUES_MAX = 60_000  # steps times users: what a page can draw, and hold
+STEPS_MAX = 400  # shown of a mission: the resolution of a slider
+VALUES_MAX = 60_000  # steps times users: the capacity of a page
 USERS_MAX = 2_000  # shown
-WAITING, SERVED, COLLECTED = "012"  # a user's state, as a page knows it
+WAITING, SERVED, COLLECTED = "012"  # state of a user in the page data
 
 
-class Flown:
-    """A mission that is brought together step by step.
+class MissionData:
+    """A mission as page data.
 
     Args:
-        scenario: the world that was flown.
-        flight, index: which mission it is, see `RecordedStep`.
-        real: was it flown by a real vehicle?
+        scenario: the world.
+        flight, index: see `RecordedStep`.
+        real: whether a real vehicle flew it.
 
     Attributes:
         totals: the mission in numbers.
         data_bits, collected: of each user at the end, `[U]`.
-        distance_m: length of the path flown, metres.
-        faults: what is missing or cannot be true, counted in words.
-        last_ns: when the last message of it was received.
-        journey: what a real vehicle told of it; None of a simulated one.
+        distance_m: length of the path flown.
+        faults: missing or contradictory messages, counted by text.
+        last_ns: log time of the latest message.
+        timeline: phases of a real vehicle; None in simulation.
     """
 
     def __init__(self, scenario: Scenario, flight: int, index: int, real: bool = False) -> None:
@@ -49,55 +50,53 @@ class Flown:
         self.scenario = scenario
         self.flight, self.index = flight, index
         self.totals = MissionTotals()
-        self.journey = Journey(scenario) if real else None
+        self.timeline = VehicleTimeline(scenario) if real else None
         self.data_bits: Array = np.zeros(n_users)
         self.collected: Array = np.zeros(n_users, dtype=bool)
         self.distance_m = 0.0
         self.faults: Counter[str] = Counter()
         self.last_ns = 0
         self.shown_users = spread(n_users, USERS_MAX)
-        most = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
-        self._steps: EveryNth[dict[str, Any]] = EveryNth(most)
+        max_kept = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
+        self._steps: EveryNth[dict[str, Any]] = EveryNth(max_kept)
         self._last: dict[str, Any] | None = None  # the newest step, kept or not
         self._position_m: Array | None = None
         self._cell: Array | None = None
-        self._expected = 0
-        self._sum_rates_bps: list[float] = [0.0, 0.0]  # sum over the steps, and how many
+        self._next_step = 0
+        self._sum_rates_bps: list[float] = [0.0, 0.0]  # sum over the steps, and their number
         self._served_steps: Array = np.zeros(n_users, dtype=np.int64)
         self._served_sums: Array = np.zeros((2, n_users))  # of SINR (linear) and rate (bit/s) while served
         self._collected_at: Array = np.full(n_users, -1, dtype=np.int64)
 
     def add(self, step: RecordedStep) -> None:
-        """The next step; what of it is for another world is counted, and left out."""
-        if step.step > self._expected:
-            self.faults["steps that are not in the bag"] += step.step - self._expected
-        self._expected = step.step + 1
+        """Add the next step. Payloads of another world are counted and left out."""
+        if step.step > self._next_step:
+            self.faults["steps that are not in the bag"] += step.step - self._next_step
+        self._next_step = step.step + 1
         self.last_ns = max(step.log_ns.values(), default=self.last_ns)
-        if self.journey is not None:
-            self.journey.add(step)
-        status, rates, users = map(self._fitting, (step.status, step.rates, step.users))
-        for name, there in (
-            ("mission", status),
-            ("users", users),
-            ("rates", rates),
-            ("pose", step.position_m is not None),
-        ):
-            if not there and (name == "mission" or step.is_measured):
-                self.faults[f"steps without {name}"] += 1
-        if status is not None:
+        if self.timeline is not None:
+            self.timeline.add(step)
+        status, rates, users = map(self._checked, (step.status, step.rates, step.users))
+        if status is None:
+            self.faults["steps without mission"] += 1
+        else:
             self._cell = np.asarray(status.cell)
+        if step.is_measured:
+            for name, value in {"users": users, "rates": rates, "pose": step.position_m}.items():
+                if value is None:
+                    self.faults[f"steps without {name}"] += 1
         self.totals.add(step.step, status, rates)
         if rates is not None:
-            self._book(step.step, rates)
-        self._keep(step, self._fly(step.position_m, status if step.is_measured else None), users, rates)
+            self._add_rates(step.step, rates)
+        self._keep(step, self._move(step.position_m, status if step.is_measured else None), users, rates)
 
     @property
     def reason(self) -> str:
-        """Why it ended, as a real vehicle tells."""
+        """Reason of the end; empty in simulation."""
         return self.totals.reason if self.totals.is_over else ""
 
     def summary(self) -> dict[str, Any]:
-        """The mission in numbers, as run_all's `--summary` has them."""
+        """The mission in numbers, with the keys of run_all's `--summary`."""
         (total, n), totals = self._sum_rates_bps, self.totals
         return {
             **({"reason": self.reason} if self.reason else {}),
@@ -112,27 +111,27 @@ class Flown:
             "data_bits": float(self.data_bits.sum()),
             "sum_rate_bps": total / max(n, 1),
             "distance_m": self.distance_m,
-            "reward": self.rewards(self._cell, self.data_bits)[2] if totals.steps else 0.0,
+            "reward": self._rewards()[2] if totals.steps else 0.0,
         }
 
-    def rewards(self, cell: Array | None, data_bits: Array) -> tuple[float, float, float]:
-        """The terms of r^t (eq. 7), the data's and `zeta R_plus`, and r^t itself; NaN where it is unknown."""
-        if cell is None:
+    def _rewards(self) -> tuple[float, float, float]:
+        """The data and trajectory terms of r^t (eq. 7), and r^t; NaN without a cell."""
+        if self._cell is None:
             return math.nan, math.nan, math.nan
-        paid = self.scenario.reward
-        distance = mission.dock_distance_cells(cell, self.scenario.dock_cell, like=data_bits)
-        trajectory = paid.zeta * reward.r_plus(distance, paid.r_plus)
-        data = reward.total(data_bits, np.zeros(()), paid.beta, paid.zeta, paid.data_scale_bits)
-        return float(data), float(trajectory), float(world.total_reward(self.scenario, cell, data_bits))
+        weights, data_bits = self.scenario.reward, self.data_bits
+        distance = mission.dock_distance_cells(self._cell, self.scenario.dock_cell, like=data_bits)
+        trajectory = weights.zeta * reward.r_plus(distance, weights.r_plus)
+        data = reward.total(data_bits, np.zeros(()), weights.beta, weights.zeta, weights.data_scale_bits)
+        return float(data), float(trajectory), float(world.total_reward(self.scenario, self._cell, data_bits))
 
-    def course(self) -> list[dict[str, Any]]:
-        """The steps that are shown, in their order; the last one is always among them."""
+    def steps(self) -> list[dict[str, Any]]:
+        """The steps shown, in order; the last one is always among them."""
         kept = self._steps.kept
         return kept if self._last is None or self._last is kept[-1] else [*kept, self._last]
 
     @property
     def stride(self) -> int:
-        """Every how many steps one is shown."""
+        """Distance between two steps shown."""
         return self._steps.stride
 
     def table(self) -> dict[str, list[Any]]:
@@ -152,7 +151,7 @@ class Flown:
             "rate_bps": _finite(np.where(served > 0, rate_bps, math.nan)),
         }
 
-    def _fitting(self, payload: Any) -> Any:
+    def _checked(self, payload: Any) -> Any:
         try:
             payloads.check(payload, self.scenario)
         except MessageError as error:
@@ -161,22 +160,22 @@ class Flown:
             return None
         return payload
 
-    def _book(self, step: int, rates: messages.Rates) -> None:
+    def _add_rates(self, step: int, rates: messages.Rates) -> None:
         data_bits, collected = payloads.collection(rates, self.scenario)
         if (data_bits < self.data_bits).any() or (self.collected & ~collected).any():
-            self.faults["steps that took back what was collected"] += 1
+            self.faults["steps with less collected data than before"] += 1
         self._collected_at[collected & (self._collected_at < 0)] = step
         self.data_bits, self.collected = data_bits, collected
         if step == 0:
-            return  # the moment of the start: no time has passed to collect in
+            return  # nothing is collected before the first move
         self._sum_rates_bps[0] += rates.sum_rate_bps
         self._sum_rates_bps[1] += 1
         served = np.asarray(rates.served, dtype=bool)
         self._served_steps += served
         self._served_sums += served * np.asarray([rates.sinr, rates.rate_bps])
 
-    def _fly(self, position_m: Array | None, status: messages.Mission | None) -> Array | None:
-        """Where the UAV was: its pose, or else the centre of its cell; metres `[3]`, or None."""
+    def _move(self, position_m: Array | None, status: messages.Mission | None) -> Array | None:
+        """Position of the UAV: its pose, or else the centre of its cell; metres `[3]`, or None."""
         if position_m is None and status is not None:
             position_m = self.scenario.grid.centre_m(np.asarray(status.cell), like=np.zeros(1))
         if position_m is not None:
@@ -198,46 +197,41 @@ class Flown:
         reach_m = 0.0
         if position_m is not None:
             reach_m = radio.ground_reach_m(self.scenario.mission.d_cons_m, max(float(position_m[2]), 0.0))
+        users_m = None if users is None else np.asarray([users.x_m, users.y_m])[:, shown]
         self._last = {
             "step": step.step,
             "uav_m": None if position_m is None else np.round(position_m, 2).tolist(),
             "reach_m": round(reach_m, 1),
             "action": step.move.action if step.move else None,
-            "users_m": None if users is None else _users_m(users, shown),
+            "users_m": None if users_m is None else np.round(users_m, 1).tolist(),
             "data_bits": None if rates is None else significant(self.data_bits[shown]),
             "state": "".join(state.tolist()),
             "n_collected": int(self.collected.sum()),
             "sum_rate_bps": rates.sum_rate_bps if rates and step.step else None,
-            "reward": _finite(np.asarray(self.rewards(self._cell, self.data_bits))),
+            "reward": _finite(np.asarray(self._rewards())),
         }
         self._steps.add(step.step, self._last)
 
 
-def flown(steps: Iterator[RecordedStep], scenario: Scenario, real: bool = False) -> Iterator[Flown]:
-    """The missions of a bag, one after the other; those steps alone are in memory that are shown."""
-    now: Flown | None = None
-    for step in steps:
-        if now is None or (now.flight, now.index) != (step.flight, step.mission):
-            if now is not None:
-                yield now
-            now = Flown(scenario, step.flight, step.mission, real)
-        now.add(step)
-    if now is not None:
-        yield now
+def read_missions(
+    steps: Iterable[RecordedStep], scenario: Scenario, real: bool = False
+) -> Iterator[MissionData]:
+    """The missions of a bag one by one, with only the steps shown in memory."""
+    for (flight, index), mission_steps in groupby(steps, attrgetter("flight", "mission")):
+        data = MissionData(scenario, flight, index, real)
+        for step in mission_steps:
+            data.add(step)
+        yield data
 
 
-def significant(values: Array, digits: int = 4) -> list[float]:
-    """Values rounded to a few significant digits: more of them nobody sees in a picture."""
+def significant(values: Array) -> list[float]:
+    """Values rounded to four significant digits."""
     values = np.asarray(values, np.float64)
     with np.errstate(divide="ignore"):
         magnitude = np.where(values == 0, 0, np.floor(np.log10(np.abs(values))))
-    scale = 10.0 ** (digits - 1 - magnitude)
+    scale = 10.0 ** (3 - magnitude)
     rounded: list[float] = (np.round(values * scale) / scale).tolist()
     return rounded
-
-
-def _users_m(users: messages.Users, shown: Array) -> list[list[float]]:
-    return np.round(np.asarray([users.x_m, users.y_m])[:, shown], 1).tolist()
 
 
 def _finite(values: Array) -> list[float | None]:

@@ -1,8 +1,7 @@
-"""A page: template, style, scripts, data and Plotly in one file that needs no network.
+"""A page: template, style, scripts, data and Plotly in one file without network access.
 
-Plotly's JavaScript comes from the installed Python package and is compressed, as is all data: a browser
-unpacks it while it opens the page. Base64 holds no `<`, so nothing that a bag says can end its script
-element.
+Plotly's JavaScript comes from the installed Python package. It is compressed, as is all data; the browser
+decompresses it. Base64 holds no `<`, so no text of a bag can end its script element.
 """
 
 import base64
@@ -14,6 +13,8 @@ from typing import Any
 
 import msgspec
 
+from uav_dc_ros.core import radio
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 
 PAGE_MAX = 3_000_000  # bytes
@@ -21,11 +22,7 @@ FOLDER = importlib.resources.files("uav_dc_ros.recordings.pages")
 
 
 class Page:
-    """A page that is put together.
-
-    Args:
-        kind: `mission` or `compare`: the script that draws it.
-        title: its title.
+    """A page with a title; `kind`, `mission` or `compare`, names the script that draws it.
 
     Raises:
         ParameterError: Plotly is not installed.
@@ -40,16 +37,12 @@ class Page:
             "plotly": _packed(_plotly()),
         }
         self._data: list[str] = []
-        self._size = len(self._whole())
+        self._size = len(self.content())
 
-    def room(self) -> int:
-        """Bytes that a page may still take."""
-        return PAGE_MAX - self._size
-
-    def add(self, name: str, data: Any, least_room: int = 0) -> bool:
-        """Add data under a name, if it fits and leaves some room; tells whether it did."""
+    def add(self, name: str, data: Any, min_room: int = 0) -> bool:
+        """Add data under a name; False if it does not fit with `min_room` bytes to spare."""
         script = f'<script type="text/plain" id="{name}">{_packed(msgspec.json.encode(data))}</script>\n'
-        if len(script) + least_room > self.room():
+        if self._size + len(script) + min_room > PAGE_MAX:
             return False
         self._data.append(script)
         self._size += len(script)
@@ -57,11 +50,35 @@ class Page:
 
     def content(self) -> bytes:
         """The whole page, UTF-8."""
-        return self._whole().encode()
-
-    def _whole(self) -> str:
         parts = self._parts | {"data": "".join(self._data)}
-        return re.sub(r"\{\{(\w+)\}\}", lambda name: parts[name[1]], _text("page.html"))
+        return re.sub(r"\{\{(\w+)\}\}", lambda name: parts[name[1]], _text("page.html")).encode()
+
+
+def world_data(scenario: Scenario) -> dict[str, Any]:
+    """The world as page data."""
+    grid, mission, reward = scenario.grid, scenario.mission, scenario.reward
+    return {
+        "name": scenario.name,
+        "fingerprint": scenario.fingerprint,
+        "users": scenario.n_users,
+        "clusters": scenario.users.cluster_centres_m,
+        "cluster_radius_m": scenario.users.cluster_radius_m,
+        "n_x": grid.n_x,
+        "n_y": grid.n_y,
+        "cell_m": grid.cell_m,
+        "top_m": grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m,
+        "start_m": mission.start_m,
+        "dock_m": mission.dock_m,
+        "step_s": mission.step_s,
+        "max_steps": mission.max_steps,
+        "d_cons_m": mission.d_cons_m,
+        "reach_m": radio.ground_reach_m(mission.d_cons_m, grid.altitude_min_m),
+        "r_min_bits": mission.r_min_bits,
+        "beta": reward.beta,
+        "zeta": reward.zeta,
+        "r_plus": reward.r_plus,
+        "data_scale_bits": reward.data_scale_bits,
+    }
 
 
 def _plotly() -> bytes:
@@ -76,7 +93,7 @@ def _plotly() -> bytes:
 
 
 def _packed(content: bytes) -> str:
-    """Compressed, as text; equal for equal content."""
+    """Compressed text; equal for equal content."""
     return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
 
 

@@ -1,4 +1,4 @@
-// How the recorded system did: latencies, nodes, faults.
+// The recorded system: latencies, nodes, faults.
 
 function system(health) {
   const ms = (name, digits = 2) => (row) => fixed(row[name], digits);
@@ -11,7 +11,7 @@ function system(health) {
   const nodes = health.nodes;
   return make("section", { "aria-labelledby": "system-title" },
     make("h2", { id: "system-title" }, "System"),
-    make("p", { class: "note" }, `${clock(health.duration_s)} recorded. A latency is the time from publishing a message to the recorder's receiving it, its p99 the one that a hundredth of them exceed; times within a step are between two publications.`),
+    make("p", { class: "note" }, `${clock(health.duration_s)} recorded. A latency is the time from the publication of a message to its receipt by the recorder; 1% of the messages exceed the p99. Times within a step are between two publications.`),
     make("div", { class: "grid halves" },
       card("Latency by topic: p50 to p99, and maximum", make("div", { class: "chart", id: "latency", style: `height: ${70 + 24 * health.topics.length}px` }),
         table([{ name: "within a step", text: by("name") }, { name: "steps", text: (row) => fixed(row.count), value: by("count") }, ...latency], health.chain, { label: "Times within a step" })),
@@ -28,16 +28,16 @@ function system(health) {
         { name: "last state", text: by("state"), cls: "text" },
         { name: "restarts", text: (row) => row.restarts ?? NONE, value: (row) => Number(row.restarts ?? 0) },
         { name: "warnings", text: (row) => fixed(row.warnings), value: by("warnings") },
-        { name: "CPU, %", text: (row) => fixed(row.cpu_median, 0), value: by("cpu_median"), help: "median, of its process: nodes that share one tell the same" },
+        { name: "CPU, %", text: (row) => fixed(row.cpu_median, 0), value: by("cpu_median"), help: "median of the node's process; nodes in one process report the same value" },
         { name: "max", text: (row) => fixed(row.cpu_max, 0), value: by("cpu_max") },
-        { name: "until handled: p50 (worst p99), ms", cls: "text", text: (row) => row.heard.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
-        { name: "counted", cls: "text", text: (row) => Object.entries(row.counters).map(([name, value]) => `${name} ${value}`).join(", ") || NONE },
-      ], nodes, { label: "Nodes" }) : make("p", { class: "note" }, "No node told diagnostics in this bag."))),
+        { name: "until handled: p50 (worst p99), ms", cls: "text", text: (row) => row.latencies.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
+        { name: "counters", cls: "text", text: (row) => Object.entries(row.counters).map(([name, value]) => `${name} ${value}`).join(", ") || NONE },
+      ], nodes, { label: "Nodes" }) : make("p", { class: "note" }, "The bag holds no diagnostics."))),
     make("div", { class: "grid halves" },
-      card("CPU of each node's process", nodes.some((node) => node.cpu.length > 1) ? make("div", { class: "chart", id: "cpu", style: "height: 300px" }) : make("p", { class: "note" }, "Too short a recording for a curve: nodes tell once a second.")),
+      card("CPU of each node's process", nodes.some((node) => node.cpu.length > 1) ? make("div", { class: "chart", id: "cpu", style: "height: 300px" }) : make("p", { class: "note" }, "The recording is too short for a curve: nodes report once a second.")),
       card("Faults", health.faults.length ? table([
         { name: "at, s", text: (row) => fixed(row.s, 2), value: by("s") },
-        { name: "who", text: by("who"), value: by("who") },
+        { name: "source", text: by("source"), value: by("source") },
         { name: "what", cls: "text", text: by("what") },
       ], health.faults, { label: "Faults", caption: health.faults_total > health.faults.length ? `${health.faults.length} of ${health.faults_total}` : "" })
         : make("p", { class: "good", id: "no-faults" }, "✓ None: every step has its messages, no node was restarted, nothing was rejected."))));
@@ -45,7 +45,7 @@ function system(health) {
 
 function drawSystem(health) {
   const rows = health.topics.filter((row) => row.p50_ms !== null).reverse();
-  const floor = 1e-3; // a logarithm needs it; clocks of two hosts may even differ the other way
+  const floor = 1e-3; // for the logarithm; with the clocks of two hosts a latency may be negative
   const at = (value) => Math.max(value, floor);
   const join = (from, to, fill) => rows.flatMap((row) => [fill ?? at(row[from]), fill ?? at(row[to]), null]);
   const names = rows.map((row) => plain(row.name));

@@ -1,1 +1,1 @@
-"""The verb `verify`: everything that a bag reports of its missions is recomputed and compared."""
+"""The verb `verify`: recomputes the missions of a bag and compares them to what was recorded."""

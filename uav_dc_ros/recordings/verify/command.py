@@ -1,8 +1,9 @@
-"""Verify a bag: recompute everything that it tells of its missions, and compare to the last bit."""
+"""Verify a bag: recompute its missions, and compare to the last bit."""
 
 import argparse
 from collections.abc import Iterator
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,30 +19,29 @@ from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, PolicyError
 from uav_dc_ros.recordings import step_reader
-from uav_dc_ros.recordings.recorded_step import RecordedStep
-from uav_dc_ros.recordings.recorded_vehicle import is_real, vehicle
+from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import Steps
-from uav_dc_ros.recordings.verify.differences import Book
-from uav_dc_ros.recordings.verify.recompute import Channel, Decisions, World
-from uav_dc_ros.recordings.verify.vehicle_flights import Flights
+from uav_dc_ros.recordings.verify.differences import Check
+from uav_dc_ros.recordings.verify.recompute import ChannelCheck, DecisionCheck, WorldCheck
+from uav_dc_ros.recordings.verify.vehicle_flights import VehicleCheck
 from uav_dc_ros.topics import SIMULATED
 
 NEEDED = ("pose", "users", "rates", "mission")  # topics without which nothing can be recomputed
-SHOWN = 5  # decisions of another policy that are shown with their Q-values
-LISTED = 100  # missions in which it decides otherwise
+SHOWN = 5  # different decisions of another policy that are shown with their Q-values
+LISTED = 100  # missions with different decisions
 DIFFERS = 1  # exit status
 
 EPILOG = """\
 Exit status 0: nothing differs; 1: something does, or, with --complete, something could not be recomputed;
 2: the bag cannot be verified at all.
 
-What a bag lacks cannot be recomputed; it is counted with its reason, and the last line then says 'in part'.
-Poses, and users from the seed, are recomputed for flights of this project's own world. Another machine's
-mathematics may differ in the last digit: --tolerance 1e-12 lets that pass, and counts it.
+What a bag lacks cannot be recomputed; it is counted with its reason, and the last line then is 'verified in
+part'. Poses, and users from the seed, are recomputed for flights in this project's simulated world. On
+another machine the last digits may differ: --tolerance 1e-12 accepts that, and counts it.
 
-A real vehicle's poses are what it measured itself. Its phases must follow each other as they may, no move may
-be flown twice, and users have the time of a pose; its distance to the centres of its cells is reported and
-is no difference: a step also ends when its time is over.
+A real vehicle measures its own poses. Its phase changes must be allowed ones, no move may be flown twice, and
+users have the time of a pose. Its distance from the centres of cells is reported and is no difference: a step
+also ends when its time is over.
 """
 
 
@@ -50,22 +50,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
-    add("--policy", metavar="NAME|DIR", help="also show where this policy would have decided otherwise")
-    add(
-        "--policy-dir",
-        type=Path,
-        metavar="DIR",
-        help="where the policy that flew lies: its folder, or theirs",
-    )
+    add("--policy", metavar="NAME|DIR", help="also show where this policy decides differently")
+    add("--policy-dir", type=Path, metavar="DIR", help="folder of the policy that flew, or of policies")
     add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the mission, for a bag with several")
-    add(
-        "--tolerance",
-        type=_tolerance,
-        default=0.0,
-        metavar="X",
-        help="relative, of numbers; 0: to the last bit",
-    )
+    tolerance = "relative, of numbers; 0: to the last bit"
+    add("--tolerance", type=_tolerance, default=0.0, metavar="X", help=tolerance)
     add("--complete", action="store_true", help="exit status 1 also for what could not be recomputed")
 
 
@@ -83,17 +73,15 @@ def run(options: argparse.Namespace) -> int:
     """Verify; the exit status.
 
     Raises:
-        BagError: nothing of the bag can be recomputed.
+        BagError: nothing in the bag can be recomputed.
     """
     with BagReader(options.bag) as reader:
         namespace = step_reader.namespace(reader, options.namespace)
-        _check_topics(reader, namespace, ("mission",) if is_real(reader, namespace) else NEEDED)
+        _check_topics(reader, namespace)
         scenario = step_reader.scenario(reader, namespace, options.scenario)
-        other = Decisions(scenario, policies.load(options.policy)) if options.policy else None
+        other = OtherPolicy(scenario, policies.load(options.policy)) if options.policy else None
         found = verify(reader, namespace, scenario, other, options.policy_dir, options.tolerance)
-        print(f"{options.bag}: {found.flown}")
-        for line in found.lines:
-            print(line)
+        print(f"{options.bag}: {found.flown}", *found.lines, sep="\n")
         if reader.about.get("version", __version__) != __version__ and found.differs:
             print(f"  (recorded by version {reader.about['version']}; this is {__version__})")
     if found.differs:
@@ -104,13 +92,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 class Verification(NamedTuple):
-    """What a verification found.
+    """Result of a verification.
 
     Attributes:
-        flown: what was looked at, in words.
-        lines: what was found, in words.
-        differs: is a recorded value not the recomputed one.
-        gaps: was there anything that could not be recomputed.
+        flown: missions, steps, scenario and policy, as text.
+        lines: results of the checks, as text.
+        differs: whether a recorded value differs from the recomputed one.
+        gaps: whether something could not be recomputed.
     """
 
     flown: str
@@ -119,106 +107,112 @@ class Verification(NamedTuple):
     gaps: bool
 
 
+class OtherPolicy(DecisionCheck):
+    """Decisions of another policy than the one that flew."""
+
+    def __init__(self, scenario: Scenario, policy: Policy) -> None:
+        super().__init__(scenario, policy)
+        self._details: list[str] = []
+        self._missions = 0  # with different decisions
+        self._before = 0, 0  # steps compared and differing before the mission
+
+    def add(self, step: RecordedStep) -> Array | None:
+        """Compare the decision of a step."""
+        q_values = super().add(step)
+        if q_values is not None and self.differing <= SHOWN and step.move is not None:
+            best, recorded = int(np.argmax(q_values)), ACTION_LABELS.index(step.move.action)
+            self._details.append(
+                f"  {step.name}: {ACTION_LABELS[best]} (Q {q_values[best]:.6g}), "
+                f"recorded {step.move.action} (Q {q_values[recorded]:.6g})"
+            )
+        return q_values
+
+    def end_mission(self, name: str) -> None:
+        """Count the decisions of a mission after its last step."""
+        compared, differing = self.compared - self._before[0], self.differing - self._before[1]
+        self._before = self.compared, self.differing
+        self._missions += differing > 0
+        if differing and self._missions <= LISTED:
+            self._details.append(f"  {name}: {differing} of {compared} moves")
+
+    def lines(self) -> list[str]:
+        """The result as text."""
+        more = [f"  and in {self._missions - LISTED} more missions"] if self._missions > LISTED else []
+        summary = f"{self.policy.name!r} decides differently in {self.differing} of {self.compared} steps"
+        return [summary, *self._details, *more]
+
+
 def verify(
     reader: BagReader,
     namespace: str,
     scenario: Scenario,
-    other: Decisions | None = None,
+    other: OtherPolicy | None = None,
     policy_dir: Path | None = None,
     tolerance: float = 0.0,
 ) -> Verification:
-    """Recompute the missions in a namespace.
+    """Recompute the missions in a namespace, as `step_reader.namespace` returns it.
 
     Args:
         reader: of the bag.
-        namespace: as `steps.namespace` gives it.
+        namespace: of the missions.
         scenario: the world.
-        other: with another policy, to tell where it would have decided otherwise.
-        policy_dir: where the policy that flew may lie.
-        tolerance: relative difference of numbers that counts as none.
+        other: another policy to compare.
+        policy_dir: folder of the policy that flew, or of policies.
+        tolerance: greatest relative difference of two equal numbers.
     """
     about = reader.about
-    lockstep = about.get("pace") == pace.LOCKSTEP
-    seeded = "seed" in about  # our recorder tells it, of our world
-    flew = vehicle(reader, namespace)
-    real = flew != SIMULATED
-    policy, without = _policy(about, scenario, policy_dir)
-    channel = Channel(scenario, tolerance)
-    world = World(scenario, seeded=seeded, lockstep=lockstep, real=real, tolerance=tolerance)
-    flights = Flights(scenario) if real else None
-    decisions = Decisions(scenario, policy) if policy else None
+    vehicle = step_reader.vehicle(reader, namespace)
+    policy, missing_policy = _policy(about, scenario, policy_dir)
+    channel = ChannelCheck(scenario, tolerance)
+    world = WorldCheck(
+        scenario,
+        seed=about.get("seed"),
+        lockstep=about.get("pace") == pace.LOCKSTEP,
+        real=vehicle != SIMULATED,
+        tolerance=tolerance,
+    )
+    flights = VehicleCheck(scenario, vehicle) if vehicle != SIMULATED else None
+    decisions = DecisionCheck(scenario, policy) if policy else None
     recorded = Steps(reader, namespace, scenario.step_ns)
-    otherwise: list[str] = []
-    n_missions = n_steps = n_missions_other = 0
-    for _, mission in groupby(recorded, lambda step: (step.flight, step.mission)):
+    n_missions = n_steps = 0
+    for (flight, mission), steps in groupby(recorded, attrgetter("flight", "mission")):
         n_missions += 1
-        n_other, n_before = 0, other.compared if other else 0
-        for step in mission:
+        for step in steps:
             n_steps += 1
             if step.is_measured or step.users is not None or step.rates is not None:
                 channel.add(step)
-            world.add(step)
-            if flights:
-                flights.add(step)
-            if decisions:
-                decisions.add(step)
-            if other and (q_values := other.add(step)) is not None:
-                n_other += 1
-                if other.differing <= SHOWN:
-                    otherwise.append(f"  {step.name}: {_told(step, q_values)}")
-        if other and n_other:
-            n_missions_other += 1
-        if other and n_other and n_missions_other <= LISTED:
-            otherwise.append(
-                f"  {step.name.partition(',')[0]}: {n_other} of {other.compared - n_before} moves"
-            )
+            for check in (world, flights, decisions, other):
+                if check:
+                    check.add(step)
+        if other:
+            other.end_mission(mission_name(mission, flight))
     if not channel.compared and not world.compared:
-        why = "; ".join(recorded.rejected.lines()) or _reasons(channel)
+        skipped = ", ".join(f"{reason} ({n})" for reason, n in channel.skipped.most_common())
+        why = "; ".join(recorded.rejected.lines()) or skipped or "there are none"
         raise BagError(f"bag {reader.path}: none of its {n_steps} steps can be recomputed: {why}")
-    told = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
+    checks: list[Check] = [one for one in (channel, world, flights, decisions) if one]
+    lines = [line for check in checks for line in check.lines()]
+    if not decisions:
+        lines.append(f"decisions: not verified: {missing_policy}")
+    losses = list(recorded.losses())
     missions = f"{n_missions} mission{'s' * (n_missions != 1)}"
-    flown = f"{missions}, {n_steps} steps in scenario {scenario.name!r}{told}"
-    lines = [*_lines("channel", channel), *_channel_notes(channel), *_lines("world", world)]
-    if world.hovered:
-        lines.append(f"  {world.hovered} moves were not flown: they came too late, and the vehicle hovered")
-    if seeded and any(str(seed) != about["seed"] for seed in world.seeds.values()):
-        seeds = ", ".join(map(str, world.seeds.values()))
-        lines.append(f"  flown with seed {seeds}, though the bag is said to be of seed {about['seed']}")
-    if not seeded:
-        what = "users" if real else "poses and users"
-        lines.append(f"  not flown by our own world, as far as the bag tells: {what} are as recorded")
-    if flights:
-        lines += flights.lines(flew)
-    lines += _lines("decisions", decisions) if decisions else [f"decisions: not verified: {without}"]
-    unread = recorded.rejected + recorded.orphans
-    lines += recorded.rejected.lines()
-    for topic, n in sorted(recorded.orphans.items()):
-        lines.append(f"{n} messages on {topic} came too late to be brought together with their step")
-    if other:
-        name, of = other.policy.name, f"{other.differing} of {other.compared} steps"
-        lines.append(f"{name!r} would have decided otherwise in {of}")
-        lines += otherwise
-        if n_missions_other > LISTED:
-            lines.append(f"  and in {n_missions_other - LISTED} missions more")
-    books: list[Book] = [channel, world, *([flights] if flights else []), *([decisions] if decisions else [])]
+    by = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
     return Verification(
-        flown,
-        lines,
-        differs=any(book.differing for book in books),
-        gaps=any(book.skipped for book in books) or decisions is None or bool(unread) or not seeded,
+        f"{missions}, {n_steps} steps in scenario {scenario.name!r}{by}",
+        lines + losses + (other.lines() if other else []),
+        differs=any(check.differing for check in checks),
+        gaps=any(check.skipped for check in checks) or not decisions or bool(losses) or "seed" not in about,
     )
 
 
-def _check_topics(reader: BagReader, namespace: str, needed: tuple[str, ...]) -> None:
-    """Raises BagError for a bag that lacks a whole topic: nothing in it can be recomputed.
+def _check_topics(reader: BagReader, namespace: str) -> None:
+    """Raises BagError for a bag without a whole topic, of which nothing can be recomputed.
 
-    A real vehicle whose mission ended before it left the ground has nobody measured.
+    Users around a real vehicle are not measured in a mission that ends before takeoff.
     """
-    missing = [
-        f"{namespace}/{name}"
-        for name in needed
-        if f"{namespace}/{name}" not in reader.topics or not reader.topics[f"{namespace}/{name}"].count
-    ]
+    needed = NEEDED if step_reader.vehicle(reader, namespace) == SIMULATED else ("mission",)
+    counts = {name.removeprefix(f"{namespace}/"): topic.count for name, topic in reader.topics.items()}
+    missing = [f"{namespace}/{name}" for name in needed if not counts.get(name)]
     if missing:
         raise BagError(
             f"bag {reader.path} holds nothing on {', '.join(missing)}; expected {', '.join(needed)}, from "
@@ -236,7 +230,7 @@ def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> t
         raise ParameterError(f"--policy-dir {folder}: no such folder")
     name, sha256 = about.get("policy"), about.get("policy_sha256")
     if name is None or sha256 is None:
-        return None, "the bag does not tell which policy flew; --policy NAME|DIR compares with one"
+        return None, "the bag does not name the policy that flew; --policy NAME|DIR compares with one"
     other = ""
     for candidate in _candidates(name, folder):
         try:
@@ -250,7 +244,7 @@ def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> t
             other = f"; {str(candidate)!r} is another one (sha256 {policy.sha256[:12]})"
     return (
         None,
-        f"policy {name!r} (sha256 {sha256[:12]}) is not here{other}; expected it from --policy-dir DIR",
+        f"policy {name!r} (sha256 {sha256[:12]}) is missing{other}; expected it from --policy-dir DIR",
     )
 
 
@@ -260,38 +254,3 @@ def _candidates(name: str, folder: Path | None) -> Iterator[str | Path]:
         yield from sorted(path.parent for path in folder.glob(f"*/{CONFIG}"))
     yield name
     yield from policies.names()
-
-
-def _lines(title: str, book: Book) -> list[str]:
-    """A book in words."""
-    total = book.compared + book.skipped.total()
-    if not total:
-        return [f"{title}: the bag has no step for it"]
-    told = f"{title}: {book.compared} of {total} steps recomputed"
-    if not book.differing:
-        lines = [f"{told}, equal {'to the last bit' if not book.within else 'within the tolerance'}"]
-    else:
-        lines = [f"{told}, {book.differing} differ; first:", f"  {book.first}"]
-    if book.within:
-        lines.append(f"  {book.within} values are equal within the tolerance only")
-    lines += [f"  {n} not recomputed: {reason}" for reason, n in book.skipped.most_common()]
-    return lines
-
-
-def _channel_notes(channel: Channel) -> list[str]:
-    if not channel.later_poses:
-        return []
-    return [f"  {channel.later_poses} steps fit a later pose than the first one recorded"]
-
-
-def _reasons(book: Book) -> str:
-    return ", ".join(f"{reason} ({n})" for reason, n in book.skipped.most_common()) or "there are none"
-
-
-def _told(step: RecordedStep, q_values: Array) -> str:
-    """Another decision, with its Q-value and that of the one recorded."""
-    assert step.move is not None, "it was compared"
-    best = int(np.argmax(q_values))
-    recorded = ACTION_LABELS.index(step.move.action)
-    decided = f"{ACTION_LABELS[best]} (Q {q_values[best]:.6g})"
-    return f"{decided}, recorded {step.move.action} (Q {q_values[recorded]:.6g})"

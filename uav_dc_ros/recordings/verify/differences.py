@@ -1,50 +1,45 @@
-"""What a recomputation found: values that are not those recorded, and steps that could not be recomputed."""
+"""Results of a verification: differences, and steps that cannot be recomputed."""
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
-@dataclass(frozen=True, kw_only=True)
-class Difference:
-    """Where a recorded value is not the recomputed one: `user` where it is one of many."""
+class Difference(NamedTuple):
+    """A recorded value that is not the recomputed one."""
 
-    topic: str
-    flight: int
-    mission: int
-    step: int
     column: str
-    user: int | None = None
-    recorded: Any
-    recomputed: Any
+    text: str
 
-    def __str__(self) -> str:
-        """One line."""
-        flight = f"flight {self.flight}, " if self.flight else ""
-        user = "" if self.user is None else f", user {self.user}"
-        return (
-            f"{self.topic}: {flight}mission {self.mission}, step {self.step}{user}, {self.column}: "
-            f"recorded {self.recorded!r}, recomputed {self.recomputed!r}"
-        )
+
+def difference(
+    step: RecordedStep, topic: str, column: str, recorded: Any, recomputed: Any, user: int | None = None
+) -> Difference:
+    """A difference in a step; `user`: index in a column with an entry per user."""
+    flight = f"flight {step.flight}, " if step.flight else ""
+    of_user = "" if user is None else f", user {user}"
+    where = f"{topic}: {flight}mission {step.mission}, step {step.step}{of_user}, {column}"
+    return Difference(column, f"{where}: recorded {recorded!r}, recomputed {recomputed!r}")
 
 
 @dataclass(kw_only=True)
-class Book:
-    """What was compared on one matter.
+class Check:
+    """One aspect of a bag, compared step by step.
 
     Attributes:
-        tolerance: greatest relative difference of two numbers that counts as none.
-        compared: steps that could be recomputed.
-        differing: of these, steps with a difference.
-        skipped: steps that could not, by reason.
+        tolerance: greatest relative difference of two equal numbers.
+        compared: recomputed steps.
+        differing: recomputed steps with a difference.
+        skipped: steps that cannot be recomputed, by reason.
         first: the first difference.
-        within: values that were equal within the tolerance only.
+        within: values that are equal only within the tolerance.
     """
 
+    title: ClassVar[str]
     tolerance: float = 0.0
     compared: int = 0
     differing: int = 0
@@ -56,16 +51,18 @@ class Book:
         """Count a step that cannot be recomputed."""
         self.skipped[reason] += 1
 
-    def enter(self, found: list[Difference]) -> None:
-        """Count a step that was recomputed, with its differences."""
+    def count(self, found: list[Difference]) -> None:
+        """Count a recomputed step with its differences."""
         self.compared += 1
         self.differing += bool(found)
         if found and self.first is None:
             self.first = found[0]
 
-    def column(self, step: RecordedStep, topic: str, name: str, recorded: Any, made: Any) -> list[Difference]:
-        """Compare an entry per user, or one value; the first difference, if any."""
-        ours, theirs = np.atleast_1d(made), np.atleast_1d(recorded)
+    def compare(
+        self, step: RecordedStep, topic: str, name: str, recorded: Any, recomputed: Any
+    ) -> list[Difference]:
+        """Compare a column with an entry per user, or one value; the first difference, if any."""
+        ours, theirs = np.atleast_1d(recomputed), np.atleast_1d(recorded)
         if ours.shape != theirs.shape:
             return [difference(step, topic, f"length of {name}", theirs.shape[0], ours.shape[0])]
         floats = ours.dtype == np.float64
@@ -76,22 +73,20 @@ class Book:
             wrong &= ~near
         if not wrong.any():
             return []
-        user = int(wrong.argmax())
-        many = np.ndim(recorded) > 0
-        return [difference(step, topic, name, theirs[user].item(), ours[user].item(), user if many else None)]
+        i = int(wrong.argmax())
+        user = i if np.ndim(recorded) > 0 else None
+        return [difference(step, topic, name, theirs[i].item(), ours[i].item(), user)]
 
-
-def difference(
-    step: RecordedStep, topic: str, column: str, recorded: Any, recomputed: Any, user: int | None = None
-) -> Difference:
-    """A difference in a step."""
-    return Difference(
-        topic=topic,
-        flight=step.flight,
-        mission=step.mission,
-        step=step.step,
-        column=column,
-        user=user,
-        recorded=recorded,
-        recomputed=recomputed,
-    )
+    def lines(self) -> list[str]:
+        """The result as text."""
+        total = self.compared + self.skipped.total()
+        if not total:
+            return [f"{self.title}: the bag holds no step to recompute"]
+        summary = f"{self.title}: {self.compared} of {total} steps recomputed"
+        if self.first:
+            lines = [f"{summary}, {self.differing} differ; first:", f"  {self.first.text}"]
+        else:
+            lines = [f"{summary}, equal {'within the tolerance' if self.within else 'to the last bit'}"]
+        if self.within:
+            lines.append(f"  {self.within} values are equal within the tolerance only")
+        return lines + [f"  {n} not recomputed: {reason}" for reason, n in self.skipped.most_common()]
