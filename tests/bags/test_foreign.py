@@ -315,7 +315,7 @@ def test_times_beyond_those_of_ros_are_the_last_of_them(tmp_path: Path) -> None:
     for torn in (False, True):
         assert [m.log_time_ns for m in messages(path, torn=torn)] == [5, 2**63 - 1, 2**63 - 1]
     assert survey(path).problems == [
-        "the times of some messages are beyond what ROS 2 can tell (2^63 ns): shown as the last"
+        "some message times exceed the limit of ROS 2 (2^63 ns): shown as the limit"
     ]
     assert recover(path, tmp_path / "out").whole.last_ns == 2**63 - 1
     assert [time_ns for _, time_ns, _ in in_bag(tmp_path / "out")][-1] == 2**63 - 1

@@ -220,7 +220,7 @@ def test_a_bag_of_another_recorder(tmp_path: Path, capsys: pytest.CaptureFixture
     ("type", "definition", "expected"),
     [
         ("std_msgs/msg/Int32", b"", "topic /users is of type std_msgs/msg/Int32"),
-        (STRING, b"float64 data", "its definition of std_msgs/msg/String is another one"),
+        (STRING, b"float64 data", "its definition of std_msgs/msg/String differs from"),
     ],
 )
 def test_a_topic_of_another_type(
