@@ -1,4 +1,4 @@
-"""What run_all sees of missions: its own, whose end may come before its rates, and those of others."""
+"""The mission monitor: missions of its run, whose end may come before their rates, and of other runs."""
 
 import json
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.runner import monitor
-from uav_dc_ros.runner.monitor import ALONE_S, STARTED_S, TELL_S, MissionMonitor, MissionProgress
+from uav_dc_ros.runner.monitor import ALONE_S, IDENTIFY_S, STARTED_S, MissionMonitor, MonitoredMission
 
 STEPS = 3
 MBIT = 1e6
@@ -24,7 +24,7 @@ RUN, OTHER = "0123456789abcdef", "fedcba9876543210"
 
 
 def mission(scenario: Scenario, step: int) -> messages.Mission:
-    """The vehicle's word for a step of a mission that goes east, and is aborted after a few."""
+    """The state at a step of a mission that goes east, and is aborted after a few."""
     return messages.Mission(
         run=RUN,
         mission=0,
@@ -55,12 +55,12 @@ def rates(scenario: Scenario, step: int) -> messages.Rates:
 
 
 class Bench:
-    """Observers in this process, a graph that a test makes, and the time."""
+    """Monitors in this process, with the graph and the time of a test."""
 
     def __init__(self, scenario: Scenario, patch: pytest.MonkeyPatch) -> None:
         self.scenario = scenario
         self.now_s = 1000.0
-        self.ends: list[tuple[MissionProgress, Phase]] = []
+        self.ends: list[MonitoredMission] = []
         self.notes: list[str] = []
         self.publishers: dict[str, list[str]] = {}  # by topic
         self.nodes: list[MissionMonitor] = []
@@ -68,11 +68,11 @@ class Bench:
         patch.setattr(other_publishers, "publishers", lambda node: self.publishers)
 
     def monitor(self, run: str = RUN) -> MissionMonitor:
-        """One of run_all's, with a vehicle of its own if it was given a run."""
+        """A monitor of run_all, on the vehicle's host if it has a run."""
         node = MissionMonitor(
             *(self.scenario, 0 if run else None, run, ["world", "policy"]),
             ["world", "policy"] if run else ["policy"],
-            *(lambda _: None, lambda _: None, lambda now, phase: self.ends.append((now, phase))),
+            *(lambda _: None, lambda _: None, self.ends.append),
             self.notes.append,
         )
         self.nodes.append(node)
@@ -80,17 +80,17 @@ class Bench:
         node.trigger_activate()
         return node
 
-    def looks(self, node: MissionMonitor, seconds: float, *, have_started: bool = True) -> None:
-        """Look for others as often as run_all does."""
+    def checks(self, node: MissionMonitor, seconds: float, *, have_started: bool = True) -> None:
+        """Check for other publishers, more often than run_all does."""
         until_s = self.now_s + seconds
         while self.now_s < until_s:
             self.now_s += 0.05
-            node.look(have_started)
+            node.check_publishers(have_started)
 
 
 @pytest.fixture
 def bench(ros: Ros, small_scenario: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    """Observers of small missions."""
+    """Monitors of small missions."""
     for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOG_DIR"):
         monkeypatch.setenv(name, ros.environment[name])
     rclpy.init()
@@ -102,49 +102,50 @@ def bench(ros: Ros, small_scenario: Path, monkeypatch: pytest.MonkeyPatch) -> It
     rclpy.shutdown()
 
 
-@pytest.mark.parametrize("heard", [STEPS + 1, 2, 0])
-def test_the_end_is_heard_before_the_rates(bench: Bench, heard: int) -> None:
-    """A monitor hears topic by topic, and a lockstep may fly a mission before it looks again."""
+@pytest.mark.parametrize("received", [STEPS + 1, 2, 0])
+def test_the_end_is_received_before_the_rates(bench: Bench, received: int) -> None:
+    """A monitor receives topic by topic, and a lockstep may fly a mission between two turns."""
     node = bench.monitor()
     for step in range(STEPS + 1):
         node.on_mission(mission(bench.scenario, step))
-    for step in range(heard):
+    for step in range(received):
         node.on_rates(rates(bench.scenario, step))
     bench.now_s += 10.0
-    node.close(waited_s=5.0)
-    ((now, phase),) = bench.ends
-    last = max(heard - 1, 0)
-    assert (phase, now.step, now.data_bits) == (Phase.ABORTED, last, last * MBIT)
-    assert now.distance_m == 100.0 * min(last, 2)
+    node.report_ends(waited_s=5.0)
+    (ended,) = bench.ends
+    summary = ended.summary(bench.scenario, "policy", None)
+    last = max(received - 1, 0)
+    assert (summary.outcome, summary.steps, summary.data_bits) == (Phase.ABORTED, last, last * MBIT)
+    assert summary.distance_m == 100.0 * min(last, 2)
 
 
-def test_nodes_begin_once_nobody_else_was_found_for_a_while(bench: Bench) -> None:
+def test_nodes_begin_after_a_while_without_another_mission(bench: Bench) -> None:
     node = bench.monitor()
-    bench.looks(node, ALONE_S / 2)
+    bench.checks(node, ALONE_S / 2)
     assert not node.is_alone
-    bench.looks(node, ALONE_S)
+    bench.checks(node, ALONE_S)
     assert node.is_alone
 
 
 def test_nodes_that_start_slowly_are_waited_for(bench: Bench) -> None:
-    """Where they take long, others are found late, too."""
+    """Discovery takes long, too, then."""
     node = bench.monitor()
-    bench.looks(node, 10 * ALONE_S, have_started=False)
+    bench.checks(node, 10 * ALONE_S, have_started=False)
     assert not node.is_alone
-    bench.looks(node, STARTED_S / 2)
+    bench.checks(node, STARTED_S / 2)
     assert not node.is_alone
-    bench.looks(node, STARTED_S)
+    bench.checks(node, STARTED_S)
     assert node.is_alone
 
 
 def test_another_mission_is_refused_by_the_names_of_its_nodes_and_its_run(bench: Bench) -> None:
     node = bench.monitor()
     bench.publishers = {"mission": ["/world"], "move": ["/policy"]}
-    bench.looks(node, TELL_S / 2)
+    bench.checks(node, IDENTIFY_S / 2)
     with pytest.raises(MessageError, match="belongs to run"):
         node.check_run("mission", OTHER)
     with pytest.raises(AnotherMissionError, match=rf"flown here by /world, /policy \(run {OTHER}\): give"):
-        bench.looks(node, 0.2)
+        bench.checks(node, 0.2)
 
 
 @pytest.mark.parametrize("silent", [True, False])
@@ -157,18 +158,18 @@ def test_another_mission_is_refused_when_only_half_of_that_is_known(bench: Bench
             node.check_run("rates", OTHER)
     who = " by /world" if silent else rf" \(run {OTHER}\)"
     with pytest.raises(AnotherMissionError, match=f"another mission is being flown here{who}: give"):
-        bench.looks(node, TELL_S + 0.2)
+        bench.checks(node, IDENTIFY_S + 0.2)
 
 
 def test_a_mission_that_has_begun_is_not_ended_by_a_player(bench: Bench) -> None:
     node = bench.monitor()
-    bench.looks(node, ALONE_S + 0.1)
+    bench.checks(node, ALONE_S + 0.1)
     node.on_mission(mission(bench.scenario, 0))
     bench.publishers = {"mission": ["/world", "/player"], "pose": ["/world", "/player"]}
     for topic in ("mission", "rates"):
         with pytest.raises(MessageError):
             node.check_run(topic, OTHER)
-    bench.looks(node, 5.0)
+    bench.checks(node, 5.0)
     assert [note.partition(" here")[0] for note in bench.notes] == ["/player publishes mission, pose"]
 
 
@@ -190,7 +191,7 @@ def test_a_host_without_the_vehicle_adopts_no_player_s(bench: Bench) -> None:
     node.check_run("mission", OTHER)
     bench.publishers = {"mission": ["/player"]}
     with pytest.raises(AnotherMissionError, match="/player publishes mission here, and is no node of"):
-        bench.looks(node, TELL_S + 0.2)
+        bench.checks(node, IDENTIFY_S + 0.2)
 
 
 def test_who_keeps_messages_as_bytes_knows_those_of_another_run(bench: Bench) -> None:

@@ -3,16 +3,18 @@
 import time
 from pathlib import Path
 
+import numpy as np
 from rich.console import JustifyMethod
 from rich.progress import TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uav_dc_ros.cli import LiveDisplay
+from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.phases import POLICY_CONTROLLED
-from uav_dc_ros.runner.monitor import MissionProgress
+from uav_dc_ros.runner.monitor import MonitoredMission
 
 REFRESH_S = 0.05
 PLAIN_LINES = 6  # per mission, without a terminal
@@ -41,21 +43,24 @@ class MissionConsole(LiveDisplay):
         self._status: Mission | None = None  # last one shown
         self._task = self._bar.add_task("starting the nodes", total=scenario.mission.max_steps, text="")
 
-    def step(self, now: MissionProgress) -> None:
+    def step(self, now: MonitoredMission) -> None:
         """Show a step: on a terminal at `REFRESH_S`, elsewhere a few per mission."""
-        due = now.step % self._line_steps == 0 if self._bar.disable else time.monotonic() >= self._next_s
-        if not (due or now.over or now.step == self.scenario.mission.max_steps):
+        due = now.steps % self._line_steps == 0 if self._bar.disable else time.monotonic() >= self._next_s
+        if not (due or now.is_over or now.steps == self.scenario.mission.max_steps):
             return
         self._next_s = time.monotonic() + REFRESH_S
-        title = "mission" if self.missions == 1 else f"mission {now.mission + 1} of {self.missions}"
+        title = "mission" if self.missions == 1 else f"mission {now.index + 1} of {self.missions}"
+        assert now.cell is not None
+        assert now.rates is not None
+        dock_m = float(world.dock_distance_m(self.scenario, np.asarray(now.cell), like=np.zeros(1)))
         text = (
-            f"{now.users_collected}/{self.scenario.n_users} users, "
-            f"{now.sum_rate_bps / 1e6:.2f} Mbit/s, {now.dock_distance_m:.0f} m to the dock"
+            f"{now.collected}/{self.scenario.n_users} users, "
+            f"{now.rates.sum_rate_bps / 1e6:.2f} Mbit/s, {dock_m:.0f} m to the dock"
         )
         if self._bar.disable:
-            self.console.print(f"{title}: step {now.step}/{self.scenario.mission.max_steps}: {text}")
+            self.console.print(f"{title}: step {now.steps}/{self.scenario.mission.max_steps}: {text}")
         else:
-            self._bar.update(self._task, description=title, completed=now.step, text=text)
+            self._bar.update(self._task, description=title, completed=now.steps, text=text)
 
     def vehicle(self, status: Mission) -> None:
         """Print a new state or reason of a real vehicle, except the routine of a step without faults."""

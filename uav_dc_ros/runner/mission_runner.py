@@ -1,6 +1,5 @@
-"""One run of run_all: check everything, start the nodes, follow the missions, stop, tell."""
+"""One run of run_all: check the options, start the nodes, follow the missions, stop the nodes, report."""
 
-import gc
 import signal
 import tempfile
 import threading
@@ -22,71 +21,61 @@ from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes.framework.node_table import mission_rows
 from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.nodes.framework.parameters import ADDRESS, EXTERNAL
-from uav_dc_ros.nodes.ros.executor import DirectExecutor
+from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.runner import node_locks, run_options
-from uav_dc_ros.runner.monitor import MissionMonitor, MissionProgress, summary
+from uav_dc_ros.runner.monitor import MissionMonitor, MonitoredMission
 from uav_dc_ros.runner.supervisor import Supervisor
 from uav_dc_ros.topics import SIMULATED, TOPICS
 
 if TYPE_CHECKING:
     from uav_dc_ros.runner.console import MissionConsole
 
-SILENCE_S = 30.0  # longest wait for the nodes to appear, and for a step that is due
-LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be starting again
-REST_S, REST_QUIET_S = 2.0, 0.2  # longest time for what the nodes said last, and after which all of it came
-TICK_S = 0.02  # from one look at the nodes to the next
-BRING_UP_TICK_S = 0.004  # the same until all are active: each transition waits for such a look
-LEAVE_S = 3.0  # for the middleware to close, which was seen to hang
+STEP_TIMEOUT_S = 30.0  # for the discovery of the nodes, and for a due step
+LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be restarting
+FINAL_S, FINAL_QUIET_S = (
+    2.0,
+    0.2,
+)  # longest wait for the nodes' last messages, and time without one that ends it
+TICK_S = 0.02  # period of checks of the nodes
+BRING_UP_TICK_S = 0.004  # until all are active: each transition takes a check
+SHUTDOWN_S = 3.0  # for the middleware
 
 
 class Network:
-    """Context, node and executor of the mission monitor.
+    """Context, node and executor of the mission monitor; `create` makes the node."""
 
-    Args:
-        namespace: of the mission.
-        make: makes the node in a context.
-    """
-
-    def __init__(self, namespace: str, make: Callable[[Context], MissionMonitor]) -> None:
+    def __init__(self, namespace: str, create: Callable[[Context], MissionMonitor]) -> None:
         self._context = Context()
         self._context.init(["--ros-args", "-r", f"__ns:={namespace}", "-r", "/clock:=clock"])
-        self.node = make(self._context)
+        self.node = create(self._context)
         self.executor = DirectExecutor(self.node.pause_s, self._context)
         self.executor.add_node(self.node)
         self._has_left = False
 
     def leave(self) -> None:
-        """Leave the network, once: others would wait for a node that only ends with the process."""
+        """Leave the network, once, so that other nodes do not wait for this one."""
         if not self._has_left:
             self._has_left = True
             self.node.trigger_shutdown()
             self.node.destroy_node()
             del self.node, self.executor
-            leaving = threading.Thread(target=self._leave, daemon=True)
-            leaving.start()
-            leaving.join(LEAVE_S)
-
-    def _leave(self) -> None:
-        gc.collect()  # the middleware's part of a node ends with the last reference to it, and not before
-        self._context.try_shutdown()
-        self._context.destroy()
+            shut_down(self._context, SHUTDOWN_S)
 
 
 class MissionRunner:
     """A run of missions.
 
     Args:
-        config: what is flown.
-        show: are progress and summary printed?
+        show: whether progress and summary are printed.
 
     Raises:
-        UavDcError: a value that cannot be flown; nothing was started or written yet.
+        UavDcError: the run cannot be flown; nothing was started or written.
 
     Attributes:
         summaries: one for each mission that is over.
-        errors: what went wrong, in words.
-        interrupted: was it asked to stop?
+        errors: messages.
+        interrupted: whether `interrupt` was called.
     """
 
     def __init__(self, config: RunConfig, *, show: bool = True) -> None:
@@ -99,78 +88,77 @@ class MissionRunner:
             pace.check(self.scenario, config.factor, config.missions)
         self.rows = mission_rows(() if self.is_simulated else ("bridge",))
         self.nodes = run_options.nodes(config)
-        # Whoever starts the vehicle draws the run's identity; a run_all on another host adopts it.
+        # The host of the vehicle creates the run's identity; a run_all on another host adopts it.
         self.run_id = new_run() if ("world" if self.is_simulated else "bridge") in self.nodes else ""
         self.composed = run_options.composed(config, self.nodes)
         self._settings = run_options.settings(config, self.nodes)
         run_options.check_vehicle(config, self.nodes, self.scenario)
         if config.live is not None:
-            from uav_dc_ros.nodes.view import foxglove_server  # brings rosbags, which only few need
+            from uav_dc_ros.nodes.view import foxglove_server  # imports rosbags
 
             foxglove_server.check(address=str(ADDRESS.default), port=config.live)
         bag = None if config.bag is None else Path(config.bag)
         self.bag = run_options.new_bag(bag) if "recorder" in self.nodes else None
         if config.summary is not None:
             run_options.check_summary(Path(config.summary), self.bag)
-        self._show, self._display, self._making = show, cast("MissionConsole | None", None), threading.Lock()
+        self._show, self._console = show, cast("MissionConsole | None", None)
+        self._console_lock = threading.Lock()
         self.summaries: list[Summary] = []
         self.errors: list[str] = []
         self.interrupted = self._aborted = False
-        self._why = ""  # this run ended before its missions
-        self._step_s = 0.0  # when the last step came, monotonic clock
-        self._status: Mission | None = None  # of the vehicle, its last word
+        self._abort_reason = ""  # of the whole run
+        self._step_s = 0.0  # time of the last step, monotonic clock
+        self._status: Mission | None = None  # last message of the vehicle
 
     @property
-    def display(self) -> "MissionConsole":
-        """What the user sees; made when it is first needed, since the nodes can start meanwhile."""
-        with self._making:
-            if self._display is None:
+    def console(self) -> "MissionConsole":
+        """The display; created on first use, while the nodes start."""
+        with self._console_lock:
+            if self._console is None:
                 from uav_dc_ros.runner.console import MissionConsole
 
-                self._display = MissionConsole(self.scenario, self.config.missions, show=self._show)
-            return self._display
+                self._console = MissionConsole(self.scenario, self.config.missions, show=self._show)
+            return self._console
 
     def run(self) -> int:
         """Fly; returns the exit status of the command.
 
-        It has a ROS context of its own, so that a caller's is as it was, and touches no signal handler.
+        It uses its own ROS context, and sets no signal handler.
         """
         status = 0
         with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, ExitStack() as stack:
             folder = Path(temporary)
-            network = Network(self.config.namespace, self._observer)
+            network = Network(self.config.namespace, self._create_monitor)
             stack.callback(network.leave)
             namespace, parameters = network.node.get_namespace(), self._parameters(folder)
             network.node.trigger_configure()
-            network.node.trigger_activate()  # it looks for other missions while all else starts
-            on_line: Callable[[str, str], None] = lambda node, line: self.display.node_line(node, line)  # noqa: E731
+            network.node.trigger_activate()  # discovery runs while the nodes start
+            on_line: Callable[[str, str], None] = lambda node, line: self.console.node_line(node, line)  # noqa: E731
             supervisor = Supervisor(namespace, parameters, self.composed, folder, on_line, self._note)
             stack.enter_context(supervisor)
-            stack.enter_context(self.display)
+            stack.enter_context(self.console)
             try:
                 stack.enter_context(self._locks(network.node))
-                self._tell_of_world()
+                self._note_other_world()
                 self._follow(supervisor, network.node, network.executor)
             except NodeError as error:
-                self._why = str(error)
-                self._error(self._why)
+                self._abort_reason = str(error)
+                self._error(self._abort_reason)
                 status = 1
-                if isinstance(error, AnotherMissionError):  # what was received may be its
+                if isinstance(error, AnotherMissionError):  # received messages may belong to it
                     self.summaries.clear()
                     network.node.mission = self._status = None
             is_complete = len(self.summaries) >= self.config.missions
-            status = max(
-                status, self._stopped(supervisor.stop(network.leave if is_complete else lambda: None))
-            )
+            exits = supervisor.stop(network.leave if is_complete else lambda: None)
+            status = max(status, self._check_exits(exits))
             if not is_complete:
-                self._hear_the_rest(network.executor)
-                self._account_for_all(network.node)
-        status = max(status, self._mend_bag(), int(self._aborted))
-        self._tell()
+                self._receive_last_messages(network.executor)
+                self._complete_summaries(network.node)
+        status = max(status, self._repair_bag(), int(self._aborted))
+        self._write_summary()
         return cli.INTERRUPTED if self.interrupted else status
 
-    def _observer(self, context: Context) -> MissionMonitor:
-        """The node that follows the missions."""
+    def _create_monitor(self, context: Context) -> MissionMonitor:
         seed = self.config.seed if "world" in self.nodes else None
         return MissionMonitor(
             *(self.scenario, seed, self.run_id, self._peers(), self.nodes),
@@ -186,20 +174,19 @@ class MissionRunner:
             node.context.get_domain_id(), [f"{namespace}/{name}" for name in publish], self.run_id
         )
 
-    def _tell_of_world(self) -> None:
-        """Note that the policy learnt in another world."""
-        learnt, flown = self.policy.scenario, self.scenario
-        if learnt.fingerprint != flown.fingerprint:
+    def _note_other_world(self) -> None:
+        trained, flown = self.policy.scenario, self.scenario
+        if trained.fingerprint != flown.fingerprint:
             self._note(
-                f"policy {self.policy.name} learnt in another world ({learnt.name} {learnt.fingerprint}) "
-                f"than it flies in ({flown.name} {flown.fingerprint})"
+                f"policy {self.policy.name} was trained in another world ({trained.name} "
+                f"{trained.fingerprint}) than it flies in ({flown.name} {flown.fingerprint})"
             )
 
     def _follow(self, supervisor: Supervisor, node: MissionMonitor, executor: DirectExecutor) -> None:
-        """Spin until all missions are over, or Ctrl-C.
+        """Spin until all missions are over, or interrupted.
 
         Raises:
-            NodeError: a node gave up, no step came for too long, or somebody else's mission is flown here.
+            NodeError: a required node failed, a step timed out, or another mission is flown here.
         """
         self._step_s = time.monotonic()
         check_s = 0.0
@@ -209,80 +196,81 @@ class MissionRunner:
             now_s = time.monotonic()
             if now_s >= check_s:
                 check_s = now_s + tick_s
-                node.look(supervisor.have_started)
+                node.check_publishers(supervisor.have_started)
                 supervisor.tick(node.is_alone)
-                if not node.is_alone:  # patience begins when the mission may
-                    self._step_s = now_s
-                if node.restarts_of != supervisor.restarts:  # the mission waits for a node that starts again
+                # The timeout of a step starts when the mission may begin, and with each restart of a node.
+                if not node.is_alone or node.restarts_of != supervisor.restarts:
                     node.restarts_of, self._step_s = supervisor.restarts, now_s
-                node.close(LAST_RATES_S)
-                self._check_patience(node, now_s)
+                node.report_ends(LAST_RATES_S)
+                self._check_timeout(node, now_s)
             time.sleep(min(node.pause_s, tick_s))
 
-    def _check_patience(self, node: MissionMonitor, now_s: float) -> None:
-        """Wait for steps that are due, and for nodes that are started here; others may take their time."""
+    def _check_timeout(self, node: MissionMonitor, now_s: float) -> None:
+        """Check the time since the last step; nodes of another run_all have no timeout.
+
+        Raises:
+            NodeError: a step timed out, or the nodes of this run_all were not discovered.
+        """
         if not self.is_simulated and self._status is not None:
-            return  # the bridge itself sees to it that the mission ends; a pilot may take his time
-        patience_s = SILENCE_S + pace.period_s(self.scenario, self.config.factor)
-        if now_s - self._step_s <= patience_s:
+            return  # the bridge has its own timeouts, and a pilot none
+        timeout_s = STEP_TIMEOUT_S + pace.period_s(self.scenario, self.config.factor)
+        if now_s - self._step_s <= timeout_s:
             return
         if node.mission is not None:
-            raise NodeError(f"no step came within {patience_s:.0f} s")
+            raise NodeError(f"no step came within {timeout_s:.0f} s")
         elsewhere = [name for name in self._peers() if name not in (*self.nodes, "mission_monitor")]
         if not elsewhere:
-            raise NodeError(f"the nodes did not find each other within {patience_s:.0f} s")
-        self.display.note(f"still waiting for {', '.join(elsewhere)} of another run of run_all")
+            raise NodeError(f"the nodes did not find each other within {timeout_s:.0f} s")
+        self._note(f"still waiting for {', '.join(elsewhere)} of another run of run_all")
         self._step_s = now_s
 
-    def _stopped(self, statuses: dict[str, int]) -> int:
-        """Tell which nodes did not end as they should; 1 if that spoilt anything: the recorder's bag."""
-        odd = {name: code for name, code in statuses.items() if code not in (0, -signal.SIGTERM)}
-        for name, code in odd.items():
-            self._error(f"node {name} ended with {code} when it was asked to stop")
-        return int("recorder" in odd)
+    def _check_exits(self, statuses: dict[str, int]) -> int:
+        """Report nodes that did not stop as requested; returns 1 if the recorder is one of them."""
+        failed = {name: code for name, code in statuses.items() if code not in (0, -signal.SIGTERM)}
+        for name, code in failed.items():
+            self._error(f"node {name} ended with {code} when it was stopped")
+        return int("recorder" in failed)
 
-    def _hear_the_rest(self, executor: DirectExecutor) -> None:
-        """Handle what the nodes said while they were stopped: how a mission ends that was broken off."""
-        if len(self.summaries) < self.config.missions:
-            deadline_s = time.monotonic() + REST_S
-            try:
-                executor.spin(lambda: time.monotonic() > deadline_s, REST_QUIET_S)
-            except NodeError as error:
-                self._error(str(error))
+    def _receive_last_messages(self, executor: DirectExecutor) -> None:
+        """Handle messages that the nodes published while they were stopped, such as the end of a mission."""
+        deadline_s = time.monotonic() + FINAL_S
+        try:
+            executor.spin(lambda: time.monotonic() > deadline_s, FINAL_QUIET_S)
+        except NodeError as error:
+            self._error(str(error))
 
-    def _account_for_all(self, node: MissionMonitor) -> None:
-        """Every mission that was to be flown has its end: those without one were aborted."""
-        node.close()
-        flown = len(self.summaries)
-        if flown < self.config.missions:
-            not_begun = MissionProgress(scenario=self.scenario, mission=flown, seed=self.config.seed + flown)
-            now = node.mission or not_begun
-            now = now if now.mission == flown else not_begun
-            status = self._status
-            if status is not None and status.mission == flown:
-                now.hear(status)
-            if self._why or not now.reason:
-                now.reason = self._why or "run_all was interrupted"
-            self._on_end(now, Phase.ABORTED)
+    def _complete_summaries(self, node: MissionMonitor) -> None:
+        """Report the end of the current mission; without one it was aborted."""
+        node.report_ends()
+        index = len(self.summaries)
+        if index >= self.config.missions:
+            return
+        mission = node.mission
+        if mission is None or mission.index != index:
+            mission = MonitoredMission(index=index, seed=self.config.seed + index)
+        if self._status is not None and self._status.mission == index:
+            mission.add(0, self._status, None)
+        if self._abort_reason or not mission.reason:
+            mission.reason = self._abort_reason or "run_all was interrupted"
+        mission.outcome = Phase.ABORTED.value
+        self._on_end(mission)
 
-    def _mend_bag(self) -> int:
-        """Make a whole bag of one whose recorder did not close it; 1 if that cannot be."""
+    def _repair_bag(self) -> int:
+        """Repair a bag that the recorder did not close; returns 1 if that fails."""
         if self.bag is None or not self.bag.is_dir() or (self.bag / "metadata.yaml").is_file():
             return 0
-        from uav_dc_ros.bags.salvage.repair import (
-            repair,  # slow to import, and rarely needed
-        )
+        from uav_dc_ros.bags.salvage.repair import repair  # slow to import, and rarely needed
 
         try:
             repaired = repair(self.bag)
         except BagError as error:
             self._error(str(error))
             return 1
-        self.display.note(f"the recorder did not close its bag: {repaired}")
+        self._note(f"the recorder did not close its bag: {repaired}")
         return 0
 
     def _peers(self) -> list[str]:
-        """Nodes that a mission waits for, on whichever host they run."""
+        """Nodes that a mission requires, on any host."""
         peers = [row.name for row in self.rows.values() if row.needed]
         if not self.config.record:
             peers.remove("recorder")
@@ -296,7 +284,7 @@ class MissionRunner:
         scenario = str(config.scenario)
         if scenario not in scenarios.names():
             scenario = str(Path(scenario).absolute())
-        given: dict[str, object] = {
+        values: dict[str, object] = {
             "scenario": scenario,
             "policy": str(self.policy.folder.absolute()),
             "seed": config.seed,
@@ -308,57 +296,60 @@ class MissionRunner:
             "system": config.system or 0,
             "arm": config.arm,
             "datum": config.datum or "",
-            **({} if config.live is None else {"port": config.live}),
         }
-        started = {}
+        if config.live is not None:
+            values["port"] = config.live
+        parameters = {}
         for name in self.nodes:
             row = self.rows[name]
-            values = given | {"journal": str(folder / name)}
+            given = values | {"journal": str(folder / name)}
+            own = {one.name: given[one.name] for one in row.parameters if one.name in given}
             if name == "world" and not self.is_simulated:
-                values["vehicle"] = EXTERNAL
-            started[name] = {
+                own["vehicle"] = EXTERNAL
+            parameters[name] = {
                 "peers": self._peers(),
                 "run": self.run_id,
-                # A real vehicle's time is that of this machine: nobody publishes another.
+                # No node publishes a clock beside a real vehicle.
                 "use_sim_time": self.is_simulated and "clock" not in row.publishes,
-                **{one.name: values[one.name] for one in row.parameters if one.name in values},
+                **own,
                 **self._settings.get(name, {}),
             }
-        return started
+        return parameters
 
     def interrupt(self, *_: object) -> None:
-        """Have the run end soon; a signal handler, too."""
+        """Stop the run soon; also a signal handler."""
         self.interrupted = True
 
     def _note(self, text: str) -> None:
-        self.display.note(text)
+        self.console.note(text)
 
     def _error(self, text: str) -> None:
         self.errors.append(text)
-        self.display.error(text)
+        self.console.error(text)
 
     def _on_status(self, status: Mission) -> None:
         self._status = status
-        self.display.vehicle(status)
+        self.console.vehicle(status)
 
-    def _on_step(self, mission: MissionProgress) -> None:
+    def _on_step(self, mission: MonitoredMission) -> None:
         self._step_s = time.monotonic()
-        self.display.step(mission)
+        self.console.step(mission)
 
-    def _on_end(self, mission: MissionProgress, outcome: Phase) -> None:
+    def _on_end(self, mission: MonitoredMission) -> None:
         bag = None if self.bag is None else str(self.bag)
-        self._aborted |= outcome is Phase.ABORTED
-        if outcome is Phase.ABORTED and not (self._why or self.interrupted):
-            why = mission.reason or "the vehicle gave no reason"
-            self._error(f"mission {mission.mission} was aborted at step {mission.step}: {why}")
-        self.summaries.append(summary(mission, outcome, self.scenario, self.policy.name, bag))
+        if mission.outcome == Phase.ABORTED.value:
+            self._aborted = True
+            if not (self._abort_reason or self.interrupted):
+                reason = mission.reason or "the vehicle gave no reason"
+                self._error(f"mission {mission.index} was aborted at step {mission.steps}: {reason}")
+        self.summaries.append(mission.summary(self.scenario, self.policy.name, bag))
 
-    def _tell(self) -> None:
-        """Write the summary where it was asked for, and print it."""
-        if self.bag is not None and not self.bag.is_dir():  # the recorder never came so far
+    def _write_summary(self) -> None:
+        """Write the summary to its file, if there is one, and print it."""
+        if self.bag is not None and not self.bag.is_dir():  # the recorder did not create it
             self.summaries = [msgspec.structs.replace(mission, bag=None) for mission in self.summaries]
         if self.config.summary is not None:
-            told = self.summaries[0] if self.config.missions == 1 else self.summaries
-            text = msgspec.json.format(msgspec.json.encode(told), indent=2)
+            content = self.summaries[0] if self.config.missions == 1 else self.summaries
+            text = msgspec.json.format(msgspec.json.encode(content), indent=2)
             files.write(Path(self.config.summary), text + b"\n")
-        self.display.summary(self.summaries)
+        self.console.summary(self.summaries)
