@@ -215,7 +215,7 @@ def test_names_can_be_remapped_and_others_who_fly_the_same_are_told(ros: Ros) ->
 def test_nobody_who_hears_setpoints_is_told(ros: Ros) -> None:
     deaf = ("--ros-args", "-r", "mavros/setpoint_position/local:=elsewhere")
     with fake(ros, "px4", *deaf), node_in(ros) as (node, executor), mavros_of(node) as vehicle:
-        expected = "nobody hears /mavros/setpoint_position/local; expected MAVROS to"
+        expected = "no node subscribes to /mavros/setpoint_position/local; expected MAVROS to"
         until(executor, vehicle, lambda known: known.missing == expected)
         vehicle.close()  # and again, when the block ends
 
@@ -225,4 +225,4 @@ def test_to_arm_it_needs_mavros_msgs(ros: Ros) -> None:
         node_in(ros) as (node, _),
         pytest.raises(VehicleError, match="arming through MAVROS needs the package"),
     ):
-        MavrosVehicle(node, place=START, arms=True)
+        MavrosVehicle(node, start=START, arms=True)

@@ -123,7 +123,7 @@ def spun(domain: Ros) -> Iterator[Spun]:
 @pytest.fixture
 def vehicle(spun: Spun) -> Iterator[px4.Px4Vehicle]:
     """The transport, on a node of its own, open."""
-    made = px4.Px4Vehicle(spun.node("bridge"), place=PLACE)
+    made = px4.Px4Vehicle(spun.node("bridge"), start=PLACE)
     made.open()
     yield made
     made.close()
@@ -204,11 +204,11 @@ def position(msg: Any, ned: Ned, reference: Geodetic | None = None, **more: Any)
 
 def standing(msg: Any, ned: Ned = START, **more: Any) -> Px4Telemetry:
     """What is known of a vehicle that stands on the ground and told where."""
-    hearing = Px4Telemetry(place=more.pop("place", PLACE), **more)
-    hearing.on_vehicle_status(status(msg), 0.0)
-    hearing.on_vehicle_land_detected(msg.VehicleLandDetected(landed=True), 0.0)
-    hearing.on_vehicle_local_position(position(msg, ned), 0.0)
-    return hearing
+    telemetry = Px4Telemetry(start=more.pop("start", PLACE), **more)
+    telemetry.on_vehicle_status(status(msg), 0.0)
+    telemetry.on_vehicle_land_detected(msg.VehicleLandDetected(landed=True), 0.0)
+    telemetry.on_vehicle_local_position(position(msg, ned), 0.0)
+    return telemetry
 
 
 # What it says on, and with what.
@@ -219,7 +219,7 @@ def test_without_px4_msgs_one_line_says_what_to_install(monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "px4_msgs", None)
     node: Any = None
     with pytest.raises(VehicleError, match="needs the ROS package px4_msgs") as told:
-        px4.Px4Vehicle(node, place=PLACE)
+        px4.Px4Vehicle(node, start=PLACE)
     assert str(told.value).endswith("its workspace sourced: https://github.com/PX4/px4_msgs")
     assert "\n" not in str(told.value)
 
@@ -287,10 +287,12 @@ def test_numbers_are_those_of_the_definitions(msg: Any) -> None:
 
 
 def test_where_it_is_comes_from_ned(msg: Any) -> None:
-    hearing = standing(msg, Ned(3.0, -2.0, 0.5), place=Enu(100.0, 200.0, 0.0))
-    assert hearing.telemetry().position == Enu(100.0, 200.0, 0.0)
-    hearing.on_vehicle_local_position(position(msg, Ned(13.0, 18.0, -29.5)), 1.0)  # 10 north, 20 east, 30 up
-    assert hearing.telemetry().position == Enu(120.0, 210.0, 30.0)
+    telemetry = standing(msg, Ned(3.0, -2.0, 0.5), start=Enu(100.0, 200.0, 0.0))
+    assert telemetry.snapshot().position == Enu(100.0, 200.0, 0.0)
+    telemetry.on_vehicle_local_position(
+        position(msg, Ned(13.0, 18.0, -29.5)), 1.0
+    )  # 10 north, 20 east, 30 up
+    assert telemetry.snapshot().position == Enu(120.0, 210.0, 30.0)
 
 
 def test_a_setpoint_goes_out_in_ned(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
@@ -306,49 +308,49 @@ def test_a_setpoint_goes_out_in_ned(vehicle: px4.Px4Vehicle, spun: Spun, hand: H
 
 
 def test_the_grid_has_a_datum_once_px4_knows_the_earth(msg: Any) -> None:
-    hearing = standing(msg)
-    assert hearing.grid_origin == "local:2.0,-3.0,0.5"
-    hearing.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
-    datum = Geodetic.parse(hearing.grid_origin)
+    telemetry = standing(msg)
+    assert telemetry.grid_origin == "local:2.0,-3.0,0.5"
+    telemetry.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
+    datum = Geodetic.parse(telemetry.grid_origin)
     # PX4 counts from a point 3 m south and 2 m east of where the vehicle stands, half a metre above it.
     assert ZURICH.enu_from(datum) == pytest.approx((2.0, -3.0, 0.5), abs=1e-5)
-    known = hearing.telemetry().position
+    known = telemetry.snapshot().position
     assert known == pytest.approx(PLACE, abs=1e-5)
     # PX4 moves its origin 40 m to the east in flight: the same place has other numbers from then on.
     moved = ZURICH.at(Enu(40.0, 0.0, 0.0))
-    hearing.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
-    hearing.on_vehicle_local_position(position(msg, Ned(3.0, -42.0, 0.5), moved), 2.0)
-    assert hearing.telemetry().position == pytest.approx(PLACE, abs=1e-3)
-    assert hearing.grid_origin == str(datum)
+    telemetry.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
+    telemetry.on_vehicle_local_position(position(msg, Ned(3.0, -42.0, 0.5), moved), 2.0)
+    assert telemetry.snapshot().position == pytest.approx(PLACE, abs=1e-3)
+    assert telemetry.grid_origin == str(datum)
 
 
 @pytest.mark.parametrize("reference", [None, ZURICH], ids=["local", "global"])
 def test_a_bridge_that_comes_back_in_the_air_has_the_same_grid(msg: Any, reference: Geodetic | None) -> None:
-    hearing = standing(msg, place=Enu(100.0, 0.0, 0.0))
-    hearing.on_vehicle_local_position(position(msg, START, reference), 1.0)
-    again = Px4Telemetry(place=Enu(100.0, 0.0, 0.0), grid_origin=hearing.grid_origin)
-    for each in (hearing, again):
+    telemetry = standing(msg, start=Enu(100.0, 0.0, 0.0))
+    telemetry.on_vehicle_local_position(position(msg, START, reference), 1.0)
+    again = Px4Telemetry(start=Enu(100.0, 0.0, 0.0), grid_origin=telemetry.grid_origin)
+    for each in (telemetry, again):
         each.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 2.0)
         each.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
         each.on_vehicle_local_position(position(msg, Ned(50.0, 60.0, -70.0), reference), 2.0)
-    assert again.telemetry().missing is None
-    assert again.telemetry().position == pytest.approx((162.0, 47.0, 70.5), abs=0.01)
-    assert again.telemetry().position == pytest.approx(hearing.telemetry().position, abs=1e-6)
+    assert again.snapshot().missing is None
+    assert again.snapshot().position == pytest.approx((162.0, 47.0, 70.5), abs=0.01)
+    assert again.snapshot().position == pytest.approx(telemetry.snapshot().position, abs=1e-6)
 
 
 @pytest.mark.parametrize("grid_origin", ["local:", "local:1,2", "local:1,2,nan", "local:a,b,c", "47,8"])
 def test_an_invalid_grid_origin(grid_origin: str) -> None:
     with pytest.raises(VehicleError, match="expected"):
-        Px4Telemetry(place=PLACE, grid_origin=grid_origin)
+        Px4Telemetry(start=PLACE, grid_origin=grid_origin)
 
 
 def test_a_grid_with_a_datum_needs_a_px4_that_knows_the_earth(msg: Any) -> None:
-    hearing = standing(msg, datum=ZURICH.at(Enu(-5.0, -7.0, 0.0)))
-    assert hearing.telemetry().position is None
-    assert "does not know where on the Earth" in str(hearing.telemetry().missing)
-    hearing.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
-    assert hearing.telemetry().position == pytest.approx((5.0 - 2.0, 7.0 + 3.0, -0.5), abs=1e-3)
-    assert hearing.telemetry().missing is None
+    telemetry = standing(msg, datum=ZURICH.at(Enu(-5.0, -7.0, 0.0)))
+    assert telemetry.snapshot().position is None
+    assert "has no global position" in str(telemetry.snapshot().missing)
+    telemetry.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
+    assert telemetry.snapshot().position == pytest.approx((5.0 - 2.0, 7.0 + 3.0, -0.5), abs=1e-3)
+    assert telemetry.snapshot().missing is None
 
 
 # The stream.
@@ -411,7 +413,7 @@ def test_the_stream_ends_half_a_second_after_the_last_good_position(
     spun.until(lambda: len(hand.setpoints) > 3, lambda: (hand.say(), vehicle.set_setpoint(goal)))
     last_ns = time.time_ns()
     spun.pass_time(2.5, set_setpoint)
-    assert px4.POSE_S - 0.2 <= (hand.heartbeats[-1][0] - last_ns) / 1e9 <= px4.POSE_S + 1.5
+    assert px4.POSE_TIMEOUT_S - 0.2 <= (hand.heartbeats[-1][0] - last_ns) / 1e9 <= px4.POSE_S + 1.5
     assert vehicle.telemetry().estimate_ok is (gone == "silence")
     before = len(hand.heartbeats)
     spun.until(lambda: len(hand.heartbeats) > before, lambda: (hand.say(), vehicle.set_setpoint(goal)))
@@ -426,15 +428,15 @@ def test_the_stream_ends_half_a_second_after_the_last_good_position(
     ids=str,
 )
 def test_a_position_that_px4_does_not_trust_is_none(msg: Any, bad: dict[str, Any]) -> None:
-    hearing = standing(msg)
-    assert (hearing.telemetry().estimate_ok, hearing.position_s) == (True, 0.0)
-    hearing.on_vehicle_local_position(position(msg, Ned(9.0, 9.0, 9.0), **bad), 1.0)
-    known = hearing.telemetry()
+    telemetry = standing(msg)
+    assert (telemetry.snapshot().estimate_ok, telemetry.position_s) == (True, 0.0)
+    telemetry.on_vehicle_local_position(position(msg, Ned(9.0, 9.0, 9.0), **bad), 1.0)
+    known = telemetry.snapshot()
     assert (known.estimate_ok, known.position, known.position_s) == (False, PLACE, 0.0)
-    never = Px4Telemetry(place=PLACE)
+    never = Px4Telemetry(start=PLACE)
     never.on_vehicle_status(status(msg), 0.0)
     never.on_vehicle_local_position(position(msg, START, **bad), 1.0)
-    assert never.telemetry().missing == "PX4 has no estimate of its position yet"
+    assert never.snapshot().missing == "PX4 has no estimate of its position yet"
 
 
 def test_no_setpoint_no_stream(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
@@ -518,49 +520,49 @@ def test_wishes_as_commands(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> 
 
 
 def test_a_refusal_is_told_until_it_is_granted(msg: Any) -> None:
-    hearing = standing(msg)
+    telemetry = standing(msg)
 
     def answer(result: int, command: int = 400, component: int = 191, system: int = 7) -> str | None:
         message = msg.VehicleCommandAck(command=command, result=result)
         message.target_system, message.target_component = system, component
-        hearing.on_vehicle_command_ack(message, 1.0)
-        return hearing.telemetry().refusal
+        telemetry.on_vehicle_command_ack(message, 1.0)
+        return telemetry.snapshot().refusal
 
     assert answer(1, component=190) is None, "somebody else was refused"
     assert answer(1, system=255) is None, "likewise"
     assert answer(5) is None, "it is being done"
     assert answer(1, command=511) is None, "never asked"
     assert answer(1) == "arming refused: temporarily rejected"
-    hearing.on_failsafe_flags(msg.FailsafeFlags(home_position_invalid=True), 1.0)
-    hearing.on_vehicle_status(status(msg, pre_flight_checks_pass=False), 1.0)
+    telemetry.on_failsafe_flags(msg.FailsafeFlags(home_position_invalid=True), 1.0)
+    telemetry.on_vehicle_status(status(msg, pre_flight_checks_pass=False), 1.0)
     why = "(home position invalid, its preflight checks fail)"
     assert answer(77, 176) == f"the change of mode refused: result 77 {why}"
     assert answer(0, 176) == f"arming refused: temporarily rejected {why}"
-    hearing.on_vehicle_status(status(msg, arming_state=2), 1.0)
-    assert hearing.telemetry().refusal is None
+    telemetry.on_vehicle_status(status(msg, arming_state=2), 1.0)
+    assert telemetry.snapshot().refusal is None
 
 
 # What is known.
 
 
 def test_modes_and_failsafe(msg: Any) -> None:
-    hearing = Px4Telemetry(place=PLACE)
-    assert hearing.telemetry() == Telemetry(missing="PX4 has no estimate of its position yet")
+    telemetry = Px4Telemetry(start=PLACE)
+    assert telemetry.snapshot() == Telemetry(missing="PX4 has no estimate of its position yet")
     for state, failsafe, mode, name in (
         (14, False, Mode.COMMANDED, "OFFBOARD"),
         (5, True, Mode.RETURN, "AUTO_RTL (failsafe)"),
         (17, False, Mode.OTHER, "AUTO_TAKEOFF"),
         (23, False, Mode.OTHER, "nav_state 23"),
     ):
-        hearing.on_vehicle_status(status(msg, nav_state=state, failsafe=failsafe), 3.0)
-        known = hearing.telemetry()
+        telemetry.on_vehicle_status(status(msg, nav_state=state, failsafe=failsafe), 3.0)
+        known = telemetry.snapshot()
         assert (known.mode, known.mode_name, known.heartbeat_s) == (mode, name, 3.0)
-    hearing.on_vehicle_status(status(msg, system_type=1), 4.0)
-    assert hearing.telemetry().missing == "PX4 has a vehicle of type 1; expected a multicopter"
+    telemetry.on_vehicle_status(status(msg, system_type=1), 4.0)
+    assert telemetry.snapshot().missing == "PX4 has a vehicle of type 1; expected a multicopter"
 
 
 def test_the_emptiest_battery_counts(msg: Any) -> None:
-    hearing = Px4Telemetry(place=PLACE)
+    telemetry = Px4Telemetry(start=PLACE)
     for number, connected, remaining, told in (
         (1, True, 0.75, 0.75),
         (2, True, 0.5, 0.5),
@@ -568,47 +570,47 @@ def test_the_emptiest_battery_counts(msg: Any) -> None:
         (2, False, 0.5, 0.75),
     ):
         message = msg.BatteryStatus(id=number, connected=connected, remaining=remaining)
-        hearing.on_battery_status(message, 0.0)
-        assert hearing.telemetry().battery == told
+        telemetry.on_battery_status(message, 0.0)
+        assert telemetry.snapshot().battery == told
 
 
 def test_a_battery_tells_its_voltage_and_what_px4_thinks_of_it(msg: Any) -> None:
-    hearing = Px4Telemetry(place=PLACE)
-    assert (hearing.telemetry().battery_v, hearing.telemetry().battery_fails) == (None, False)
+    telemetry = Px4Telemetry(start=PLACE)
+    assert (telemetry.snapshot().battery_v, telemetry.snapshot().battery_fails) == (None, False)
     for warning, fails in ((0, False), (1, True), (3, True)):
         message = msg.BatteryStatus(id=1, connected=True, remaining=0.75, voltage_v=9.0, warning=warning)
-        hearing.hear("battery_status", message, 0.0)
-        known = hearing.telemetry()
+        telemetry.update("battery_status", message, 0.0)
+        known = telemetry.snapshot()
         assert (known.battery, known.battery_v, known.battery_fails) == (0.75, 9.0, fails)
 
 
 def test_when_it_last_said_whether_it_trusts_its_position_is_told(msg: Any) -> None:
-    hearing = standing(msg)
-    assert hearing.telemetry().estimate_s == 0.0
-    hearing.hear("vehicle_local_position", position(msg, START, xy_valid=False), 1.0)
-    hearing.hear("vehicle_status", status(msg), 2.0)
-    known = hearing.telemetry()
+    telemetry = standing(msg)
+    assert telemetry.snapshot().estimate_s == 0.0
+    telemetry.update("vehicle_local_position", position(msg, START, xy_valid=False), 1.0)
+    telemetry.update("vehicle_status", status(msg), 2.0)
+    known = telemetry.snapshot()
     assert (known.estimate_ok, known.estimate_s, known.position_s) == (False, 1.0, 0.0)
 
 
 def test_home_and_tilt_are_told(msg: Any) -> None:
-    hearing = standing(msg)
-    assert (hearing.telemetry().home, hearing.telemetry().tilt_rad) == (None, None)
-    hearing.hear("home_position", msg.HomePosition(x=3.0, y=8.0, z=0.5, valid_lpos=True), 1.0)
-    hearing.hear("vehicle_attitude", msg.VehicleAttitude(q=[0.0, 1.0, 0.0, 0.0]), 1.0)
-    known = hearing.telemetry()
+    telemetry = standing(msg)
+    assert (telemetry.snapshot().home, telemetry.snapshot().tilt_rad) == (None, None)
+    telemetry.update("home_position", msg.HomePosition(x=3.0, y=8.0, z=0.5, valid_lpos=True), 1.0)
+    telemetry.update("vehicle_attitude", msg.VehicleAttitude(q=[0.0, 1.0, 0.0, 0.0]), 1.0)
+    known = telemetry.snapshot()
     assert known.home == pytest.approx((PLACE.east_m + 10.0, PLACE.north_m, PLACE.up_m))
     assert known.tilt_rad == pytest.approx(math.pi), "on its back"
     assert known.system == "system 7"
 
 
 def test_what_is_late_repeated_unstamped_or_of_another_vehicle_is_counted_and_ignored(msg: Any) -> None:
-    hearing = standing(msg)
+    telemetry = standing(msg)
 
     def hear(name: str, message: Any, stamp_s: float, now_s: float) -> Telemetry:
         message.timestamp = round(stamp_s * 1e6)
-        hearing.hear(name, message, now_s)
-        return hearing.telemetry()
+        telemetry.update(name, message, now_s)
+        return telemetry.snapshot()
 
     offboard = status(msg, arming_state=2, nav_state=14)
     at = [position(msg, Ned(START.north_m + m, START.east_m, START.down_m)) for m in (0.0, 1.0, 2.0, 400.0)]
@@ -634,7 +636,7 @@ def test_what_is_late_repeated_unstamped_or_of_another_vehicle_is_counted_and_ig
 
 
 def test_time_goes_on_whatever_clock_the_stamps_are_of(msg: Any) -> None:
-    hearing = Px4Telemetry(place=PLACE)
+    telemetry = Px4Telemetry(start=PLACE)
     agent_us = 1_700_000_000_000_000
     passed = []
     for stamp_us in (
@@ -643,28 +645,28 @@ def test_time_goes_on_whatever_clock_the_stamps_are_of(msg: Any) -> None:
         *(agent_us - 3_600_000_000, agent_us - 3_599_000_000),  # which somebody has set
         *(1, 500_001),  # booted anew
     ):
-        hearing.on_vehicle_status(status(msg, timestamp=stamp_us), 0.0)
-        passed.append(round(hearing.vehicle_s, 6))
+        telemetry.on_vehicle_status(status(msg, timestamp=stamp_us), 0.0)
+        passed.append(round(telemetry.vehicle_s, 6))
     assert passed == [0.0, 1.0, 1.0, 2.0, 2.0, 2.0, 3.0, 3.0, 4.0, 4.0, 4.5]
 
 
 def test_in_the_air_without_a_datum_nobody_knows_where_the_grid_is(msg: Any) -> None:
     for landed in (None, False):  # PX4 1.15 may not tell: then it stands as long as it is disarmed
-        hearing = Px4Telemetry(place=PLACE)
-        hearing.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 0.0)
+        telemetry = Px4Telemetry(start=PLACE)
+        telemetry.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 0.0)
         if landed is not None:
-            hearing.on_vehicle_land_detected(msg.VehicleLandDetected(landed=landed), 0.0)
-        hearing.on_vehicle_local_position(position(msg, START), 0.0)
-        assert "expected a datum" in str(hearing.telemetry().missing)
-    hearing = Px4Telemetry(place=PLACE)
-    hearing.on_vehicle_status(status(msg), 0.0)
-    hearing.on_vehicle_local_position(position(msg, START), 0.0)
-    assert (hearing.telemetry().missing, hearing.telemetry().position) == (None, PLACE)
+            telemetry.on_vehicle_land_detected(msg.VehicleLandDetected(landed=landed), 0.0)
+        telemetry.on_vehicle_local_position(position(msg, START), 0.0)
+        assert "expected a datum" in str(telemetry.snapshot().missing)
+    telemetry = Px4Telemetry(start=PLACE)
+    telemetry.on_vehicle_status(status(msg), 0.0)
+    telemetry.on_vehicle_local_position(position(msg, START), 0.0)
+    assert (telemetry.snapshot().missing, telemetry.snapshot().position) == (None, PLACE)
 
 
 def test_px4_msgs_of_another_release_are_named(vehicle: px4.Px4Vehicle, spun: Spun, msg: Any) -> None:
     assert vehicle.telemetry().missing == (
-        "nothing came on fmu/out/vehicle_status_v1, fmu/out/vehicle_local_position yet"
+        "nothing received on fmu/out/vehicle_status_v1, fmu/out/vehicle_local_position yet"
     )
     spun.nodes[0].create_publisher(msg.VehicleStatus, "fmu/out/vehicle_status", 1)
     spun.until(lambda: "but" in str(vehicle.telemetry().missing))
@@ -718,7 +720,7 @@ class Flight:
         scenario = scenarios.load(path)
         self.place = Enu(*scenario.mission.start_m[:2], 0.0)
         self.bridge = MissionController(scenario, SafetySettings(arm=True), self.note)
-        self.vehicle = px4.Px4Vehicle(spun.node("bridge"), place=self.place)
+        self.vehicle = px4.Px4Vehicle(spun.node("bridge"), start=self.place)
         self.vehicle.open()
 
     def note(self) -> None:
@@ -854,7 +856,7 @@ def test_a_bridge_that_is_started_again_in_the_air_goes_on(flight: Flight) -> No
     standing, grid_origin, place = flight.bridge.standing, flight.vehicle.grid_origin, Enu(7.0, 7.0, 7.0)
     flight.vehicle.close()
     flight.bridge = MissionController(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
-    flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], place=place, grid_origin=grid_origin)
+    flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], start=place, grid_origin=grid_origin)
     flight.vehicle.open()
     flight.until(lambda: flight.log[-1][2].startswith("it flies already"))
     flight.spun.pass_time(1.0, flight.tick)  # until PX4 has found the new publishers

@@ -22,10 +22,10 @@ NORTH_MPS = 5.0
 
 
 class Radio:
-    """Messages of one sender, with their numbers; `hearing` takes them in, at `now_s`."""
+    """Messages of one sender, with their numbers; `telemetry` takes them in, at `now_s`."""
 
-    def __init__(self, hearing: MavlinkTelemetry, system: int = 1, component: int = 1) -> None:
-        self.hearing, self.now_s = hearing, 0.0
+    def __init__(self, telemetry: MavlinkTelemetry, system: int = 1, component: int = 1) -> None:
+        self.telemetry, self.now_s = telemetry, 0.0
         self.codec = mav.MAVLink(None, system, component)
 
     def make(self, name: str, *fields: Any) -> Any:
@@ -34,8 +34,8 @@ class Radio:
         return mav.MAVLink(None).parse_buffer(packed)[0]
 
     def send(self, name: str, *fields: Any) -> Telemetry:
-        self.hearing.hear(self.make(name, *fields), self.now_s)
-        return self.hearing.telemetry(self.now_s)
+        self.telemetry.update(self.make(name, *fields), self.now_s)
+        return self.telemetry.snapshot(self.now_s)
 
     def heartbeat(self, autopilot: int = ARDUPILOT, kind: int = 2, mode: int = 4) -> Telemetry:
         return self.send("heartbeat", kind, autopilot, 0, mode, 4)
@@ -60,22 +60,22 @@ def met(autopilot: int = ARDUPILOT, datum: Geodetic | None = HOME) -> Radio:
 
 
 def test_only_an_autopilot_is_listened_to() -> None:
-    hearing = MavlinkTelemetry(None, Enu(0.0, 0.0, 0.0))
-    Radio(hearing, 255, 190).heartbeat(8, 6)  # a ground station
-    Radio(hearing, 1, 154).heartbeat(8, 26)  # a gimbal
-    assert hearing.system is None
-    known = Radio(hearing, 7, 1).heartbeat(kind=1)
+    telemetry = MavlinkTelemetry(None, Enu(0.0, 0.0, 0.0))
+    Radio(telemetry, 255, 190).heartbeat(8, 6)  # a ground station
+    Radio(telemetry, 1, 154).heartbeat(8, 26)  # a gimbal
+    assert telemetry.system is None
+    known = Radio(telemetry, 7, 1).heartbeat(kind=1)
     assert known.missing == "system 7 is a vehicle of type 1; expected a multicopter"
-    known = Radio(hearing, 8, 1).heartbeat(4)
+    known = Radio(telemetry, 8, 1).heartbeat(4)
     assert "autopilot of kind 4; expected 3 (ArduCopter) or 12 (PX4)" in str(known.missing)
     assert known.system == ""
-    known = Radio(hearing, 1, 1).heartbeat()
-    assert (hearing.dialect, known.system) == (ARDUCOPTER, "system 1, ArduCopter")
+    known = Radio(telemetry, 1, 1).heartbeat()
+    assert (telemetry.flight_stack, known.system) == (ARDUCOPTER, "system 1, ArduCopter")
 
 
 def test_of_two_autopilots_on_a_link_none_is_taken_unless_one_is_named() -> None:
-    hearing = MavlinkTelemetry(None, Enu(0.0, 0.0, 0.0))
-    other, ours = Radio(hearing, 2), Radio(hearing, 1)
+    telemetry = MavlinkTelemetry(None, Enu(0.0, 0.0, 0.0))
+    other, ours = Radio(telemetry, 2), Radio(telemetry, 1)
     assert "waiting for its heartbeats, and for those of others" in str(other.heartbeat(PX4_STACK).missing)
     two = "2 autopilots on this link: system 2, PX4; system 1, ArduCopter; expected --system N, one of them"
     known = ours.heartbeat()
@@ -83,7 +83,7 @@ def test_of_two_autopilots_on_a_link_none_is_taken_unless_one_is_named() -> None
     other.now_s = ours.now_s = 5.0
     ours.heartbeat()
     assert other.heartbeat(PX4_STACK).missing == two
-    assert hearing.system == 2, "it never changes over by itself"
+    assert telemetry.system == 2, "it never changes over by itself"
     other.now_s = 16.0
     for _ in range(4):
         known = other.heartbeat(PX4_STACK)
@@ -93,8 +93,8 @@ def test_of_two_autopilots_on_a_link_none_is_taken_unless_one_is_named() -> None
 
 @pytest.mark.parametrize("first", [1, 2])
 def test_the_vehicle_that_is_named_is_taken_whoever_speaks_first(first: int) -> None:
-    hearing = MavlinkTelemetry(HOME, Enu(0.0, 0.0, 0.0), system=2)
-    radios = {1: Radio(hearing, 1), 2: Radio(hearing, 2)}
+    telemetry = MavlinkTelemetry(HOME, Enu(0.0, 0.0, 0.0), system=2)
+    radios = {1: Radio(telemetry, 1), 2: Radio(telemetry, 2)}
     known = radios[first].heartbeat()
     if first == 1:
         others = "no heartbeat from an autopilot of system 2 (there is system 1, ArduCopter)"
@@ -122,10 +122,10 @@ def test_a_long_text_comes_in_parts() -> None:
     radio, text = met(PX4_STACK), "Preflight Fail: " + "x" * 60 + " the end"
     for number in range(2):
         radio.send("statustext", 2, text[number * 50 : number * 50 + 50].encode(), 9, number)
-    radio.hearing.refused("arming", "failed", 1.5)
-    assert radio.hearing.telemetry(1.5).refusal == f"arming refused: {text}"
-    radio.hearing.granted("arming")
-    assert radio.hearing.telemetry(1.5).refusal is None
+    radio.telemetry.rejections.reject("arming", "failed", 1.5)
+    assert radio.telemetry.snapshot(1.5).refusal == f"arming refused: {text}"
+    radio.telemetry.rejections.accept("arming")
+    assert radio.telemetry.snapshot(1.5).refusal is None
 
 
 # Which messages are news.
@@ -168,8 +168,8 @@ def test_a_message_that_comes_late_or_twice_changes_nothing() -> None:
         before = radio.position(600.0 + 0.05 * tick)
     twice = radio.make("heartbeat", 2, 3, 0, 4, 4)
     for message in (late, late_mode, twice, twice):
-        radio.hearing.hear(message, radio.now_s)
-    known = radio.hearing.telemetry(radio.now_s)
+        radio.telemetry.update(message, radio.now_s)
+    known = radio.telemetry.snapshot(radio.now_s)
     assert (known.position, known.position_s, known.mode) == (before.position, before.position_s, before.mode)
     assert not known.armed, "nor does an old heartbeat"
     assert known.discarded == {"late": 2, "repeated": 1}
@@ -182,10 +182,10 @@ def test_a_message_that_was_overtaken_by_others_is_news() -> None:
         heartbeat = radio.make("heartbeat", 2, 3, 0, 5, 4)
         radio.now_s += 1.0
         radio.position(600.0 + second)
-        radio.hearing.hear(heartbeat, radio.now_s)
-        radio.hearing.hear(heartbeat, radio.now_s)
-        assert radio.hearing.telemetry(radio.now_s).heartbeat_s == radio.now_s
-    assert radio.hearing.discarded == {"late": 5}, "the second time"
+        radio.telemetry.update(heartbeat, radio.now_s)
+        radio.telemetry.update(heartbeat, radio.now_s)
+        assert radio.telemetry.snapshot(radio.now_s).heartbeat_s == radio.now_s
+    assert radio.telemetry.discarded == {"late": 5}, "the second time"
 
 
 def test_a_mode_that_was_just_left_is_believed_at_the_second_heartbeat() -> None:
@@ -197,10 +197,10 @@ def test_a_mode_that_was_just_left_is_believed_at_the_second_heartbeat() -> None
     assert (guided.mode_name, landing.mode_name) == ("GUIDED", "LAND")
     radio.now_s += 1.0
     assert radio.send("heartbeat", 2, 3, 0, 4, 4).mode_name == "LAND"
-    assert radio.hearing.doubts_mode(radio.now_s), "nothing is commanded until that is clear"
+    assert radio.telemetry.is_mode_uncertain(radio.now_s), "nothing is commanded until that is clear"
     radio.now_s += 1.0
     assert radio.send("heartbeat", 2, 3, 0, 4, 4).mode_name == "GUIDED"
-    assert not radio.hearing.doubts_mode(radio.now_s)
+    assert not radio.telemetry.is_mode_uncertain(radio.now_s)
     radio.now_s += 10.0
     assert radio.send("heartbeat", 2, 3, 0, 9, 4).mode_name == "LAND", "at once, after a while"
     radio.now_s += 1.0
@@ -301,11 +301,11 @@ def test_whatever_happens_to_single_messages_the_vehicle_is_where_it_is(
             arrivals.append((sent_s + (how_long_s if fate == "late" else 0.0), message))
         if fate == "twice":
             arrivals.append((sent_s + 0.02, message))
-    before = radio.hearing.telemetry(0.0)
+    before = radio.telemetry.snapshot(0.0)
     taken = 0
     for arrives_s, message in sorted(arrivals, key=lambda arrival: arrival[0]):
-        taken += radio.hearing.hear(message, arrives_s)
-        known = radio.hearing.telemetry(arrives_s)
+        taken += radio.telemetry.update(message, arrives_s)
+        known = radio.telemetry.snapshot(arrives_s)
         assert known.position is not None
         assert known.position_s is not None
         assert known.vehicle_s >= before.vehicle_s
@@ -354,7 +354,7 @@ def test_an_estimate_that_is_not_reported_any_more_is_not_one_that_is_lost() -> 
 
 
 def answer(radio: Radio, values: dict[str, float]) -> None:
-    for name in radio.hearing.unanswered(radio.now_s):
+    for name in radio.telemetry.parameters_to_request(radio.now_s):
         if name in values:
             radio.send("param_value", name.encode(), values[name], 9, 500, 1)
 
@@ -382,7 +382,7 @@ FENCE |= {"FENCE_ALT_MIN": 5.0, "FENCE_TOTAL": 0, "FENCE_TYPE": 7}
 def test_limits_of_arducopter(values: dict[str, float], expected: Limits | None) -> None:
     radio = met()
     answer(radio, values)
-    assert radio.hearing.telemetry(0.0).limits == expected
+    assert radio.telemetry.snapshot(0.0).limits == expected
 
 
 def test_limits_of_px4_whose_integers_are_bytes() -> None:
@@ -392,7 +392,7 @@ def test_limits_of_px4_whose_integers_are_bytes() -> None:
     answer(radio, {"GF_MAX_HOR_DIST": 300.0, "GF_MAX_VER_DIST": 0.0, "MPC_XY_VEL_MAX": 12.0})
     answer(radio, {"MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_VEL_MAX_DN": 1.5})
     expected = Limits(fence_radius_m=300.0, speed_mps=12.0)
-    assert radio.hearing.telemetry(0.0).limits == expected
+    assert radio.telemetry.snapshot(0.0).limits == expected
     (one,) = struct.unpack("<f", struct.pack("<i", 1))
     known = radio.send("param_value", b"GF_ACTION", one, mav.MAV_PARAM_TYPE_INT32, 500, 1)
     assert known.limits == Limits(speed_mps=12.0), "it only warns, and somebody has just changed that"
@@ -410,10 +410,10 @@ def test_a_vehicle_that_answers_for_no_parameter_is_not_waited_for_long(autopilo
     radio.send("system_time", 0, 900)
     asked: list[str] = []
     while "parameters" in str(radio.position(1.0 + radio.now_s).missing):
-        asked += radio.hearing.unanswered(radio.now_s)
+        asked += radio.telemetry.parameters_to_request(radio.now_s)
         radio.now_s += 0.1
     assert radio.now_s < 3.0
-    assert radio.hearing.telemetry(radio.now_s).missing is None
+    assert radio.telemetry.snapshot(radio.now_s).missing is None
     assert all(asked.count(name) == MAX_REQUESTS for name in asked)
 
 
@@ -422,10 +422,10 @@ def test_a_vehicle_that_answers_for_no_parameter_is_not_waited_for_long(autopilo
 
 def test_heartbeats_of_our_own_identity_that_are_not_ours_are_another_controller() -> None:
     radio = met()
-    other = Radio(radio.hearing, 255, 191)
+    other = Radio(radio.telemetry, 255, 191)
     other.codec.seq = 100
     for second in range(1, 4):
-        radio.hearing.rivals.sent_heartbeat(second)
+        radio.telemetry.other_controllers.sent_heartbeat(second)
         radio.position(float(second))
         before = other.send("heartbeat", 18, 8, 0, 0, 4)
         if second < 3:
@@ -439,35 +439,35 @@ def test_heartbeats_of_our_own_identity_that_are_not_ours_are_another_controller
 
 def test_what_a_router_sends_back_is_no_other_controller() -> None:
     radio = met()
-    echo = Radio(radio.hearing, 255, 191)
+    echo = Radio(radio.telemetry, 255, 191)
     for second in range(1, 60):
         echo.codec.seq = number = 20 * second % 256
-        radio.hearing.rivals.sent_heartbeat(number)
+        radio.telemetry.other_controllers.sent_heartbeat(number)
         radio.position(float(second))
         assert echo.send("heartbeat", 18, 8, 0, 0, 4).other_controller is None
 
 
 def test_a_ground_station_is_no_other_controller() -> None:
     radio = met()
-    station = Radio(radio.hearing, 255, 190)
+    station = Radio(radio.telemetry, 255, 190)
     for second in range(1, 60):
-        radio.hearing.rivals.sent_heartbeat(second)
+        radio.telemetry.other_controllers.sent_heartbeat(second)
         radio.position(float(second))
         assert station.send("heartbeat", 6, 8, 0, 0, 4).other_controller is None
 
 
 def test_answers_to_commands_that_were_never_sent_are_another_controller() -> None:
     radio = met()
-    rivals = radio.hearing.rivals
+    rivals = radio.telemetry.other_controllers
     rivals.sent_command(mav.MAV_CMD_DO_SET_MODE, 0.0)
     for second in range(1, 10):
         known = radio.position(float(second))
-        rivals.answer(mav.MAV_CMD_DO_SET_MODE, known.vehicle_s)
-        assert radio.hearing.telemetry(0.0).other_controller is None, "asked for once, answered often"
+        rivals.on_ack(mav.MAV_CMD_DO_SET_MODE, known.vehicle_s)
+        assert radio.telemetry.snapshot(0.0).other_controller is None, "asked for once, answered often"
     for _ in range(3):
-        rivals.answer(mav.MAV_CMD_NAV_TAKEOFF, known.vehicle_s)
+        rivals.on_ack(mav.MAV_CMD_NAV_TAKEOFF, known.vehicle_s)
     words = "answers to commands of system 255, component 191 that this bridge did not send"
-    assert radio.hearing.telemetry(0.0).other_controller == words
+    assert radio.telemetry.snapshot(0.0).other_controller == words
 
 
 @pytest.mark.parametrize("mode", [4, 5])
@@ -492,5 +492,5 @@ def test_the_last_target_of_a_bridge_that_was_killed_is_no_other_controller() ->
             north_m = 100.0  # what the process before has left
         else:
             north_m = 200.0 + 100.0 * (tick // 10)
-            radio.hearing.rivals.sent_setpoint(Ned(north_m, 0.0, -20.0))
+            radio.telemetry.other_controllers.sent_setpoint(Ned(north_m, 0.0, -20.0))
         assert radio.target(0.5 * tick, north_m).other_controller is None

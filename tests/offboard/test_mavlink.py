@@ -163,7 +163,7 @@ def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told
     place = Enu(300.0, 400.0, 0.0)
     with (
         fake("px4", speed=20.0, ready_s=1.0) as autopilot,
-        MavlinkVehicle(autopilot.address, place=place) as vehicle,
+        MavlinkVehicle(autopilot.address, start=place) as vehicle,
     ):
         known = until(vehicle, lambda known: known.missing is None)
         # Not exactly: the plane at the grid's corner is no longer level half a kilometre away (0.02 m).
@@ -244,7 +244,7 @@ def test_the_autopilot_s_limits_home_and_target_are_read(kind: str) -> None:
     with fake(kind, speed=20.0, ready_s=1.0) as autopilot:
         autopilot.do("param FENCE_ENABLE 1")
         autopilot.do(f"param {fence} 250.0")
-        with MavlinkVehicle(autopilot.address, place=place) as vehicle:
+        with MavlinkVehicle(autopilot.address, start=place) as vehicle:
             known = until(vehicle, lambda known: known.missing is None and known.home is not None)
             assert known.system == f"system 1, {'ArduCopter' if kind == 'ardupilot' else 'PX4'}"
             assert known.limits is not None

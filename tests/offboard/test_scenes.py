@@ -77,7 +77,7 @@ def test_a_mission_is_flown_whatever_happens_to_single_messages(kind: str, seed:
     flight.until_over()
     check_landed(flight)
     if share > 0.01:
-        assert {"late", "repeated"} <= flight.hearing.discarded.keys()
+        assert {"late", "repeated"} <= flight.telemetry.discarded.keys()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -88,7 +88,7 @@ def test_one_odd_message_does_nothing(kind: str, line: str) -> None:
     flight.do(line)
     flight.until_over()
     check_landed(flight)
-    assert sum(flight.hearing.discarded.values()) >= 1
+    assert sum(flight.telemetry.discarded.values()) >= 1
     assert not any(reason.startswith("goes on after") for _, _, reason in flight.log)
 
 
@@ -149,8 +149,8 @@ def test_a_second_vehicle_on_the_link_is_left_alone(kind: str) -> None:
 def test_a_second_bridge_is_known_before_anybody_can_arm(kind: str) -> None:
     flight = VirtualFlight(kind)
     flight.do("second_bridge_heartbeats 1")
-    flight.until(lambda: flight.hearing.telemetry(flight.now_s).missing is None)
-    found = str(flight.hearing.telemetry(flight.now_s).other_controller)
+    flight.until(lambda: flight.telemetry.snapshot(flight.now_s).missing is None)
+    found = str(flight.telemetry.snapshot(flight.now_s).other_controller)
     assert found.startswith("heartbeats of system 255, component 191")
     assert not flight.copter.armed
 
@@ -162,14 +162,14 @@ def test_after_a_lost_link_the_report_on_the_estimate_is_older_than_the_heartbea
     moving(flight)
     flight.link_is_up = False
     flight.run(4.0)
-    known = flight.hearing.telemetry(flight.now_s)
+    known = flight.telemetry.snapshot(flight.now_s)
     assert known.estimate_s is not None
     assert known.heartbeat_s is not None
     assert flight.now_s - known.estimate_s == pytest.approx(4.0, abs=0.3)
     assert flight.now_s - known.heartbeat_s == pytest.approx(4.5, abs=0.6)
     flight.link_is_up = True
     flight.run(1.2)
-    known = flight.hearing.telemetry(flight.now_s)
+    known = flight.telemetry.snapshot(flight.now_s)
     assert known.estimate_ok
     assert flight.now_s - (known.estimate_s or 0.0) < 0.3
 
@@ -365,7 +365,7 @@ def test_a_second_vehicle_that_comes_before_arming_stops_it(kind: str) -> None:
 def test_a_bridge_that_is_restarted_beside_a_second_vehicle_goes_on(kind: str) -> None:
     flight = VirtualFlight(kind, scenario=short(20), looks=1)
     moving(flight, 3)
-    system = flight.hearing.telemetry(flight.now_s).system_id
+    system = flight.telemetry.snapshot(flight.now_s).system_id
     assert system == 1
     flight.autopilot.other = other = Autopilot(Copter(kind, 0.0, "second "), 7)
     flight.restart(system)

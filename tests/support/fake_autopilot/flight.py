@@ -149,7 +149,7 @@ class Flight:
         self.bridge = MissionController(scenario, how, self._note, **bridge)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
-        self.vehicle = MavlinkVehicle(autopilot.address, place=self.place)
+        self.vehicle = MavlinkVehicle(autopilot.address, start=self.place)
         self.policy: Callable[[MissionController], Action] | None = way_home
 
     def _note(self) -> None:

@@ -117,7 +117,7 @@ def node_in(ros: Ros, *arguments: str) -> Iterator[tuple[rclpy.node.Node, Direct
 @contextlib.contextmanager
 def mavros_of(node: rclpy.node.Node, **how: Any) -> Iterator[MavrosVehicle]:
     """The transport, open, for the time of a block."""
-    vehicle = MavrosVehicle(node, place=START, **how)
+    vehicle = MavrosVehicle(node, start=START, **how)
     vehicle.open()
     with contextlib.closing(vehicle):
         yield vehicle

@@ -86,16 +86,16 @@ class VirtualFlight:
         self.channel = channel or (lambda sent, now_s: sent)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
-        self.hearing = MavlinkTelemetry(datum, self.place, system)
-        self.session = Session(load_codec(), self.hearing, self._write)
+        self.telemetry = MavlinkTelemetry(datum, self.place, system)
+        self.session = Session(load_codec(), self.telemetry, self._write)
         self.link_is_up, self.now_s, self.speed, self.looks = True, 1000.0, speed, looks
         self._control = Control(self.autopilot)
         self.bridge = MissionController(scenario, how or SafetySettings(arm=True), self._note, **bridge)
         self.policy: Callable[[MissionController], Action] | None = way_home
         self.log: list[tuple[Phase, int, str]] = []
         self.executed: list[int] = []
-        self.session.live(self.now_s)
-        self.session.begin(self.now_s)
+        self.session.keep_alive(self.now_s)
+        self.session.on_connected(self.now_s)
 
     def _tell(self, event: str, **more: Any) -> None:
         self.events.append({"event": event, "t_s": self.copter.t_s, **more})
@@ -122,11 +122,11 @@ class VirtualFlight:
             system: the vehicle that the journal names.
         """
         standing, old = self.bridge.standing, self.bridge
-        self.hearing = MavlinkTelemetry(self.hearing.datum, self.place, system, again=True)
-        self.session = Session(load_codec(), self.hearing, self._write)
+        self.telemetry = MavlinkTelemetry(self.telemetry.datum, self.place, system, again=True)
+        self.session = Session(load_codec(), self.telemetry, self._write)
         self.bridge = MissionController(old.scenario, old.settings, self._note, standing)
-        self.session.live(self.now_s)
-        self.session.begin(self.now_s)
+        self.session.keep_alive(self.now_s)
+        self.session.on_connected(self.now_s)
 
     def all(self, event: str) -> list[dict[str, Any]]:
         """All events of a name so far."""
@@ -143,7 +143,7 @@ class VirtualFlight:
         self.autopilot.out.clear()
         for data in self.channel(list(_split(out)) if self.link_is_up else [], self.now_s):
             self.session.receive(data, self.now_s)
-        known = self.hearing.telemetry(self.now_s)
+        known = self.telemetry.snapshot(self.now_s)
         for command in self.bridge.tick(self.now_s, known):
             self.session.queue_command(command)
         bridge = self.bridge

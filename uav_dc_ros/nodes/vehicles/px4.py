@@ -1,9 +1,9 @@
-"""PX4 over uXRCE-DDS: hears its topics, passes commands on, streams setpoints. It decides nothing.
+"""PX4 over uXRCE-DDS: receives telemetry, sends commands, streams setpoints. It decides nothing.
 
-The stream (see there) also ends while no position has come for `POSE_S` that PX4 trusts; then PX4's own
-failsafe takes over (COM_OF_LOSS_T, COM_OBL_RC_ACT), as it does when the process is gone.
+The stream also ends `POSE_TIMEOUT_S` after the last position that PX4 trusts; then PX4's own failsafe takes
+over (COM_OF_LOSS_T, COM_OBL_RC_ACT), as it does when the process has died.
 
-What is sent has the time 0: PX4 puts that of its arrival there, so nobody has to agree about clocks.
+Messages are sent with time 0, which PX4 replaces by their arrival, so clocks need not be synchronised.
 """
 
 import dataclasses
@@ -19,20 +19,19 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uav_dc_ros.errors import VehicleError
-from uav_dc_ros.nodes.vehicles.other_setpoints import OtherSetpointPublishers
+from uav_dc_ros.nodes.vehicles.graph_checks import PeriodicCheck, other_publishers
 from uav_dc_ros.offboard import flight_stacks
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned
 from uav_dc_ros.offboard.px4.telemetry import COMPANION, Px4Telemetry
 from uav_dc_ros.offboard.setpoint_stream import STREAM_VEHICLE_S, SetpointStream
 from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, Telemetry
 
-POSE_S = 0.5
-LOOK_S = 1.0  # between two looks at which topics there are
+POSE_TIMEOUT_S = 0.5
 NOT_CONTROLLED = [math.nan] * 3
 RETURN, LAND, SET_MODE, ARM = 20, 21, 176, 400  # VEHICLE_CMD
 CUSTOM_MODE = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
-HEARD = {  # in fmu/out
+SUBSCRIBED = {  # in fmu/out
     "vehicle_status": "VehicleStatus",
     "vehicle_local_position": "VehicleLocalPosition",
     "vehicle_land_detected": "VehicleLandDetected",
@@ -42,8 +41,8 @@ HEARD = {  # in fmu/out
     "vehicle_attitude": "VehicleAttitude",
     "home_position": "HomePosition",
 }
-NEEDED = ("vehicle_status", "vehicle_local_position")  # PX4 1.15 does not send all of the others
-SENT = {  # in fmu/in
+REQUIRED = ("vehicle_status", "vehicle_local_position")  # PX4 1.15 does not send all of the others
+PUBLISHED = {  # in fmu/in
     "trajectory_setpoint": "TrajectorySetpoint",
     "offboard_control_mode": "OffboardControlMode",
     "vehicle_command": "VehicleCommand",
@@ -55,7 +54,7 @@ def load_messages() -> Any:
     """The module of PX4's message classes.
 
     Raises:
-        VehicleError: it is not there, or not of a PX4 that can be flown.
+        VehicleError: it is not installed, or too old.
     """
     try:
         messages = importlib.import_module("px4_msgs.msg")
@@ -64,27 +63,28 @@ def load_messages() -> Any:
             f"a vehicle on PX4's topics needs the ROS package px4_msgs ({error}); expected it built from the "
             "branch of PX4's release, and its workspace sourced: https://github.com/PX4/px4_msgs"
         ) from None
-    lacking = [kind for kind in (*HEARD.values(), *SENT.values()) if not hasattr(messages, kind)]
+    kinds = (*SUBSCRIBED.values(), *PUBLISHED.values())
+    lacking = [kind for kind in kinds if not hasattr(messages, kind)]
     if lacking:
         raise VehicleError(f"px4_msgs has no {', '.join(lacking)}; expected that of PX4 1.15 or later")
     return messages
 
 
 def versioned(name: str, kind: Any) -> str:
-    """Name of the topic of a message class: PX4 appends the version of the definition, if that is not 0."""
+    """Name of the topic of a message class: PX4 appends the version of the definition, if it is not 0."""
     version = getattr(kind, "MESSAGE_VERSION", 0)
     return f"{name}_v{version}" if version else name
 
 
 class Px4Vehicle:
-    """One vehicle on the topics `fmu/in/...` and `fmu/out/...` of a node's namespace.
+    """One vehicle on the topics `fmu/in/...` and `fmu/out/...` of a node's namespace, see `Vehicle`.
 
     Args:
-        node: that hears and sends; somebody else spins it.
-        place: where the vehicle stands when its first position comes, in the grid's ENU frame.
-        grid_origin: of the same transport before it was started again: takes the place of a datum.
-        datum: of the grid, for a PX4 that knows where on the Earth it is; None: see `place`.
-        restarted: was a bridge killed before it, even one that had no grid origin yet?
+        node: owns the topics; the caller spins it.
+        start: where the vehicle stands when its first position comes, in the grid's ENU frame.
+        grid_origin: `grid_origin` of an earlier process in the same flight; replaces `datum`.
+        datum: of the grid, for a PX4 with a global position; None: see `start`.
+        restarted: whether an earlier bridge was killed, with or without a grid origin.
 
     Raises:
         VehicleError: px4_msgs is missing, or the grid origin is invalid.
@@ -94,41 +94,41 @@ class Px4Vehicle:
         self,
         node: Node,
         *,
-        place: Enu,
+        start: Enu,
         grid_origin: str = "",
         datum: Geodetic | None = None,
         restarted: bool = False,
     ) -> None:
         self._messages = load_messages()
-        self._node = node
-        self._hearing = Px4Telemetry(place=place, grid_origin=grid_origin, datum=datum)
-        self._lock = threading.Lock()  # of all below, and of `_hearing`
+        self._node, self._restarted = node, restarted or bool(grid_origin)
+        self._telemetry = Px4Telemetry(start=start, grid_origin=grid_origin, datum=datum)
+        self._lock = threading.Lock()  # of all below, and of `_telemetry`
         self._streamed_vehicle_s = 0.0
         self._sent: Ned | None = None
         heartbeat = self._class("offboard_control_mode")()
         heartbeat.position = True
-        self._messages_sent = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
-        self._silent = set(NEEDED)
-        self._looked_s, self._seen = -math.inf, ""
-        self._other_publishers = OtherSetpointPublishers(node, restarted=restarted or bool(grid_origin))
+        self._stream_messages = {"trajectory_setpoint": None, "offboard_control_mode": heartbeat}
+        self._silent = set(REQUIRED)
+        self._other_release = PeriodicCheck(self._find_other_release)
         self._subscriptions: list[Any] = []
         self._publishers: dict[str, Any] = {}
-        self._stream: SetpointStream[Enu] = SetpointStream(self._send, "px4")
+        self._stream: SetpointStream[Enu] = SetpointStream(self._publish, "px4")
 
     def open(self) -> None:
-        """Begin to listen."""
-        for name in HEARD:
+        """Create subscriptions and publishers, and start the stream."""
+        for name in SUBSCRIBED:
+            callback = partial(self._on_message, name)
             self._subscriptions.append(
-                self._node.create_subscription(
-                    self._class(name), self._topic(name), partial(self._hear, name), QOS
-                )
+                self._node.create_subscription(self._class(name), self._topic(name), callback, QOS)
             )
-        for name in SENT:
+        for name in PUBLISHED:
             self._publishers[name] = self._node.create_publisher(self._class(name), self._topic(name), QOS)
+        topic = self._publishers["trajectory_setpoint"].topic_name
+        self._other_publishers = other_publishers(self._node, topic, restarted=self._restarted)
         self._stream.start()
 
     def close(self) -> None:
-        """End the stream, and hear no more; more than once is as good as once."""
+        """End the stream, and destroy what `open` created; idempotent."""
         self._stream.stop()
         while self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop())
@@ -137,86 +137,82 @@ class Px4Vehicle:
 
     @property
     def kind(self) -> str:
-        """Name of the autopilot; empty until it has spoken."""
+        """Name of the autopilot; empty until it is known."""
         with self._lock:
-            return flight_stacks.PX4.name if self._hearing.status is not None else ""
+            return flight_stacks.PX4.name if self._telemetry.status is not None else ""
 
     @property
     def datum(self) -> Geodetic | None:
-        """Where on the Earth the grid's corner lies; None: not known."""
+        """Position of the grid's corner on the Earth; None: not known."""
         with self._lock:
-            return self._hearing.datum
+            return self._telemetry.datum
 
     @property
     def grid_origin(self) -> str:
-        """Where the grid lies: its datum, or else PX4's origin in it; empty until it is known."""
+        """The grid's datum, or else PX4's origin in the grid; empty until it is known."""
         with self._lock:
-            return self._hearing.grid_origin
+            return self._telemetry.grid_origin
 
     def telemetry(self) -> Telemetry:
-        """What is known of the vehicle now, times as of `time.monotonic`."""
+        """The vehicle's state now, times as of `time.monotonic`."""
+        other_controller = self._other_publishers()
         with self._lock:
-            known, silent = self._hearing.telemetry(), [name for name in NEEDED if name in self._silent]
-        setpoints = self._publishers["trajectory_setpoint"].topic_name
-        known = dataclasses.replace(known, other_controller=self._other_publishers.on(setpoints))
+            telemetry, silent = self._telemetry.snapshot(other_controller), self._silent_names()
         if not silent:
-            return known
+            return telemetry
         topics = ", ".join(self._topic(name) for name in silent)
-        return dataclasses.replace(known, missing=f"nothing came on {topics} yet{self._others(silent)}")
+        missing = f"nothing received on {topics} yet{self._other_release() or ''}"
+        return dataclasses.replace(telemetry, missing=missing)
 
     def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
         self._stream.set_setpoint(setpoint)
 
     def send_command(self, command: Command) -> None:
-        """Send a command, once; `telemetry` reports what came of it. PX4 takes off by setpoints."""
+        """Send a command once; `telemetry` reports its effect. PX4 takes off by setpoints."""
         match command:
             case SetMode(Mode.RETURN):
-                self._command(RETURN)
-            case SetMode(Mode.LAND):  # here, heading as it does
-                self._command(LAND, param4=math.nan, param5=math.nan, param6=math.nan, param7=math.nan)
+                self._publish_command(RETURN)
+            case SetMode(Mode.LAND):  # NaN: at the current position and heading
+                at_here = dict.fromkeys(("param4", "param5", "param6", "param7"), math.nan)
+                self._publish_command(LAND, **at_here)
             case SetMode(mode):
                 main, sub = flight_stacks.PX4.mode_parameters(mode)
-                self._command(SET_MODE, param1=CUSTOM_MODE, param2=main, param3=sub)
+                self._publish_command(SET_MODE, param1=CUSTOM_MODE, param2=main, param3=sub)
             case Arm():
-                self._command(ARM, param1=1.0)
-
-    # Topics.
+                self._publish_command(ARM, param1=1.0)
 
     def _class(self, name: str) -> Any:
-        return getattr(self._messages, HEARD.get(name) or SENT[name])
+        return getattr(self._messages, SUBSCRIBED.get(name) or PUBLISHED[name])
 
     def _topic(self, name: str) -> str:
-        return versioned(f"fmu/{'out' if name in HEARD else 'in'}/{name}", self._class(name))
+        return versioned(f"fmu/{'out' if name in SUBSCRIBED else 'in'}/{name}", self._class(name))
 
-    def _hear(self, name: str, message: Any) -> None:
+    def _on_message(self, name: str, message: Any) -> None:
         with self._lock:
             self._silent.discard(name)
-            self._hearing.hear(name, message, time.monotonic())
-            hurry = self._hearing.vehicle_s - self._streamed_vehicle_s >= STREAM_VEHICLE_S
-        if hurry:
+            self._telemetry.update(name, message, time.monotonic())
+            due = self._telemetry.vehicle_s - self._streamed_vehicle_s >= STREAM_VEHICLE_S
+        if due:
             self._stream.hurry()
 
-    def _others(self, silent: list[str]) -> str:
-        """What a PX4 of another release publishes instead, in words."""
-        if time.monotonic() - self._looked_s >= LOOK_S:
-            self._looked_s = time.monotonic()
-            bases = [self._node.resolve_topic_name(f"fmu/out/{name}") for name in silent]
-            pattern = re.compile(f"({'|'.join(map(re.escape, bases))})(_v[0-9]+)?")
-            ours = {self._node.resolve_topic_name(self._topic(name)) for name in silent}
-            there = {name for name, _ in self._node.get_topic_names_and_types() if pattern.fullmatch(name)}
-            others = sorted(name for name in there - ours if self._node.count_publishers(name))
-            self._seen = (
-                f", but {', '.join(others)} exists; expected px4_msgs of PX4's release" if others else ""
-            )
-        return self._seen
+    def _silent_names(self) -> list[str]:
+        return [name for name in REQUIRED if name in self._silent]
 
-    # Sending.
+    def _find_other_release(self) -> str | None:
+        """Topics that a PX4 of another release publishes in place of the silent ones, in words."""
+        silent = self._silent_names()
+        bases = [self._node.resolve_topic_name(f"fmu/out/{name}") for name in silent]
+        pattern = re.compile(f"({'|'.join(map(re.escape, bases))})(_v[0-9]+)?")
+        ours = {self._node.resolve_topic_name(self._topic(name)) for name in silent}
+        present = {name for name, _ in self._node.get_topic_names_and_types() if pattern.fullmatch(name)}
+        others = sorted(name for name in present - ours if self._node.count_publishers(name))
+        return f", but {', '.join(others)} exists; expected px4_msgs of PX4's release" if others else None
 
-    def _command(self, command: int, **parameters: float) -> None:
-        status = self._hearing.status
+    def _publish_command(self, command: int, **parameters: float) -> None:
+        status = self._telemetry.status
         if status is None or "vehicle_command" not in self._publishers:
-            return  # who knows whom it would reach
+            return  # the target system is not known
         message = self._class("vehicle_command")()
         for name, value in parameters.items():
             setattr(message, name, value)
@@ -226,21 +222,21 @@ class Px4Vehicle:
         message.from_external = True
         self._publishers["vehicle_command"].publish(message)
 
-    def _send(self, setpoint: Enu) -> None:
-        """Send a setpoint, then the heartbeat that has PX4 follow it: the stream's thread."""
+    def _publish(self, setpoint: Enu) -> None:
+        """Publish a setpoint, then the heartbeat that makes PX4 follow it; in the stream's thread."""
         with self._lock:
-            hearing = self._hearing
-            self._streamed_vehicle_s = hearing.vehicle_s
-            if hearing.frame is None or hearing.position_s is None:
+            telemetry = self._telemetry
+            self._streamed_vehicle_s = telemetry.vehicle_s
+            if telemetry.frame is None or telemetry.position_s is None:
                 return
-            if time.monotonic() - hearing.position_s > POSE_S:
+            if time.monotonic() - telemetry.position_s > POSE_TIMEOUT_S:
                 return
-            ned = hearing.frame.to_autopilot(setpoint)
-        if ned != self._sent:  # made anew only then: the less there is to do, the better the pace
+            ned = telemetry.frame.to_autopilot(setpoint)
+        if ned != self._sent:  # a message is reused, which keeps the rate
             message, self._sent = self._class("trajectory_setpoint")(), ned
             message.position = list(ned)
             message.velocity = message.acceleration = message.jerk = NOT_CONTROLLED
             message.yaw = message.yawspeed = math.nan
-            self._messages_sent["trajectory_setpoint"] = message
-        for name, message in self._messages_sent.items():
+            self._stream_messages["trajectory_setpoint"] = message
+        for name, message in self._stream_messages.items():
             self._publishers[name].publish(message)

@@ -1,4 +1,4 @@
-"""Evidence of another controller of the same vehicle: messages that answer nothing that was sent here."""
+"""Evidence of another controller of the same vehicle: messages that answer nothing this bridge sent."""
 
 import math
 from collections import deque
@@ -6,11 +6,11 @@ from collections import deque
 from uav_dc_ros.offboard.frames import Ned
 
 ENOUGH = 3  # pieces of evidence of one kind,
-WITHIN_S = 10.0  # in so much of the vehicle's time, and the last of them not older than that
-TARGETS_WITHIN_S = 60.0  # the same of position targets: a mission has one every ten seconds or so
-ANSWERED_S = 60.0  # a command is answered within that time, vehicle time
+WITHIN_S = 10.0  # within this time, the last of them no older than that, vehicle time
+TARGETS_WITHIN_S = 60.0  # the same for position targets, of which a mission has one every ten seconds or so
+ACK_TIMEOUT_S = 60.0  # a later acknowledgement belongs to another command, vehicle time
 SAME_M = 1.0  # two position targets that are nearer are the same
-KEPT, KEPT_HEARTBEATS = 64, 8
+MAX_SETPOINTS, MAX_HEARTBEATS = 64, 8
 
 HEARTBEATS = "heartbeats"
 ANSWERS = "answers to commands"
@@ -18,60 +18,58 @@ TARGETS = "position targets"
 
 
 class OtherControllers:
-    """Compares what was sent with what comes back. All times are the vehicle's.
+    """Compares what this bridge sent with what it receives. All times are the vehicle's.
 
-    What a router sends back is known by its number; what an earlier process of the same bridge left behind
-    comes once or twice, and is not enough.
+    A message that a router sends back is recognised by its number. What an earlier process of the same
+    bridge left behind arrives once or twice, which is not enough.
 
     Args:
-        identity: system and component of this end.
+        identity: MAVLink system and component of this bridge.
     """
 
     def __init__(self, identity: tuple[int, int]) -> None:
-        self._who = f"of system {identity[0]}, component {identity[1]}"
-        self._heartbeats: deque[int] = deque(maxlen=KEPT_HEARTBEATS)  # numbers of those that were sent
+        self._identity = f"of system {identity[0]}, component {identity[1]}"
+        self._heartbeats: deque[int] = deque(maxlen=MAX_HEARTBEATS)  # sequence numbers sent
         self._commands: dict[int, float] = {}
-        self._setpoints: deque[Ned] = deque(maxlen=KEPT)
+        self._setpoints: deque[Ned] = deque(maxlen=MAX_SETPOINTS)
         self._target: Ned | None = None  # reported last
-        self._seen: dict[str, deque[float]] = {
-            name: deque(maxlen=ENOUGH) for name in (HEARTBEATS, ANSWERS, TARGETS)
-        }
+        self._seen_s = {name: deque[float](maxlen=ENOUGH) for name in (HEARTBEATS, ANSWERS, TARGETS)}
 
     def sent_heartbeat(self, number: int) -> None:
-        """Note that a heartbeat with this number went out."""
+        """Record the sequence number of a heartbeat that was sent."""
         self._heartbeats.append(number)
 
     def sent_command(self, command: int, vehicle_s: float) -> None:
-        """Note that a command went out."""
+        """Record a command that was sent."""
         self._commands[command] = vehicle_s
 
     def sent_setpoint(self, setpoint: Ned) -> None:
-        """Note that a setpoint went out."""
+        """Record a setpoint that was sent."""
         if not self._setpoints or self._setpoints[-1] != setpoint:
             self._setpoints.append(setpoint)
 
-    def heartbeat(self, number: int, vehicle_s: float) -> None:
-        """Take in a heartbeat of this end's own identity."""
+    def on_heartbeat(self, number: int, vehicle_s: float) -> None:
+        """Check a heartbeat with this bridge's identity."""
         if self._heartbeats and number not in self._heartbeats:
-            self._seen[HEARTBEATS].append(vehicle_s)
+            self._seen_s[HEARTBEATS].append(vehicle_s)
 
-    def answer(self, command: int, vehicle_s: float) -> None:
-        """Take in an answer that is addressed to this end."""
-        if vehicle_s - self._commands.get(command, -math.inf) > ANSWERED_S:
-            self._seen[ANSWERS].append(vehicle_s)
+    def on_ack(self, command: int, vehicle_s: float) -> None:
+        """Check an acknowledgement that is addressed to this bridge."""
+        if vehicle_s - self._commands.get(command, -math.inf) > ACK_TIMEOUT_S:
+            self._seen_s[ANSWERS].append(vehicle_s)
 
-    def target(self, target: Ned | None, vehicle_s: float) -> None:
-        """Take in the position target that a vehicle in the commanded mode reports; None: it has none."""
+    def on_target(self, target: Ned | None, vehicle_s: float) -> None:
+        """Check the position target that a vehicle in the commanded mode reports; None: it has none."""
         before, self._target = self._target, target
         if before is None or target is None or math.dist(before, target) <= SAME_M:
             return
         if all(math.dist(sent, target) > SAME_M for sent in self._setpoints):
-            self._seen[TARGETS].append(vehicle_s)
+            self._seen_s[TARGETS].append(vehicle_s)
 
-    def found(self, vehicle_s: float) -> str | None:
-        """The evidence, in words; None: there is not enough."""
-        for name, seen in self._seen.items():
+    def evidence(self, vehicle_s: float) -> str | None:
+        """The evidence in words; None: there is not enough."""
+        for name, seen_s in self._seen_s.items():
             within_s = TARGETS_WITHIN_S if name == TARGETS else WITHIN_S
-            if len(seen) == ENOUGH and vehicle_s - seen[0] <= within_s:
-                return f"{name} {self._who} that this bridge did not send"
+            if len(seen_s) == ENOUGH and vehicle_s - seen_s[0] <= within_s:
+                return f"{name} {self._identity} that this bridge did not send"
         return None

@@ -1,82 +1,82 @@
-"""The autopilots on one link, and which of them is meant."""
+"""The autopilots on one link, and which of them the bridge flies."""
 
 from typing import Any
 
 from uav_dc_ros.offboard.flight_stacks import COPTERS, FLIGHT_STACKS, FlightStack
 
-SYSTEM, COMPONENT = 255, 191  # of this end: what FS_GCS_ENABLE of ArduPilot looks after; an onboard computer
+SYSTEM, COMPONENT = 255, 191  # of this bridge: the system that FS_GCS_ENABLE watches; an onboard computer
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a camera, a ground station
-PRESENT_S = 10.0  # a vehicle that was silent for so long is no longer on the link, steady clock
-LISTENED = 4  # heartbeats of a vehicle, once a second, between which every other one speaks
-LISTENED_AGAIN = 2  # of one that was flown by this mission before
+PRESENT_S = 10.0  # a vehicle that was silent for longer has left the link, steady clock
+MIN_HEARTBEATS = 4  # of the vehicle, one a second, before it counts as the only one
+MIN_HEARTBEATS_AGAIN = 2  # of a vehicle that this mission already flew
 
 
 class Systems:
-    """Finds the vehicle that is meant: the one that is named, or the only one; and never another after that.
+    """Selects the vehicle: the one that is named, or the only one; and never another one after that.
 
     Args:
-        named: its number; None: the link has one vehicle only.
-        again: was the vehicle flown by this mission before? Then nobody is waited for longer than needed.
+        named: its system number; None: the link has one vehicle only.
+        again: whether this mission already flew the vehicle; then the wait for others is shorter.
 
     Attributes:
         number: of the vehicle; None: none was found yet.
-        dialect: what kind of autopilot it has.
+        flight_stack: of the vehicle.
     """
 
     def __init__(self, named: int | None, again: bool = False) -> None:
         self.named, self.number = named, named
-        self.dialect: FlightStack | None = None
-        self._listens = LISTENED if not again else LISTENED_AGAIN if named is None else 1
+        self.flight_stack: FlightStack | None = None
+        self._min_heartbeats = MIN_HEARTBEATS
+        if again:
+            self._min_heartbeats = MIN_HEARTBEATS_AGAIN if named is None else 1
         self._heartbeats = 0  # of the vehicle
-        self._present: dict[int, tuple[float, str]] = {}  # vehicles that could be meant: when they spoke last
-        self._stranger: str | None = None  # why somebody who spoke is not meant
+        self._present: dict[int, tuple[float, str]] = {}  # vehicles on the link: last heartbeat, description
+        self._unsupported: str | None = None  # why a system with a heartbeat is not selected
 
     def __str__(self) -> str:
         """The vehicle's number and autopilot; empty until it is known."""
-        return "" if self.dialect is None else f"system {self.number}, {self.dialect.name}"
+        return "" if self.flight_stack is None else f"system {self.number}, {self.flight_stack.name}"
 
-    def meet(self, heartbeat: Any, now_s: float) -> None:
-        """Take in a heartbeat, at a steady time."""
+    def on_heartbeat(self, heartbeat: Any, now_s: float) -> None:
+        """Process a heartbeat received at a steady time."""
         if heartbeat.get_srcComponent() != AUTOPILOT or heartbeat.autopilot == NO_AUTOPILOT:
             return
-        system, dialect = heartbeat.get_srcSystem(), FLIGHT_STACKS.get(heartbeat.autopilot)
-        meant = self.number in (None, system)
-        if dialect is None or heartbeat.type not in COPTERS:
-            if meant and self.dialect is None:
-                self._stranger = _stranger(system, heartbeat)
+        system, flight_stack = heartbeat.get_srcSystem(), FLIGHT_STACKS.get(heartbeat.autopilot)
+        selects = self.flight_stack is None and self.number in (None, system)
+        if flight_stack is None or heartbeat.type not in COPTERS:
+            if selects:
+                self._unsupported = _unsupported(system, heartbeat)
             return
-        self._present[system] = now_s, f"system {system}, {dialect.name}"
-        if meant and self.dialect is None:
-            self.number, self.dialect, self._stranger = system, dialect, None
+        self._present[system] = now_s, f"system {system}, {flight_stack.name}"
+        if selects:
+            self.number, self.flight_stack, self._unsupported = system, flight_stack, None
         self._heartbeats += system == self.number
 
-    def is_meant(self, now_s: float) -> bool:
-        """Is the vehicle surely the one that is meant: it is named, or there is no other."""
+    def is_unambiguous(self, now_s: float) -> bool:
+        """Whether the vehicle is named, or the only one on the link."""
         return self.named is not None or len(self._vehicles(now_s)) <= 1
 
     def _vehicles(self, now_s: float) -> list[str]:
-        """The vehicles on the link."""
         return [text for seen_s, text in self._present.values() if now_s - seen_s <= PRESENT_S]
 
     def missing(self, now_s: float) -> str | None:
-        """Why nobody knows yet which vehicle is meant; None: it is known."""
+        """Why the vehicle is not selected yet; None: it is."""
         present = self._vehicles(now_s)
-        if self.dialect is None:
+        if self.flight_stack is None:
             others = f" (there is {'; '.join(present)})" if present else ""
             whose = "" if self.named is None else f" of system {self.named}"
-            return self._stranger or f"no heartbeat from an autopilot{whose}{others}"
-        if not self.is_meant(now_s):
+            return self._unsupported or f"no heartbeat from an autopilot{whose}{others}"
+        if not self.is_unambiguous(now_s):
             listed = "; ".join(present)
             return f"{len(present)} autopilots on this link: {listed}; expected --system N, one of them"
-        if self._heartbeats < self._listens:
+        if self._heartbeats < self._min_heartbeats:
             return f"{self}: waiting for its heartbeats, and for those of others on this link"
         return None
 
 
-def _stranger(system: int, heartbeat: Any) -> str:
-    """Why a vehicle is not one that this system can fly."""
+def _unsupported(system: int, heartbeat: Any) -> str:
     if heartbeat.autopilot in FLIGHT_STACKS:
         return f"system {system} is a vehicle of type {heartbeat.type}; expected a multicopter"
-    known = " or ".join(f"{number} ({dialect.name})" for number, dialect in FLIGHT_STACKS.items())
+    known = " or ".join(f"{number} ({stack.name})" for number, stack in FLIGHT_STACKS.items())
     return f"system {system} has an autopilot of kind {heartbeat.autopilot}; expected {known}"

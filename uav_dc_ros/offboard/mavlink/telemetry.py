@@ -1,8 +1,9 @@
-"""What is known of the vehicle, from the MAVLink messages that came. No input or output."""
+"""State of the vehicle, from the MAVLink messages that it sends. No input or output."""
 
 import math
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 from uav_dc_ros.offboard import limits
@@ -11,20 +12,18 @@ from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, sphere_sc
 from uav_dc_ros.offboard.mavlink.message_order import Discard, Sequence, VehicleClock
 from uav_dc_ros.offboard.mavlink.other_controllers import OtherControllers
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM, Systems
+from uav_dc_ros.offboard.rejections import Rejections
 from uav_dc_ros.offboard.vehicle import Limits, Mode, Telemetry
 
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 POSITION_IGNORED = 0x7  # POSITION_TARGET_TYPEMASK
-ACCEPTED, IN_PROGRESS = 0, 5  # MAV_RESULT
-WARNING = 4  # MAV_SEVERITY; what is below is worse
 CHUNK = 50  # characters of a STATUSTEXT
 NO_VOLTAGE = 65535
-ADVICE_S = 60.0  # age of a reason not to arm that may still hold; ArduPilot repeats it every 30 s
-TEXT_S = 2.0  # a reason comes within this time before or after the refusal, steady clock
-STALE_S = 3.0  # age after which a report on an estimate, an attitude or a target says nothing, steady clock
-FARTHEST_M = 1e5  # no vehicle is further from where it was switched on
+PREARM_TEXT_S = 60.0  # a reason not to arm may hold for this long; ArduPilot repeats it every 30 s
+STALE_S = 3.0  # maximum age of a report on an estimate, an attitude or a target, steady clock
+MAX_POSITION_M = 1e5  # no vehicle is further from where it was switched on
 
-# What is asked for, Hz of the vehicle's time; its dialect adds the estimate's message. Nobody flies without.
+# Rates to request, Hz of the vehicle's time; the flight stack adds its estimate's message. All are required.
 RATES_HZ = {
     "LOCAL_POSITION_NED": 20.0,
     "EXTENDED_SYS_STATE": 5.0,
@@ -32,23 +31,23 @@ RATES_HZ = {
     "SYS_STATUS": 2.0,
     "GPS_GLOBAL_ORIGIN": 1.0,
 }
-# What helps where a vehicle sends it; few, for a telemetry radio carries a kilobyte or two a second.
-HELPFUL_HZ = {"ATTITUDE": 4.0, "POSITION_TARGET_LOCAL_NED": 2.0, "HOME_POSITION": 0.5}
+# Used if the vehicle sends them; low rates, since a telemetry radio carries a kilobyte or two a second.
+OPTIONAL_RATES_HZ = {"ATTITUDE": 4.0, "POSITION_TARGET_LOCAL_NED": 2.0, "HOME_POSITION": 0.5}
 TIMED = frozenset({"LOCAL_POSITION_NED", "SYSTEM_TIME", "ATTITUDE", "POSITION_TARGET_LOCAL_NED"})
-ONCE = frozenset({"GPS_GLOBAL_ORIGIN"})  # PX4 sends it when it changes, or is asked for this one
 ESTIMATE_HZ = 5.0
-ADVICE = ("PreArm", "Preflight", "Arm:")
-BACK_S = 4.0  # a state that was left for so short a time is believed when two heartbeats report it
-SEEN = 64  # texts that are kept
+PREARM_TEXTS = ("PreArm", "Preflight", "Arm:")
+RETURNED_S = 4.0  # a state that was left for a shorter time is accepted from the second heartbeat on
+
+_enu_from = lru_cache(maxsize=64)(Geodetic.enu_from)  # costly, and the same at each tick
 
 
 def _is_on_earth(message: Any) -> bool:
     return abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7
 
 
-# Messages whose values no vehicle can have are discarded.
+# A message whose values no vehicle can have is discarded.
 IS_POSSIBLE: dict[str, Callable[[Any], bool]] = {
-    "LOCAL_POSITION_NED": lambda m: all(abs(value) <= FARTHEST_M for value in (m.x, m.y, m.z)),
+    "LOCAL_POSITION_NED": lambda m: all(abs(value) <= MAX_POSITION_M for value in (m.x, m.y, m.z)),
     "GPS_GLOBAL_ORIGIN": _is_on_earth,
     "HOME_POSITION": _is_on_earth,
     "ATTITUDE": lambda m: math.isfinite(m.roll) and math.isfinite(m.pitch),
@@ -58,211 +57,202 @@ IS_POSSIBLE: dict[str, Callable[[Any], bool]] = {
 
 
 class MavlinkTelemetry:
-    """One vehicle, as it tells of itself.
+    """State of one vehicle.
 
     Args:
-        datum: of the grid. None: the vehicle stands at `place` when its first position comes.
-        place: in the grid's ENU frame, see `datum`.
-        system: whom to listen to; None: to the only autopilot.
-        again: was the vehicle flown by this mission before?
+        datum: of the grid. None: the vehicle stands at `start` when its first position comes.
+        start: in the grid's ENU frame, see `datum`.
+        system: MAVLink system of the vehicle; None: the only autopilot on the link.
+        again: whether this mission already flew the vehicle.
 
     Attributes:
         systems: the vehicle among those on the link.
-        rivals: evidence of another controller.
+        other_controllers: evidence of another controller.
+        rejections: rejected commands, and status texts.
         parameters: of the vehicle.
-        discarded: messages of the vehicle that were ignored, by reason.
+        discarded: number of the vehicle's messages that were discarded, by reason.
         datum: of the grid, once it is known.
-        texts: what it said of itself, with the steady time, seconds.
+        frame: of the vehicle's local position, once it is known.
+        position: of the vehicle, in the grid's ENU frame.
         landed_state: MAV_LANDED_STATE.
-        heard: when a message of each name last came, steady time, seconds.
-        frame: of its local position.
+        received_s: when a message of each name was received last, steady clock, seconds.
     """
 
     def __init__(
-        self, datum: Geodetic | None, place: Enu, system: int | None = None, again: bool = False
+        self, datum: Geodetic | None, start: Enu, system: int | None = None, again: bool = False
     ) -> None:
-        self.datum, self.place = datum, place
-        self.systems, self.rivals = Systems(system, again), OtherControllers((SYSTEM, COMPONENT))
-        self.parameters = limits.ParameterReader()
+        self.datum, self.start = datum, start
+        self.systems, self.other_controllers = Systems(system, again), OtherControllers((SYSTEM, COMPONENT))
+        self.rejections = Rejections()
         self.discarded: Counter[str] = Counter()
         self._sequence, self._clock = Sequence(), VehicleClock()
         self.frame: LocalFrame | None = None
-        self.texts: deque[tuple[float, str]] = deque(maxlen=SEEN)
-        self.landed_state: int | None = None
-        self.heard: dict[str, float] = {}
+        self.received_s: dict[str, float] = {}
         self._custom_mode, self._armed = 0, False
-        self._left_s: dict[tuple[int, bool], float] = {}  # when such a state was reported no more
-        self._back_s: float | None = None  # when the last heartbeat came, if it reported such a state
-        self._flags, self._health = 0, 0
+        self._left_s: dict[tuple[int, bool], float] = {}  # when the vehicle last left a state
+        self._returned_s: float | None = None  # last heartbeat, if it reports a state left a moment ago
+        self._health = 0
         self._battery: float | None = None
         self._battery_v: float | None = None
         self._battery_fails = False
-        self._origin: Geodetic | None = None
-        self._ned: Ned | None = None
-        self._position: Enu | None = None
+        self._chunks: dict[int, str] = {}
+        self._reset()
+
+    def _reset(self) -> None:
+        """Drop what a vehicle reported before it was started anew."""
+        heartbeats = "HEARTBEAT" in self.received_s
+        self.received_s = {"HEARTBEAT": self.received_s["HEARTBEAT"]} if heartbeats else {}
+        self.position: Enu | None = None
         self._position_s: float | None = None
+        self._ned: Ned | None = None
+        self._origin: Geodetic | None = None
         self._home: Geodetic | None = None
         self._target: Ned | None = None
         self._tilt_rad: float | None = None
-        self._refusals: dict[str, tuple[float, str]] = {}  # by what was refused
-        self._chunks: dict[int, str] = {}
+        self.landed_state: int | None = None
+        self._flags = 0
+        self.parameters = limits.ParameterReader()
+        self._limits: Limits | None = None
 
     @property
     def system(self) -> int | None:
-        """The vehicle's number; None: it has not spoken yet, and was not named."""
+        """The vehicle's system number; None: not known yet."""
         return self.systems.number
 
     @property
-    def dialect(self) -> FlightStack | None:
-        """What kind of autopilot it has; None: it has not spoken yet."""
-        return self.systems.dialect
+    def flight_stack(self) -> FlightStack | None:
+        """The vehicle's autopilot; None: not known yet."""
+        return self.systems.flight_stack
 
     @property
     def vehicle_s(self) -> float:
-        """Its own time, seconds; goes on where it starts anew."""
+        """The vehicle's own time, seconds; monotonic across its restarts."""
         return self._clock.vehicle_s
 
-    def doubts_mode(self, now_s: float) -> bool:
-        """Does the last heartbeat report a mode that was left a moment ago: an old message, or a pilot."""
-        return self._back_s is not None and now_s - self._back_s < STALE_S
+    def is_mode_uncertain(self, now_s: float) -> bool:
+        """Whether the last heartbeat reports a state left a moment ago: a late message, or a pilot."""
+        return self._returned_s is not None and now_s - self._returned_s < STALE_S
 
-    def hear(self, message: Any, now_s: float) -> bool:
-        """Take in a message of pymavlink's, at a steady time; was it the vehicle's, and news."""
+    def update(self, message: Any, now_s: float) -> bool:
+        """Process a pymavlink message; returns whether it is new, and the vehicle's."""
         name, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
-        known = self.dialect is not None and source == (self.system, AUTOPILOT)
+        known = self.flight_stack is not None and source == (self.system, AUTOPILOT)
         if name == "HEARTBEAT" and source == (SYSTEM, COMPONENT):
-            self.rivals.heartbeat(message.get_seq(), self.vehicle_s)
+            self.other_controllers.on_heartbeat(message.get_seq(), self.vehicle_s)
         if name == "HEARTBEAT" and not known:
-            self.systems.meet(message, now_s)
-        if source != (self.system, AUTOPILOT) or self.dialect is None:
+            self.systems.on_heartbeat(message, now_s)
+        if source != (self.system, AUTOPILOT) or self.flight_stack is None:
             return False
-        if (why := self._discards(name, message, now_s)) is not None:
+        if (why := self._discard_reason(name, message, now_s)) is not None:
             self.discarded[why] += 1
             return False
         if name == "HEARTBEAT" and known:
-            self.systems.meet(message, now_s)
-        self.heard[name] = now_s
-        if (take := getattr(self, f"_on_{name.lower()}", None)) is not None:
-            take(message, now_s)
+            self.systems.on_heartbeat(message, now_s)
+        self.received_s[name] = now_s
+        if (handler := getattr(self, f"_on_{name.lower()}", None)) is not None:
+            handler(message, now_s)
         return True
 
-    def _discards(self, name: str, message: Any, now_s: float) -> Discard | None:
-        """Why a message of the vehicle is ignored; None: it is not."""
-        if (why := self._sequence.take(name, message.get_seq(), message.get_crc(), now_s)) is not None:
+    def _discard_reason(self, name: str, message: Any, now_s: float) -> Discard | None:
+        if (why := self._sequence.check(name, message.get_seq(), message.get_crc(), now_s)) is not None:
             return why
-        if not IS_POSSIBLE.get(name, lambda _: True)(message):
+        if name in IS_POSSIBLE and not IS_POSSIBLE[name](message):
             return Discard.IMPOSSIBLE
         if name not in TIMED:
             return None
         restarts = self._clock.restarts
-        why = self._clock.take(name, message.time_boot_ms, now_s)
+        why = self._clock.check(name, message.time_boot_ms, now_s)
         if self._clock.restarts != restarts:
-            self._forget()
+            self._reset()
         return why
 
-    def refused(self, what: str, result: str, now_s: float) -> None:
-        """Keep that something was refused."""
-        self._refusals[what] = now_s, result
-
-    def granted(self, what: str) -> None:
-        """Forget that something was refused."""
-        self._refusals.pop(what, None)
-
-    def telemetry(self, now_s: float) -> Telemetry:
-        """What is known now."""
-        dialect = self.dialect
-        estimate_s = self.heard.get(dialect.estimate_message) if dialect else None
-        sure = dialect is not None and self._is_fresh(dialect.estimate_message, now_s)
+    def snapshot(self, now_s: float) -> Telemetry:
+        """The vehicle's state at a steady time."""
+        stack, received_s = self.flight_stack, self.received_s
         target = self._target if self._is_fresh("POSITION_TARGET_LOCAL_NED", now_s) else None
         return Telemetry(
-            heartbeat_s=self.heard.get("HEARTBEAT"),
-            mode=dialect.mode(self._custom_mode) if dialect else Mode.OTHER,
-            mode_name=dialect.mode_name(self._custom_mode) if dialect else "",
+            heartbeat_s=received_s.get("HEARTBEAT"),
+            mode=stack.mode(self._custom_mode) if stack else Mode.OTHER,
+            mode_name=stack.mode_name(self._custom_mode) if stack else "",
             armed=self._armed,
-            on_ground=None if not self.landed_state else self.landed_state == ON_GROUND,
-            position=self._position,
+            on_ground=self.landed_state == ON_GROUND if self.landed_state else None,
+            position=self.position,
             position_s=self._position_s,
-            estimate_ok=bool(
-                sure and dialect and dialect.estimate_ok(self._flags, self._health, self._armed)
-            ),
-            estimate_s=estimate_s,
+            estimate_ok=bool(stack and self._is_fresh(stack.estimate_message, now_s) and self._flags_ok()),
+            estimate_s=received_s.get(stack.estimate_message) if stack else None,
             battery=self._battery,
             battery_v=self._battery_v,
             battery_fails=self._battery_fails,
             vehicle_s=self.vehicle_s,
             missing=self._missing(now_s),
-            refusal=self._refusal(),
-            status_text="; ".join(self._said(now_s - TEXT_S, now_s)),
-            home=self._home.enu_from(self.datum) if self._home and self.datum else None,
+            refusal=self.rejections.latest(),
+            status_text=self.rejections.recent_texts(now_s),
+            home=_enu_from(self._home, self.datum) if self._home and self.datum else None,
             target=self.frame.from_autopilot(target) if self.frame and target else None,
-            target_s=self.heard.get("POSITION_TARGET_LOCAL_NED"),
+            target_s=received_s.get("POSITION_TARGET_LOCAL_NED"),
             tilt_rad=self._tilt_rad if self._is_fresh("ATTITUDE", now_s) else None,
-            limits=self._limits(),
-            other_controller=self.rivals.found(self.vehicle_s),
+            limits=self._limits,
+            other_controller=self.other_controllers.evidence(self.vehicle_s),
             system=str(self.systems),
             system_id=self.system,
-            is_selected=self.systems.is_meant(now_s),
+            is_selected=self.systems.is_unambiguous(now_s),
             discarded=dict(self.discarded),
         )
 
-    def wanted(self) -> Mapping[str, float]:
-        """The messages that the vehicle shall send, Hz."""
-        return {**self._needed(), **HELPFUL_HZ} if self.dialect else {}
+    def rates_hz(self) -> dict[str, float]:
+        """The messages that the vehicle shall send, and their rates, Hz."""
+        return {**self._required_rates_hz(), **OPTIONAL_RATES_HZ} if self.flight_stack else {}
 
-    def unanswered(self, now_s: float) -> list[str]:
-        """Parameters to ask for now, at a steady time; they count as asked for."""
-        return self.parameters.due(self.dialect.parameters, now_s) if self.dialect else []
+    def parameters_to_request(self, now_s: float) -> list[str]:
+        """Parameters to request at a steady time; they count as requested."""
+        return self.parameters.due(self.flight_stack.parameters, now_s) if self.flight_stack else []
 
-    def _needed(self) -> dict[str, float]:
-        return {**RATES_HZ, self.dialect.estimate_message: ESTIMATE_HZ} if self.dialect else {}
+    def _required_rates_hz(self) -> dict[str, float]:
+        return {**RATES_HZ, self.flight_stack.estimate_message: ESTIMATE_HZ} if self.flight_stack else {}
 
     def _is_fresh(self, name: str, now_s: float) -> bool:
-        return now_s - self.heard.get(name, -math.inf) <= STALE_S
-
-    def _limits(self) -> Limits | None:
-        return (
-            self.dialect.limits(self.parameters.values) if self.dialect and self.parameters.values else None
-        )
+        return now_s - self.received_s.get(name, -math.inf) <= STALE_S
 
     def _missing(self, now_s: float) -> str | None:
-        if (missing := self.systems.missing(now_s)) is not None or self.dialect is None:
+        if (missing := self.systems.missing(now_s)) is not None or self.flight_stack is None:
             return missing
-        lacking = [name for name in self._needed() if name not in self.heard]
+        lacking = [name for name in self._required_rates_hz() if name not in self.received_s]
         if lacking:
             return f"the autopilot has not sent {', '.join(lacking)} yet"
-        if not self._armed and self.parameters.are_pending(self.dialect.parameters, now_s):
+        if not self._armed and self.parameters.are_pending(self.flight_stack.parameters, now_s):
             return "the autopilot has not answered for its parameters yet"
         if not self._armed and not self._flags_ok():
-            told = [text for text in self._said(now_s - ADVICE_S, now_s) if text.startswith(ADVICE)]
-            return f"the autopilot is not ready to arm: {told[-1] if told else 'no position estimate yet'}"
-        if self._position is None and self.landed_state == ON_GROUND:
+            texts = self.rejections.texts(now_s - PREARM_TEXT_S, now_s)
+            reasons = [text for text in texts if text.startswith(PREARM_TEXTS)]
+            return f"the autopilot is not ready to arm: {(reasons or ['no position estimate yet'])[-1]}"
+        if self.position is None and self.landed_state == ON_GROUND:
             return "the autopilot has no estimate of its position yet"
-        if self._position is None:
+        if self.position is None:
             return "the grid has no datum, and the vehicle does not stand on the ground; expected a datum"
         return None
 
-    # What it says.
+    # Handlers, by message name.
 
     def _on_heartbeat(self, message: Any, now_s: float) -> None:
         state = message.custom_mode, bool(message.base_mode & ARMED)
         if state != (self._custom_mode, self._armed):
-            # A heartbeat that was late for seconds, and whose number is news again, tells of a state before.
-            is_back = state in self._left_s and now_s - self._left_s[state] < BACK_S
-            if is_back and self._back_s is None:
-                self._back_s = now_s
+            # A heartbeat that is seconds late, and whose number is accepted again, reports an earlier state.
+            returned = state in self._left_s and now_s - self._left_s[state] < RETURNED_S
+            if returned and self._returned_s is None:
+                self._returned_s = now_s
                 self.discarded[Discard.LATE] += 1
                 return
             self._left_s[self._custom_mode, self._armed] = now_s
-        self._back_s = None
+        self._returned_s = None
         self._custom_mode, self._armed = state
         if self._armed:
-            self.granted("arming")
+            self.rejections.accept("arming")
 
     def _on_gps_global_origin(self, message: Any, now_s: float) -> None:
         self._origin = _geodetic(message)
         if self.datum is not None:
             self.frame = self._frame_at(self._origin.enu_from(self.datum))
-        self._place()
+        self._locate()
 
     def _on_home_position(self, message: Any, now_s: float) -> None:
         self._home = _geodetic(message)
@@ -270,22 +260,24 @@ class MavlinkTelemetry:
     def _on_local_position_ned(self, message: Any, now_s: float) -> None:
         self._ned = Ned(message.x, message.y, message.z)
         self._position_s = now_s - self._clock.lag_s(message.time_boot_ms)
-        self._place()
+        self._locate()
 
     def _on_position_target_local_ned(self, message: Any, now_s: float) -> None:
         target = Ned(message.x, message.y, message.z)
         has_one = not message.type_mask & POSITION_IGNORED and all(map(math.isfinite, target))
         self._target = target if has_one else None
-        if self.dialect is not None and self.dialect.mode(self._custom_mode) is Mode.COMMANDED:
-            self.rivals.target(self._target, self.vehicle_s)
+        if self.flight_stack is not None and self.flight_stack.mode(self._custom_mode) is Mode.COMMANDED:
+            self.other_controllers.on_target(self._target, self.vehicle_s)
 
     def _on_attitude(self, message: Any, now_s: float) -> None:
         self._tilt_rad = math.acos(math.cos(message.roll) * math.cos(message.pitch))
 
     def _on_param_value(self, message: Any, now_s: float) -> None:
-        if self.dialect is not None:
-            value = limits.decode(message, bytewise=self.dialect.parameters_are_bytes)
+        if (stack := self.flight_stack) is not None:
+            value = limits.decode(message, bytewise=stack.parameters_are_bytes)
             self.parameters.receive(message.param_id, value)
+            values = self.parameters.values
+            self._limits = stack.limits(values) if values else None
 
     def _on_extended_sys_state(self, message: Any, now_s: float) -> None:
         self.landed_state = message.landed_state
@@ -295,70 +287,45 @@ class MavlinkTelemetry:
         self._battery = message.battery_remaining / 100 if message.battery_remaining >= 0 else None
         volts = message.voltage_battery / 1e3
         self._battery_v = volts if 0 < message.voltage_battery < NO_VOLTAGE else None
-        watched = message.onboard_control_sensors_enabled & BATTERY
-        self._battery_fails = bool(watched and not self._health & BATTERY)
+        self._battery_fails = bool(message.onboard_control_sensors_enabled & BATTERY & ~self._health)
 
     def _on_ekf_status_report(self, message: Any, now_s: float) -> None:
         self._flags = message.flags
 
-    def _on_estimator_status(self, message: Any, now_s: float) -> None:
-        self._flags = message.flags
+    _on_estimator_status = _on_ekf_status_report
 
     def _on_statustext(self, message: Any, now_s: float) -> None:
         text = self._chunks.pop(message.id, "") + message.text
         if message.id and len(message.text) == CHUNK:
             self._chunks[message.id] = text
-            return
-        if message.severity <= WARNING:
-            self.texts.append((now_s, text.strip()))
+        else:
+            self.rejections.on_status_text(message.severity, text, now_s)
 
-    # What follows from it.
-
-    def _place(self) -> None:
-        """Bring the local position into the grid's frame."""
+    def _locate(self) -> None:
+        """Convert the local position into the grid's frame, which the first one on the ground may define."""
         if self._ned is None or self._origin is None:
             return
         if self.datum is None:
             if self.landed_state != ON_GROUND or not self._flags_ok():
                 return
-            # Here is `place`, as far as the autopilot knows: the datum lies as far away as that says.
             here = self._frame_at(Enu(0.0, 0.0, 0.0)).from_autopilot(self._ned)
-            self.datum = self._origin.at(here.minus(self.place))
+            self.datum = self._origin.at(here.minus(self.start))
             self.frame = self._frame_at(self._origin.enu_from(self.datum))
         if self.frame is not None:
-            self._position = self.frame.from_autopilot(self._ned)
+            self.position = self.frame.from_autopilot(self._ned)
 
     def _flags_ok(self) -> bool:
-        return self.dialect is not None and self.dialect.estimate_ok(self._flags, self._health, self._armed)
+        stack = self.flight_stack
+        return stack is not None and stack.estimate_ok(self._flags, self._health, self._armed)
 
     def _frame_at(self, origin: Enu) -> LocalFrame:
-        """The autopilot's local frame; it has spoken, and told its origin."""
-        assert self.dialect is not None
+        assert self.flight_stack is not None
         assert self._origin is not None
-        return LocalFrame(origin=origin, scale=sphere_scale(self._origin, self.dialect.earth_radius_m))
-
-    def _forget(self) -> None:
-        """It was started anew: what it told before says nothing."""
-        self.heard = {"HEARTBEAT": self.heard["HEARTBEAT"]} if "HEARTBEAT" in self.heard else {}
-        self._position, self._ned, self._origin, self._position_s = None, None, None, None
-        self._home, self._target, self._tilt_rad = None, None, None
-        self.landed_state, self._flags = None, 0
-        self.parameters = limits.ParameterReader()
-
-    def _said(self, from_s: float, to_s: float) -> list[str]:
-        """What it warned of between two steady times, each of it once."""
-        return list(dict.fromkeys(text for text_s, text in self.texts if from_s <= text_s <= to_s))
-
-    def _refusal(self) -> str | None:
-        if not self._refusals:
-            return None
-        what, (at_s, result) = max(self._refusals.items(), key=lambda refusal: refusal[1][0])
-        said = self._said(at_s - TEXT_S, at_s + TEXT_S)
-        return f"{what} refused: {'; '.join(said) or result}"
+        return LocalFrame(origin=origin, scale=sphere_scale(self._origin, self.flight_stack.earth_radius_m))
 
 
 def _geodetic(message: Any) -> Geodetic:
-    """The place of a message, which has degrees times 1e7 and millimetres."""
+    """The position of a message that has degrees times 1e7, and millimetres."""
     return Geodetic(
         latitude_deg=message.latitude / 1e7,
         longitude_deg=message.longitude / 1e7,

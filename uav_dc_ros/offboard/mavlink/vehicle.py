@@ -1,7 +1,7 @@
-"""MAVLink with an autopilot: a link, and a thread that reads and writes, as `session` says.
+"""A vehicle on MAVLink: a connection, and a thread that reads and writes.
 
-The thread runs before all others where the system allows that, so that the stream keeps its pace. (Who holds
-Python's lock holds it up: the rest of the process should run when it is due, too.)
+The thread has real-time priority where the system allows it, so that setpoints keep their rate. (A holder of
+Python's global lock delays it: the rest of the process should have that priority, too.)
 """
 
 import contextlib
@@ -22,14 +22,14 @@ from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.realtime import use_realtime_priority
 from uav_dc_ros.offboard.vehicle import Command, Telemetry
 
-OPEN_AGAIN_S = 0.5
-SILENCE_S = 10.0  # after which a link that says nothing is opened anew
+RECONNECT_S = 0.5
+SILENCE_S = 10.0  # after which a silent connection is opened anew
 
 ORIGIN = Enu(0.0, 0.0, 0.0)
 
 
 def load_codec() -> Any:
-    """pymavlink's messages of ArduPilot's dialect, which has all of the common ones.
+    """pymavlink's messages of ArduPilot's dialect, which includes the common ones.
 
     Raises:
         VehicleError: pymavlink is not installed.
@@ -43,17 +43,17 @@ def load_codec() -> Any:
 
 
 class MavlinkVehicle:
-    """One vehicle on one link, from `with Mavlink(...) as vehicle` to the end of the block.
+    """One vehicle on one link, see `Vehicle`; usable as a context manager.
 
     Args:
         address: such as `tcp:127.0.0.1:5760`.
-        datum: of the grid. None: the vehicle stands at `place` when its first position comes.
-        place: in the grid's ENU frame, see `datum`.
-        grid_origin: of the same transport before it was started again: takes the place of a datum.
-        system: whom to talk to; None: to the only autopilot on the link.
+        datum: of the grid. None: the vehicle stands at `start` when its first position comes.
+        start: in the grid's ENU frame, see `datum`.
+        grid_origin: `grid_origin` of an earlier process in the same flight; replaces `datum`.
+        system: MAVLink system of the vehicle; None: the only autopilot on the link.
 
     Raises:
-        VehicleError: the address is none, or a package is missing.
+        VehicleError: the address is invalid, or a package is missing.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class MavlinkVehicle:
         address: str,
         *,
         datum: Geodetic | None = None,
-        place: Enu = ORIGIN,
+        start: Enu = ORIGIN,
         grid_origin: str = "",
         system: int | None = None,
     ) -> None:
@@ -71,12 +71,12 @@ class MavlinkVehicle:
         codec = load_codec()
         if self.address.kind == "serial":
             load_serial(self.address)
-        self._hearing = MavlinkTelemetry(datum, place, system, again=bool(grid_origin))
-        self._session = Session(codec, self._hearing, self._write)
+        self._telemetry = MavlinkTelemetry(datum, start, system, again=bool(grid_origin))
+        self._session = Session(codec, self._telemetry, self._write)
         self._lock = threading.Lock()  # of both
-        self._down: str | None = f"{self.address} is not open yet"
-        self._failed: VehicleError | None = None
-        self._link: Connection | None = None
+        self._down: str | None = f"{self.address} is not open yet"  # why there is no connection
+        self._failure: VehicleError | None = None
+        self._connection: Connection | None = None
         self._wake_out, self._wake_in = os.pipe()
         os.set_blocking(self._wake_in, False)
         os.set_blocking(self._wake_out, False)
@@ -84,21 +84,21 @@ class MavlinkVehicle:
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
 
     def __enter__(self) -> Self:
-        """Begin to listen."""
+        """Open the vehicle."""
         self.open()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """End the stream, and the link."""
+        """Close the vehicle."""
         self.close()
 
     def open(self) -> None:
-        """Begin to listen, and to send heartbeats: who opens it is alive."""
-        self._session.live(time.monotonic())
+        """Start to receive, and to send heartbeats."""
+        self._session.keep_alive(time.monotonic())
         self._thread.start()
 
     def close(self) -> None:
-        """End the stream, and the link; more than once is as good as once."""
+        """End the stream, and close the connection; idempotent."""
         if self._closed:
             return
         self._closed = self._ended = True
@@ -110,44 +110,44 @@ class MavlinkVehicle:
 
     @property
     def grid_origin(self) -> str:
-        """The grid's datum, as `Geodetic.parse` reads it; empty until it is known."""
+        """The grid's datum as text; empty until it is known."""
         return str(self.datum or "")
 
     @property
     def datum(self) -> Geodetic | None:
-        """Where on the Earth the grid's corner lies; None: not known."""
+        """Position of the grid's corner on the Earth; None: not known."""
         with self._lock:
-            return self._hearing.datum
+            return self._telemetry.datum
 
     @property
     def kind(self) -> str:
-        """Name of the autopilot; empty until it has spoken."""
+        """Name of the autopilot; empty until it is known."""
         with self._lock:
-            return self._hearing.dialect.name if self._hearing.dialect else ""
+            return self._telemetry.flight_stack.name if self._telemetry.flight_stack else ""
 
     def telemetry(self) -> Telemetry:
-        """What is known of the vehicle now, times as of `time.monotonic`.
+        """The vehicle's state now, times as of `time.monotonic`.
 
         Raises:
-            VehicleError: this machine cannot open the link at all.
+            VehicleError: this machine cannot open the connection at all.
         """
-        if self._failed is not None:
-            raise self._failed
+        if self._failure is not None:
+            raise self._failure
         with self._lock:
-            known = self._hearing.telemetry(time.monotonic())
-            if self._down is not None and known.missing is not None:
-                known = dataclasses.replace(known, missing=self._down)
-            return known
+            telemetry = self._telemetry.snapshot(time.monotonic())
+            if self._down is not None and telemetry.missing is not None:
+                telemetry = dataclasses.replace(telemetry, missing=self._down)
+            return telemetry
 
     def set_setpoint(self, setpoint: Enu | None) -> None:
-        """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at least at 2 Hz."""
+        """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""
         with self._lock:
-            news = self._session.set_setpoint(setpoint, time.monotonic())
-        if news:
+            due = self._session.set_setpoint(setpoint, time.monotonic())
+        if due:
             self._wake()
 
     def send_command(self, command: Command) -> None:
-        """Pass a command on, once; whether it was fulfilled, `telemetry` tells."""
+        """Send a command once; `telemetry` reports its effect."""
         with self._lock:
             self._session.queue_command(command)
         self._wake()
@@ -160,56 +160,56 @@ class MavlinkVehicle:
 
     def _run(self) -> None:
         use_realtime_priority()
-        opened_s = heard_s = -math.inf
+        opened_s = received_s = -math.inf
         while not self._ended:
             now_s = time.monotonic()
-            if self._link is None:
-                if now_s - opened_s >= OPEN_AGAIN_S:
+            if self._connection is None:
+                if now_s - opened_s >= RECONNECT_S:
                     opened_s = now_s
-                    self._open()
-                    heard_s = now_s = time.monotonic()
-                if self._link is None:
-                    self._pause(OPEN_AGAIN_S)
+                    self._connect()
+                    received_s = now_s = time.monotonic()
+                if self._connection is None:
+                    self._wait(RECONNECT_S)
                     continue
             try:
-                self._pause(max(0.0, self._session.stream_s - now_s), self._link)
-                data = self._link.read()
+                self._wait(max(0.0, self._session.next_setpoint_s - now_s), self._connection)
+                data = self._connection.read()
                 now_s = time.monotonic()
-                heard_s = now_s if data else heard_s
-                if now_s - heard_s > SILENCE_S:
-                    raise ConnectionLost(f"{self.address} says nothing for {SILENCE_S:g} s")
+                received_s = now_s if data else received_s
+                if now_s - received_s > SILENCE_S:
+                    raise ConnectionLost(f"{self.address}: nothing received for {SILENCE_S:g} s")
                 with self._lock:
                     if self._session.receive(data, now_s):
-                        self._link.answer_here()
+                        self._connection.reply_to_sender()
                     self._session.send(now_s)
             except ConnectionLost as error:
-                self._drop(str(error))
-        self._drop("closed")
+                self._disconnect(str(error))
+        self._disconnect("closed")
 
     def _write(self, data: bytes) -> bool:
-        return self._link is not None and self._link.write(data)
+        return self._connection is not None and self._connection.write(data)
 
-    def _pause(self, seconds: float, link: Connection | None = None) -> None:
-        """Wait for something to do, or a time."""
-        files: list[Any] = [self._wake_out] if link is None else [self._wake_out, link]
+    def _wait(self, seconds: float, connection: Connection | None = None) -> None:
+        """Wait for data, a wake-up, or a time."""
+        files: list[Any] = [self._wake_out] if connection is None else [self._wake_out, connection]
         ready, _, _ = select.select(files, [], [], seconds)
         if self._wake_out in ready:
             os.read(self._wake_out, 4096)
 
-    def _open(self) -> None:
+    def _connect(self) -> None:
         try:
-            link = self.address.open()
+            connection = self.address.open()
         except ConnectionLost as error:
-            self._drop(str(error))
+            self._disconnect(str(error))
         except VehicleError as error:
-            self._failed, self._ended = error, True
+            self._failure, self._ended = error, True
         else:
             with self._lock:
-                self._link, self._down = link, None
-                self._session.begin(time.monotonic())
+                self._connection, self._down = connection, None
+                self._session.on_connected(time.monotonic())
 
-    def _drop(self, why: str) -> None:
-        if self._link is not None:
-            self._link.close()
+    def _disconnect(self, why: str) -> None:
+        if self._connection is not None:
+            self._connection.close()
         with self._lock:
-            self._link, self._down = None, why
+            self._connection, self._down = None, why

@@ -1,1 +1,1 @@
-"""What MAVROS reports of its vehicle."""
+"""State of a vehicle behind MAVROS."""

@@ -1,8 +1,8 @@
-"""What MAVROS tells of its vehicle in the standard `/diagnostics`, once a second. No input or output, no ROS.
+"""State of the vehicle in MAVROS's `/diagnostics`, published once a second. No input or output, no ROS.
 
-Its task `Heartbeat` counts heartbeats, and names the kinds of autopilot and vehicle, the mode, and MAV_STATE;
-its task `System` has the health of sensors and estimates. (MAVROS's plugin sys_status, HeartbeatStatus and
-SystemStatusDiag.) Each status bears the node's name and, as its hardware, the link.
+The task `Heartbeat` counts heartbeats, and names autopilot, vehicle, mode and MAV_STATE. The task `System`
+has the health of sensors and estimates. (MAVROS's plugin sys_status, HeartbeatStatus and SystemStatusDiag.)
+Each status has the node's name, and the link as its hardware.
 """
 
 from collections.abc import Mapping
@@ -10,12 +10,10 @@ from collections.abc import Mapping
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4, FlightStack
 
 HEARTBEAT, SYSTEM = "Heartbeat", "System"  # tasks
-BEATS, KIND, VEHICLE, MODE, STATE = (
-    *("Heartbeats since startup", "Autopilot type", "Vehicle type", "Mode"),
-    "System status",
-)
+COUNT, AUTOPILOT, VEHICLE = "Heartbeats since startup", "Autopilot type", "Vehicle type"
+MODE, STATE = "Mode", "System status"
 
-# As MAVROS writes MAV_AUTOPILOT, MAV_TYPE and MAV_STATE.
+# MAVROS's texts of MAV_AUTOPILOT, MAV_TYPE and MAV_STATE.
 AUTOPILOTS = {"ArduPilot": ARDUCOPTER, "PX4 Autopilot": PX4}
 COPTERS = {
     *("Quadrotor", "Coaxial helicopter", "Normal helicopter with tail rotor", "Hexarotor", "Octorotor"),
@@ -24,87 +22,86 @@ COPTERS = {
 GROUNDED = {"Uninit", "Boot", "Calibrating", "Standby"}
 ACTIVE = "Active"
 
-OTHERS_S = 5.0  # how long another MAVROS is remembered
-LISTENS = 3  # heartbeats before the vehicle is believed to be the only one
+OTHERS_S = 5.0  # time for which another MAVROS is remembered
+MIN_HEARTBEATS = 3  # before the vehicle counts as the only one
 
 
 class Diagnostics:
-    """The first MAVROS that tells of heartbeats. Times are steady, seconds.
+    """State of the first MAVROS that reports heartbeats. Times are of the steady clock, seconds.
 
     Attributes:
-        dialect: what kind of autopilot it has.
-        mode_name: what the autopilot calls its mode.
-        armed: is it, as far as MAV_STATE says: PX4 is Active when it is armed, ArduPilot when it flies. In a
-            failsafe MAV_STATE does not say, and things stay as they were; None: nothing was ever said.
-        heartbeat_s: when the last heartbeat was told of.
-        enabled, health: of SYS_STATUS; None before one came.
+        flight_stack: of the vehicle.
+        mode_name: the autopilot's name of its mode.
+        armed: as far as MAV_STATE shows: PX4 is Active when armed, ArduPilot when flying. A failsafe state
+            leaves it unchanged; None: not known.
+        heartbeat_s: when a heartbeat was reported last.
+        enabled, health: sensor bits of SYS_STATUS; None before one came.
     """
 
     def __init__(self) -> None:
-        self.dialect: FlightStack | None = None
+        self.flight_stack: FlightStack | None = None
         self.mode_name = ""
         self.armed: bool | None = None
         self.heartbeat_s: float | None = None
         self.enabled: int | None = None
         self.health: int | None = None
-        self._source: tuple[str, str] | None = None  # whom it listens to: node and link
-        self._sources: dict[tuple[str, str], float] = {}  # who told of heartbeats, and when
-        self._beats, self._listened = 0, 0
-        self._stranger: str | None = None
+        self._source: tuple[str, str] | None = None  # node and link of the MAVROS in use
+        self._sources: dict[tuple[str, str], float] = {}  # all that report heartbeats, and when they did
+        self._count, self._in_a_row = 0, 0
+        self._unsupported: str | None = None
 
     @property
     def source(self) -> str:
-        """Whom it listens to: MAVROS's node and link; empty: nobody yet."""
+        """Node and link of the MAVROS in use; empty: none yet."""
         return "{} ({})".format(*self._source) if self._source else ""
 
     def on_status(self, name: str, link: str, values: Mapping[str, str], now_s: float) -> None:
-        """A status of anybody's diagnostics: its name, its hardware, and its values."""
+        """Process a status of any node: its name, hardware and values."""
         node, _, task = name.rpartition(": ")
         source = node, link
-        if task == HEARTBEAT and {BEATS, KIND, VEHICLE, MODE, STATE} <= values.keys():
+        if task == HEARTBEAT and {COUNT, AUTOPILOT, VEHICLE, MODE, STATE} <= values.keys():
             self._sources[source] = now_s
             self._source = self._source or source
             if source == self._source:
                 self._on_heartbeat(values, now_s)
-        elif task == SYSTEM and source == self._source and number(values.get("Sensor present", "")):
-            self.enabled = number(values.get("Sensor enabled", ""))
-            self.health = number(values.get("Sensor health", ""))
+        elif task == SYSTEM and source == self._source and parse_int(values.get("Sensor present", "")):
+            self.enabled = parse_int(values.get("Sensor enabled", ""))
+            self.health = parse_int(values.get("Sensor health", ""))
 
     def _on_heartbeat(self, values: Mapping[str, str], now_s: float) -> None:
-        beats = number(values[BEATS])
-        if beats in (0, self._beats):
-            return  # none since
-        # Counting again: MAVROS has started anew, or there are two that cannot be told apart.
-        self._listened = self._listened + 1 if beats > self._beats else 0
-        self._beats, self.heartbeat_s = beats, now_s
-        self.dialect, self.mode_name = AUTOPILOTS.get(values[KIND]), values[MODE]
+        count = parse_int(values[COUNT])
+        if count in (0, self._count):
+            return  # no new heartbeat
+        # A lower count: MAVROS restarted, or two nodes have the same name and link.
+        self._in_a_row = self._in_a_row + 1 if count > self._count else 0
+        self._count, self.heartbeat_s = count, now_s
+        self.flight_stack, self.mode_name = AUTOPILOTS.get(values[AUTOPILOT]), values[MODE]
         if values[STATE] in GROUNDED:
             self.armed = False
         elif values[STATE] == ACTIVE:
             self.armed = True
-        self._stranger = None
-        if self.dialect is None:
-            self._stranger = (
-                f"the autopilot is {values[KIND]!r}; expected {' or '.join(map(repr, AUTOPILOTS))}"
-            )
+        self._unsupported = None
+        if self.flight_stack is None:
+            expected = " or ".join(map(repr, AUTOPILOTS))
+            self._unsupported = f"the autopilot is {values[AUTOPILOT]!r}; expected {expected}"
         elif values[VEHICLE] not in COPTERS:
-            self._stranger = f"the vehicle is {values[VEHICLE]!r}; expected a multicopter"
+            self._unsupported = f"the vehicle is {values[VEHICLE]!r}; expected a multicopter"
 
     def problem(self, now_s: float) -> str | None:
-        """Why this is nobody to fly; None: it may be."""
-        heard = [
+        """Why the vehicle cannot be flown; None: it can."""
+        present = [
             f"{node} ({link})" for (node, link), at_s in self._sources.items() if now_s - at_s <= OTHERS_S
         ]
-        if len(heard) > 1:
-            return f"/diagnostics tells of {' and '.join(sorted(heard))}; expected one MAVROS"
+        if len(present) > 1:
+            return f"/diagnostics has {' and '.join(sorted(present))}; expected one MAVROS"
         if self._source is not None and self.heartbeat_s is None:
-            return "MAVROS has not heard an autopilot yet"
-        if self._source is not None and self._stranger is None and self._listened < LISTENS:
-            return "listens for other vehicles on /diagnostics"
-        return self._stranger
+            return "MAVROS has received no heartbeat of an autopilot yet"
+        if self._source is not None and self._unsupported is None and self._in_a_row < MIN_HEARTBEATS:
+            return "waiting for other vehicles on /diagnostics"
+        return self._unsupported
 
 
-def number(text: str) -> int:
+def parse_int(text: str) -> int:
     """A whole number, decimal or 0x...; 0 for anything else."""
     try:
         return int(text, 0)

@@ -1,1 +1,1 @@
-"""What PX4 reports on its own topics."""
+"""State of a vehicle on PX4's own topics."""
