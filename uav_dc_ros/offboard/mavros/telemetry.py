@@ -141,9 +141,8 @@ class MavrosTelemetry:
             return Mode.OTHER
         if (custom := CUSTOM_MODE.fullmatch(mode_name)) is not None:
             return stack.mode(int(custom[1]))
-        return stack.mode(
-            next((number for number, name in stack.mode_names.items() if name == mode_name), -1)
-        )
+        numbers = (number for number, name in stack.mode_names.items() if name == mode_name)
+        return stack.mode(next(numbers, -1))
 
     @property
     def armed(self) -> bool | None:
@@ -239,7 +238,7 @@ class MavrosTelemetry:
         if (problem := diagnostics.problem(now_s)) is not None:
             return problem
         if self.armed is None:
-            return "the autopilot reports a failsafe, not whether it is armed; expected it to be clear of it first"
+            return "the autopilot reports a failsafe, not whether it is armed; expected it to end that first"
         if not self.armed and not self._estimate_ok(now_s):
             return "the autopilot is not ready to arm, or has no position estimate yet"
         if self.origin is not None:
