@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core.batch import BatchWorld
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario, from_values
+from uav_dc_ros.core.world import BatchWorld
 
 # Users, and worlds side by side: enough to drown the cost of a call, few enough to stay near the cache.
 SIZES = ((10, 4096), (50, 1024), (100, 1024), (1000, 64), (10_000, 8))

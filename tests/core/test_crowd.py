@@ -5,7 +5,7 @@ import numpy as np
 
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.core.users import WalkingUsers
+from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.env.registration import ENV_ID
 
 
@@ -17,8 +17,8 @@ def test_they_walk_as_in_the_environment() -> None:
     assert np.array_equal(crowd.positions_m, info["users_m"])
     for step in range(1, 6):
         if step % 2:
-            ahead_m = crowd.ahead_m()
-            assert crowd.ahead_m() is ahead_m
+            ahead_m = crowd.next_m()
+            assert crowd.next_m() is ahead_m
         crowd.walk()
         _, _, _, _, info = env.step(Action.HOVER)
         assert np.array_equal(crowd.positions_m, info["users_m"])

@@ -1,4 +1,4 @@
-"""The mission's books: range, collection, landing."""
+"""The state of a mission: range, collection, landing."""
 
 import numpy as np
 import pytest

@@ -33,8 +33,8 @@ def test_each_world_may_have_its_own_weights(array):
 
 def test_forms(array):
     total, before = array([2.0, 1.0]), array([0.5, 1.5])
-    np.testing.assert_array_equal(reward.earned(total, before, "immediate"), [1.5, -0.5])
-    np.testing.assert_array_equal(reward.earned(total, before, "episode"), [2.0, 1.0])
+    np.testing.assert_array_equal(reward.step_reward(total, before, "immediate"), [1.5, -0.5])
+    np.testing.assert_array_equal(reward.step_reward(total, before, "episode"), [2.0, 1.0])
 
 
 def test_each_world_may_have_its_own_shape_and_form(array):
@@ -47,7 +47,7 @@ def test_each_world_may_have_its_own_shape_and_form(array):
         for i, shape in enumerate(["exponential", "binary", "exponential", "binary", "binary"]):
             assert found[i] == reward.r_plus(cells, shape)[i]
         total, before = array([2.0, 1.0, 3.0], dtype), array([0.5, 1.5, 3.0], dtype)
-        earned = reward.earned(total, before, array([True, False, True]))
+        earned = reward.step_reward(total, before, array([True, False, True]))
         assert earned.dtype == total.dtype
         np.testing.assert_array_equal(earned, [2.0, -0.5, 3.0])
 

@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.support.worlds import population, run, tiny
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import observations
-from uav_dc_ros.core.batch import BatchWorld, observe
+from uav_dc_ros.core.world import BatchWorld, observe
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS

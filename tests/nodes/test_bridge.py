@@ -25,8 +25,8 @@ from tests.conftest import Ros, finish, read_bag, wait_for
 from tests.support.fake_autopilot.flight import Fake, fake
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.env.registration import ENV_ID
 
 STEPS = 7  # of the low world's missions

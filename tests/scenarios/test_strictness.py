@@ -208,13 +208,12 @@ def test_a_byte_order_mark_is_no_part_of_the_scenario(tmp_path):
         (
             "d_cons_m",
             "d_cons_m = 99.0",
-            "mission.d_cons_m = 99; expected at least grid.altitude_min_m = 100, "
-            "or nobody can ever be served",
+            "mission.d_cons_m = 99; expected at least grid.altitude_min_m = 100, or no user can be served",
         ),
         (
             "cluster_centres_m",
             "cluster_centres_m = [[100.0, 100.0], [0.0, 2000.0], [50.0, 50.0]]",
-            "users.cluster_centres_m[1] = [0.0, 2000.0]: from the nearest cell its disc is ",
+            "users.cluster_centres_m[1] = [0.0, 2000.0]: its disc is ",
         ),
     ],
     ids=lambda value: value if isinstance(value, str) and "=" in value and ";" not in value else "",

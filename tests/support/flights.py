@@ -17,8 +17,8 @@ from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.bags.read import BagMessage
 from uav_dc_ros.core import world
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
+from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.controller import MissionController

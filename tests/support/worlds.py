@@ -9,7 +9,7 @@ import numpy as np
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import network, policy
 from uav_dc_ros.agents.policy import Hyperparameters, PolicyConfig
-from uav_dc_ros.core.scenario import Reward, Scenario, from_values
+from uav_dc_ros.core.scenario import RewardSettings, Scenario, from_values
 from uav_dc_ros.experiments.train.population import Population, Run
 
 
@@ -52,7 +52,7 @@ def config(scenario: Scenario, **values: Any) -> PolicyConfig:
 def run(scenario: Scenario, seed: int = 0, **values: Any) -> Run:
     """A small run: `run(tiny(), 3, algorithm="dqn", gamma=0.5, beta=2.0)`, whichever part a value is of."""
     learning: dict[str, Any] = {"episodes": 4, "batch_size": 8, "buffer_size": 100, "target_every": 10}
-    paid = {key: values.pop(key) for key in Reward.__struct_fields__ if key in values}
+    paid = {key: values.pop(key) for key in RewardSettings.__struct_fields__ if key in values}
     learning |= {key: values.pop(key) for key in Hyperparameters.__struct_fields__ if key in values}
     return Run(
         seed=seed,

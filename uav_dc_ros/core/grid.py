@@ -1,7 +1,7 @@
 """The grid of cells that the UAV moves on, and the seven moves.
 
-A cell is three indices, east, north and up. Cell (0, 0, 0) has its centre at the map's origin, at
-the lowest altitude. Frames are ENU: x east, y north, z up.
+A cell is three indices, east, north and up. The centre of cell (0, 0, 0) is at the map's origin, at the
+lowest altitude. Frames are ENU: x east, y north, z up.
 """
 
 import math
@@ -28,7 +28,7 @@ class Action(IntEnum):
 
     @property
     def label(self) -> ActionLabel:
-        """The name that travels in messages."""
+        """The action's name in messages."""
         return cast(ActionLabel, self.name.lower())
 
 
@@ -65,7 +65,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Number of cells east, north and up."""
+        """Cells east, north and up."""
         return self.n_x, self.n_y, self.n_z
 
     @property
@@ -74,30 +74,14 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         return self.n_x - 1, self.n_y - 1, self.n_z - 1
 
     def move(self, cell: Array, action: Array) -> Array:
-        """The cell after one move; a move off the grid leaves the UAV where it is.
-
-        Args:
-            cell: indices, integers `[..., 3]`.
-            action: value of an `Action`, integers `[...]`.
-
-        Returns:
-            Indices, `[..., 3]`.
-        """
+        """The cell `[..., 3]` after an `Action` (its value, `[...]`); a move off the grid has no effect."""
         xp = array_namespace(cell)
         target = cell + xp.take(constant(MOVES, cell), action.reshape((-1,)), axis=0).reshape(cell.shape)
-        # A move changes one index by one, so to stay is to be clipped.
+        # A move changes one index by one: clipping cancels a move off the grid.
         return xp.minimum(xp.maximum(target, constant((0,), cell)), constant(self.last_cell, cell))
 
     def centre_m(self, cell: Array, like: Array) -> Array:
-        """Position of a cell's centre.
-
-        Args:
-            cell: indices, integers `[..., 3]`.
-            like: an array whose floating-point type and device the result takes.
-
-        Returns:
-            x, y, altitude, metres, `[..., 3]`.
-        """
+        """Centres x, y, altitude of cells `[..., 3]`, metres, `[..., 3]`; dtype and device as `like`."""
         xp = array_namespace(cell)
         spacing = constant((self.cell_m, self.cell_m, self.altitude_step_m), like)
         origin = constant((0.0, 0.0, self.altitude_min_m), like)
@@ -106,11 +90,8 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     def cell_at(self, position_m: tuple[float, float, float]) -> tuple[int, int, int] | None:
         """The cell whose centre is at `position_m` (x, y, altitude, metres), or None."""
         x_m, y_m, z_m = position_m
-        steps = (
-            x_m / self.cell_m,
-            y_m / self.cell_m,
-            (z_m - self.altitude_min_m) / self.altitude_step_m,
-        )
+        height_m = z_m - self.altitude_min_m
+        steps = (x_m / self.cell_m, y_m / self.cell_m, height_m / self.altitude_step_m)
         if not all(map(math.isfinite, steps)):  # a spacing so small that the division overflows
             return None
         cell = (round(steps[0]), round(steps[1]), round(steps[2]))

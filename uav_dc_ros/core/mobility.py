@@ -1,20 +1,20 @@
-"""Where users start, and how they walk about."""
+"""The users' start positions and random walk."""
 
 import math
 
-from uav_dc_ros.core.arrays import Array, array_namespace
+import numpy as np
+
+from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.scenario import Scenario
 
 
 def scatter(centres_m: Array, radius_m: float, draws: Array) -> Array:
-    """Users placed uniformly, by area, in the disc around their cluster's centre.
+    """Start positions, metres, `[..., U, 2]`: uniform by area in the disc around each user's cluster centre.
 
     Args:
         centres_m: centre of each user's cluster, metres, `[U, 2]`.
         radius_m: radius C of a cluster, metres.
         draws: uniform in [0, 1), `[..., U, 2]`.
-
-    Returns:
-        Positions x, y, metres, `[..., U, 2]`.
     """
     xp = array_namespace(draws)
     # The square root makes equal areas, not equal radii, equally likely.
@@ -22,16 +22,13 @@ def scatter(centres_m: Array, radius_m: float, draws: Array) -> Array:
 
 
 def walk(users_m: Array, v_max_mps: float, step_s: float, draws: Array) -> Array:
-    """One step of the random walk: a fresh direction, a speed uniform up to `v_max_mps`.
+    """Positions after one step of the unbounded random walk, metres, `[..., U, 2]`.
 
     Args:
         users_m: positions x, y, metres, `[..., U, 2]`.
-        v_max_mps: greatest speed v, m/s.
+        v_max_mps: maximum speed v, m/s; speeds are uniform, directions too.
         step_s: duration of a step, seconds.
         draws: uniform in [0, 1), `[..., U, 2]`.
-
-    Returns:
-        Positions after the step, metres, `[..., U, 2]`. Nothing confines the walk.
     """
     return users_m + _polar(v_max_mps * step_s * draws[..., 0], draws[..., 1])
 
@@ -40,5 +37,39 @@ def _polar(radius_m: Array, turn: Array) -> Array:
     """Radius `[...]` and angle in turns `[...]` as x, y, `[..., 2]`."""
     xp = array_namespace(radius_m)
     angle_rad = (2.0 * math.pi) * turn
-    radius_m, angle_rad = radius_m[..., None], angle_rad[..., None]  # as `stack` does, at twice the cost
+    radius_m, angle_rad = radius_m[..., None], angle_rad[..., None]  # `stack` takes twice the time
     return xp.concat([radius_m * xp.cos(angle_rad), radius_m * xp.sin(angle_rad)], axis=-1)
+
+
+class WalkingUsers:
+    """The users of one mission, drawn from its seed in the order of the environment.
+
+    Attributes:
+        step: steps walked.
+        positions_m: current positions, metres, `[U, 2]`.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self._scenario = scenario
+        self._rng = np.random.default_rng(seed)
+        self.step = 0
+        draws = self._draws()
+        centres_m = constant(scenario.user_centres_m, draws)
+        self.positions_m: Array = scatter(centres_m, scenario.users.cluster_radius_m, draws)
+        self._next_m: Array | None = None
+
+    def walk(self, steps: int = 1) -> None:
+        """Advance the users."""
+        for _ in range(steps):
+            self.positions_m, self._next_m = self.next_m(), None
+            self.step += 1
+
+    def next_m(self) -> Array:
+        """Positions after the next step, metres, `[U, 2]`; drawn once."""
+        if self._next_m is None:
+            v_max_mps, step_s = self._scenario.users.v_max_mps, self._scenario.mission.step_s
+            self._next_m = walk(self.positions_m, v_max_mps, step_s, self._draws())
+        return self._next_m
+
+    def _draws(self) -> Array:
+        return self._rng.random((self._scenario.n_users, 2))

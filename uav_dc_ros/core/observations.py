@@ -1,17 +1,16 @@
-"""What an agent sees: encodings of the mission as a vector of numbers, mostly in [0, 1].
+"""Observations of an agent: encodings of the mission as a vector of numbers, mostly in [0, 1].
 
 position   the UAV's cell (the paper's state, eq. 5), each index scaled to [0, 1]: 3 numbers
-mission    position; steps that remain; for each cluster the share of users collected, and of data; the
-           cell once more as one switch per index in each direction; for each cluster how close the UAV
-           is, and the same times the share of users collected: 4 + 4 M + n_x + n_y + n_z numbers
-map        mission, and the way from the UAV to each cluster's centre and to the dock: 2 M + 2 more
+mission    position; remaining steps; for each cluster the share of users collected, and of data; the cell
+           one-hot in each direction; for each cluster the UAV's closeness, and the closeness times the share
+           of users collected: 4 + 4 M + n_x + n_y + n_z numbers
+map        mission, and the vector from the UAV to each cluster's centre and to the dock: 2 M + 2 more
 
-Switches and closeness say nothing new. They spare a small network the work of carving "here, and not
-one cell further" and "here, while there is something left" out of scaled indices.
-Closeness is 1 over a cluster's centre and falls like a bell with the horizontal distance, to a half
-at 1.2 `d_cons_m`.
+One-hot cells and closeness add no information. They spare a small network the work of deriving "this cell
+only" and "here, while users remain" from scaled indices. Closeness is a Gaussian of the horizontal distance
+to a cluster's centre: 1 at the centre, a half at 1.2 `d_cons_m`.
 
-The encodings are made from what the nodes know, so that training and flying see the same vector.
+Nodes publish all inputs of the encodings: training and flight use the same vector.
 """
 
 from functools import cache
@@ -33,7 +32,7 @@ def size(kind: Observation, scenario: Scenario) -> int:
 
 
 def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
-    """Lowest and highest value of each entry of the encoding, float32 `[D]` each."""
+    """Minimum and maximum of each entry of the encoding, float32 `[D]` each."""
     low, high = np.zeros(size(kind, scenario), np.float32), np.ones(size(kind, scenario), np.float32)
     if kind == "map":
         goals = np.asarray(scenario.goals_cells, np.float32)
@@ -45,26 +44,17 @@ def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
 
 
 def encode(
-    kind: Observation,
-    scenario: Scenario,
-    *,
-    cell: Array,
-    step: Array,
-    data_bits: Array,
-    collected: Array,
+    kind: Observation, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
 ) -> Array:
-    """The observation of a mission.
+    """The observation of a mission, float32 `[..., D]` with D = `size(kind, scenario)`.
 
     Args:
-        kind: which encoding.
+        kind: encoding.
         scenario: the world's values.
         cell: the UAV's cell, integers `[..., 3]`.
         step: steps flown, integers `[...]`.
         data_bits: data collected from each user, bit, `[..., U]`.
         collected: bool `[..., U]`.
-
-    Returns:
-        float32 `[..., D]` with D = `size(kind, scenario)`.
     """
     xp = array_namespace(cell)
     cell_f = xp.astype(cell, xp.float32)
@@ -76,29 +66,29 @@ def encode(
         done = _cluster_means(scenario, xp.astype(collected, xp.float32))
         progress = xp.astype(data_bits, xp.float32) / scenario.mission.r_min_bits
         data = _cluster_means(scenario, xp.minimum(progress, constant((1.0,), progress)))
-        direction, index = _switches(scenario.grid.shape)
-        here = xp.take(cell_f, constant(direction, cell), axis=-1)
-        switches = xp.astype(here == constant(index, cell_f), xp.float32)
-        ways_cells = constant(scenario.goals_cells, cell_f) - cell_f[..., None, :2]
+        direction, index = _one_hot_entries(scenario.grid.shape)
+        indices = xp.take(cell_f, constant(direction, cell), axis=-1)
+        one_hot = xp.astype(indices == constant(index, cell_f), xp.float32)
+        to_goals_cells = constant(scenario.goals_cells, cell_f) - cell_f[..., None, :2]
         reach_cells = scenario.mission.d_cons_m / scenario.grid.cell_m
-        ways_reach = ways_cells[..., :-1, :] / reach_cells
-        closeness = xp.exp(-0.5 * (ways_reach * ways_reach).sum(axis=-1))
-        parts += [done, data, switches, closeness, closeness * done]
+        to_clusters = to_goals_cells[..., :-1, :] / reach_cells
+        closeness = xp.exp(-0.5 * (to_clusters * to_clusters).sum(axis=-1))
+        parts += [done, data, one_hot, closeness, closeness * done]
     if kind == "map":
-        way = ways_cells / span[:2]
-        parts.append(way.reshape((*cell.shape[:-1], -1)))
+        to_goals = to_goals_cells / span[:2]
+        parts.append(to_goals.reshape((*cell.shape[:-1], -1)))
     return xp.concat(parts, axis=-1)
 
 
 def _spans(scenario: Scenario) -> tuple[int, ...]:
-    """Highest index in each direction, at least 1."""
+    """Maximum index in each direction, at least 1."""
     east, north, up = scenario.grid.last_cell
     return max(east, 1), max(north, 1), max(up, 1)
 
 
 @cache
-def _switches(shape: tuple[int, int, int]) -> tuple[tuple[int, ...], ...]:
-    """Direction (0 east, 1 north, 2 up) and index that each switch stands for."""
+def _one_hot_entries(shape: tuple[int, int, int]) -> tuple[tuple[int, ...], ...]:
+    """Direction (0 east, 1 north, 2 up) and index of each one-hot entry."""
     return tuple(zip(*((i, index) for i, n in enumerate(shape) for index in range(n)), strict=True))
 
 

@@ -1,25 +1,21 @@
-"""How fast a mission is flown: in lockstep, or at a multiple of real time."""
+"""The pace of a mission: lockstep, or a multiple of real time."""
 
 from typing import TYPE_CHECKING
 
 from uav_dc_ros.errors import ParameterError
 
-if TYPE_CHECKING:  # a command line reads its pace before anything heavy is imported
+if TYPE_CHECKING:  # a command line parses its pace before anything heavy is imported
     from uav_dc_ros.core.scenario import Scenario
 
 LOCKSTEP = "lockstep"
-WATCHABLE = 90.0  # a mission of sixty steps of 15 s in ten seconds
+WATCHABLE = 90.0  # a mission of sixty steps of 15 s takes ten seconds
 PACE_MAX = 1e6
-TIME_MAX_S = 2.0**31  # the seconds of a ROS time are 32 bits with a sign
-PERIOD_MIN_S = 0.005  # of a step at a pace; one in lockstep takes a millisecond or two
+TIME_MAX_S = 2.0**31  # the seconds of a ROS time are a signed 32-bit integer
+PERIOD_MIN_S = 0.005  # of a step at a pace; a step in lockstep takes a millisecond or two
 
 
 def parse(text: str) -> float | None:
-    """How many times faster than real time, or None for lockstep.
-
-    Raises:
-        ParameterError: neither.
-    """
+    """The factor of real time, or None for lockstep; raises ParameterError for any other text."""
     if text == LOCKSTEP:
         return None
     try:
@@ -37,16 +33,12 @@ def text(pace: float | None) -> str:
 
 
 def period_s(scenario: "Scenario", pace: float | None) -> float:
-    """Shortest time that a step takes, seconds; 0 in lockstep."""
+    """Minimum duration of a step in the nodes, seconds; 0 in lockstep."""
     return 0.0 if pace is None else scenario.mission.step_s / pace
 
 
 def check(scenario: "Scenario", pace: float | None, missions: int) -> None:
-    """Refuse what cannot be flown.
-
-    Raises:
-        ParameterError: steps shorter than the nodes need for one, or more mission time than a ROS time holds.
-    """
+    """Raise ParameterError for steps too short for the nodes, or a time that ROS cannot represent."""
     if pace is not None and period_s(scenario, pace) < PERIOD_MIN_S:
         raise ParameterError(
             f"pace: {pace:g}; expected at most {scenario.mission.step_s / PERIOD_MIN_S:g}, which makes steps "

@@ -1,6 +1,6 @@
 """The uplink: distance, path gain, SINR and rate. Equation numbers are those of the paper.
 
-The radio knows nothing of missions: who is served is decided in `mission`.
+`mission` decides which users are served.
 """
 
 import math
@@ -13,14 +13,11 @@ Interference: TypeAlias = Literal["all", "associated", "none"]
 
 
 def distance(uav_m: Array, users_m: Array) -> Array:
-    """3D distance between the UAV and users on the ground (eq. 1).
+    """3D distance between the UAV and users on the ground (eq. 1), metres, `[..., U]`.
 
     Args:
         uav_m: UAV position x, y, altitude, metres, `[..., 3]`.
-        users_m: user positions x, y, metres, `[..., U, 2]`. Whole metres in integers become float64.
-
-    Returns:
-        Distance, metres, `[..., U]`.
+        users_m: user positions x, y, metres, `[..., U, 2]`. Integers become float64.
     """
     xp = array_namespace(uav_m, users_m)
     uav_m, users_m = _floating(xp, uav_m), _floating(xp, users_m)
@@ -31,28 +28,17 @@ def distance(uav_m: Array, users_m: Array) -> Array:
 
 
 def ground_reach_m(distance_m: float, altitude_m: float) -> float:
-    """Radius of the circle on the ground within a 3D distance of the UAV (eq. 1, solved for it).
-
-    Args:
-        distance_m: greatest 3D distance, metres.
-        altitude_m: altitude of the UAV, metres.
-
-    Returns:
-        Horizontal distance, metres; 0 where the UAV is higher than `distance_m`.
-    """
+    """Radius of the circle on the ground within a 3D distance of the UAV (eq. 1), metres; 0: out of range."""
     return math.sqrt(max(distance_m * distance_m - altitude_m * altitude_m, 0.0))
 
 
 def path_gain(distance_m: Array, ref_gain: float, exponent: float = 2.0) -> Array:
-    """Channel power gain of a line-of-sight link, `beta_0 d^-exponent` (eq. 2).
+    """Channel power gain of a line-of-sight link, `beta_0 d^-exponent` (eq. 2), linear.
 
     Args:
-        distance_m: distance, metres, any shape; must be above zero.
+        distance_m: metres, any shape, above zero.
         ref_gain: gain at 1 m, linear.
         exponent: path-loss exponent; the paper's free space is 2.
-
-    Returns:
-        Gain, linear, the shape of `distance_m`.
     """
     return ref_gain / distance_m**exponent
 
@@ -64,19 +50,16 @@ def sinr(
     interference: Interference = "all",
     served: Array | None = None,
 ) -> Array:
-    """Signal over interference and noise of every user at the UAV (the fraction in eq. 3).
+    """Signal over interference and noise of every user at the UAV (part of eq. 3), linear, `[..., U]`.
 
     Args:
         gain: channel power gain, linear, `[..., U]`.
         power_w: transmit power, watts, a number or `[..., U]`.
         noise_w: noise power, watts.
-        interference: who transmits. `all`: every user, at every step (the paper's equation as
-            written). `associated`: only the users in `served`; the others have SINR 0. `none`:
-            orthogonal channels, noise only.
-        served: which users are associated, bool `[..., U]`; needed for `associated` only.
-
-    Returns:
-        SINR, linear, `[..., U]`.
+        interference: transmitting users. `all`: every user, at every step (the paper's equation as
+            written). `associated`: only the users in `served`; the others have SINR 0. `none`: orthogonal
+            channels, noise only.
+        served: associated users, bool `[..., U]`; needed for `associated` only.
 
     Raises:
         ValueError: unknown `interference`, or `associated` without `served`.
@@ -96,21 +79,13 @@ def sinr(
 
 
 def rate_bps(sinr: Array, bandwidth_hz: float) -> Array:
-    """Achievable rate `B log2(1 + SINR)`, bit/s (eq. 3).
-
-    Args:
-        sinr: linear, any shape.
-        bandwidth_hz: bandwidth B, hertz.
-
-    Returns:
-        Rate, bit/s, the shape of `sinr`.
-    """
-    # log1p keeps the digits that 1 + sinr would drop for a user far below the noise.
+    """Achievable rate `B log2(1 + SINR)`, bit/s (eq. 3), of a linear SINR of any shape."""
+    # log1p keeps the digits that 1 + sinr drops for a user far below the noise.
     return (bandwidth_hz / math.log(2.0)) * array_namespace(sinr).log1p(sinr)
 
 
 def _floating(xp: Any, values: Array) -> Array:
-    """Integers as float64: torch would take their square root in float32."""
+    """Integers as float64: torch takes their square root in float32."""
     return values if _is_real(xp, values.dtype) else xp.astype(values, xp.float64)
 
 
@@ -122,9 +97,8 @@ def _is_real(xp: Any, dtype: Any) -> bool:
 def _sum_of_others(received_w: Array) -> Array:
     """For each user, the sum over every other one, `[..., U]`.
 
-    The sum of all but the strongest, and by how much the strongest outdoes the user. The total less the
-    user's own share would be wrong: beside a user ten thousand times stronger that difference keeps only
-    half of its digits.
+    It is the sum of all but the strongest user, plus the difference of the strongest and this user. The total
+    less the user's own share loses half of its digits beside a user ten thousand times stronger.
     """
     xp = array_namespace(received_w)
     strongest = received_w.argmax(axis=-1, keepdims=True)

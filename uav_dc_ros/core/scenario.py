@@ -1,7 +1,7 @@
-"""A scenario: every value of a world, frozen and read strictly.
+"""A scenario: every value of a world, frozen and parsed strictly.
 
-`parse` takes the text of a TOML file; `uav_dc_ros.scenarios.load` finds the file. An unknown key, a
-wrong type and a value out of range are errors that name the key, the value and what was expected.
+`parse` reads the text of a TOML file; `uav_dc_ros.scenarios.load` finds the file. An unknown key, a wrong
+type and a value out of range are errors that name the key, the value and what was expected.
 """
 
 import difflib
@@ -11,6 +11,7 @@ import math
 import re
 import reprlib
 import tomllib
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
@@ -30,23 +31,22 @@ EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 
-
 _NAME = r"^[a-z][a-z0-9_]{0,63}\Z"
 _NAME_IN_WORDS = "a lower-case letter (a to z), then at most 63 of a to z, 0 to 9 and '_'"
 
 
-class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the scenario file: unknown keys are errors."""
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the scenario file."""
 
 
-class Users(_Section, frozen=True):
+class UserSettings(_Table, frozen=True):
     """The users on the ground.
 
     Attributes:
         cluster_centres_m: centre x, y of each of the M clusters, metres.
         users_per_cluster: users K in a cluster.
         cluster_radius_m: radius C of the disc in which a cluster's users start, metres.
-        v_max_mps: greatest speed v of the random walk, m/s.
+        v_max_mps: maximum speed v of the random walk, m/s.
     """
 
     cluster_centres_m: Annotated[tuple[tuple[float, float], ...], Meta(min_length=1, max_length=1000)]
@@ -55,16 +55,16 @@ class Users(_Section, frozen=True):
     v_max_mps: NotNegative
 
 
-class Mission(_Section, frozen=True):
-    """Where the UAV flies from and to, and what counts.
+class MissionSettings(_Table, frozen=True):
+    """Start, destination and limits of the mission.
 
     Attributes:
         start_m: start x, y, altitude, metres; the centre of a cell.
         dock_m: destination x, y, metres; the centre of a cell.
         step_s: duration of a step, seconds.
         max_steps: steps T_cons that the battery allows.
-        d_cons_m: greatest 3D distance at which a user can be served, metres.
-        r_min_bits: data after which a user is collected, bit.
+        d_cons_m: maximum 3D distance at which a user is served, metres.
+        r_min_bits: data at which a user counts as collected, bit.
         episode_end: `at_time_limit`: every mission flies `max_steps` steps, and has landed if it ends
             over the dock. `on_arrival`: it ends at the dock, or after `max_steps` without landing.
     """
@@ -78,7 +78,7 @@ class Mission(_Section, frozen=True):
     episode_end: EpisodeEnd
 
 
-class Radio(_Section, frozen=True):
+class RadioSettings(_Table, frozen=True):
     """The uplink.
 
     Attributes:
@@ -87,7 +87,7 @@ class Radio(_Section, frozen=True):
         noise_power_dbm: noise power alpha^2, dBm.
         ref_gain_db: channel power gain beta_0 at 1 m, dB.
         path_loss_exponent: exponent of the path loss.
-        interference: who transmits, see `radio.sinr`.
+        interference: transmitting users, see `radio.sinr`.
     """
 
     bandwidth_hz: Positive
@@ -108,14 +108,14 @@ class Radio(_Section, frozen=True):
         return 10.0 ** (self.ref_gain_db / 10.0)
 
 
-class Reward(_Section, frozen=True):
+class RewardSettings(_Table, frozen=True):
     """The trade-off game.
 
     Attributes:
         beta: weight of the data collected.
         zeta: weight of the trajectory reward.
         r_plus: trajectory reward, see `reward.r_plus`.
-        form: reward of a step, see `reward.earned`.
+        form: reward of a step, see `reward.step_reward`.
         data_scale_bits: data of a user that counts as 1 in the reward, bit.
     """
 
@@ -126,15 +126,15 @@ class Reward(_Section, frozen=True):
     data_scale_bits: Positive
 
 
-class Scenario(_Section, frozen=True, dict=True):
+class Scenario(_Table, frozen=True, dict=True):
     """Every value of a world. `U` below is the number of users, M K."""
 
     name: Annotated[str, Meta(pattern=_NAME)]
     grid: Grid
-    users: Users
-    mission: Mission
-    radio: Radio
-    reward: Reward
+    users: UserSettings
+    mission: MissionSettings
+    radio: RadioSettings
+    reward: RewardSettings
 
     @property
     def n_clusters(self) -> int:
@@ -148,7 +148,7 @@ class Scenario(_Section, frozen=True, dict=True):
 
     @cached_property
     def user_cluster(self) -> Array:
-        """Cluster index of each user, integers `[U]`: users of a cluster stand together."""
+        """Cluster index of each user, integers `[U]`, ascending."""
         return np.repeat(np.arange(self.n_clusters), self.users.users_per_cluster)
 
     @cached_property
@@ -162,7 +162,7 @@ class Scenario(_Section, frozen=True, dict=True):
         return round(self.mission.step_s * 1e9)
 
     def time_ns(self, mission: int, step: int) -> int:
-        """Mission time of a step, nanoseconds; missions follow each other one step apart."""
+        """Time of a step since the first mission's start, nanoseconds; one step lies between missions."""
         return round((mission * (self.mission.max_steps + 1) + step) * self.mission.step_s * 1e9)
 
     @cached_property
@@ -188,10 +188,9 @@ class Scenario(_Section, frozen=True, dict=True):
 
     @cached_property
     def fingerprint(self) -> str:
-        """First 12 hex digits of the SHA-256 of every value but the reward's.
+        """First 12 hex digits of the SHA-256 of every value but the reward's: equal for equal worlds only.
 
-        Equal for equal worlds only. What an agent is paid is its own matter: a policy trained for
-        another reward flies in the same world.
+        A policy trained with another reward flies in the same world.
         """
         world = msgspec.to_builtins(self)
         del world["reward"]
@@ -202,35 +201,34 @@ def parse(text: str, source: str) -> Scenario:
     """A scenario from the text of a TOML file.
 
     Args:
-        text: the file's content.
-        source: what to call it in errors: a path or a name.
+        text: content of the file.
+        source: name of the file for errors.
 
     Raises:
-        ScenarioError: not TOML, an unknown key, a wrong type, a value out of range, or values that
-            do not fit together.
+        ScenarioError: not TOML, an unknown key, a wrong type, a value out of range, or inconsistent values.
     """
     try:
-        values = tomllib.loads(text.removeprefix("\ufeff"))  # the mark that Windows editors write first
-    except (ValueError, RecursionError) as error:
-        # ValueError: bad TOML, but also an integer of more digits than Python reads.
+        values = tomllib.loads(text.removeprefix("\ufeff"))  # the byte-order mark of Windows editors
+    except (ValueError, RecursionError) as error:  # ValueError: also of an integer with too many digits
         raise ScenarioError(f"{source}: not a TOML file: {error}") from None
     return from_values(values, source)
 
 
 def from_values(values: dict[str, Any], source: str) -> Scenario:
     """A scenario from plain values, as TOML or JSON hold them; see `parse`."""
-    _check_known(values, Scenario, source)
+    _check_keys(values, Scenario, source)
     try:
         scenario = msgspec.convert(values, Scenario)
     except msgspec.ValidationError as error:
         raise ScenarioError(f"{source}: {_explain(str(error), values)}") from None
     _check_finite(msgspec.to_builtins(scenario), source)
-    _check_together(scenario, source)
+    if (error_text := next(_inconsistencies(scenario), None)) is not None:
+        raise ScenarioError(f"{source}: {error_text}")
     return scenario
 
 
-def _check_known(values: Any, struct: type, source: str, table: str = "") -> None:
-    """Unknown keys come first: a typo is the likeliest mistake, and has the best answer."""
+def _check_keys(values: Any, struct: type, source: str, table: str = "") -> None:
+    """Reject unknown keys before anything else: a typo is the likeliest mistake."""
     if not isinstance(values, dict):
         return
     known = get_type_hints(struct)
@@ -242,7 +240,7 @@ def _check_known(values: Any, struct: type, source: str, table: str = "") -> Non
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
             raise ScenarioError(f"{source}: unknown key {name} = {reprlib.repr(value)}; {hint}")
         if _is_table(known[key]):
-            _check_known(value, known[key], source, f"{key}.")
+            _check_keys(value, known[key], source, f"{key}.")
 
 
 def _is_table(kind: Any) -> bool:
@@ -250,7 +248,7 @@ def _is_table(kind: Any) -> bool:
 
 
 def _explain(message: str, values: Any) -> str:
-    """msgspec's message, with the key and the value in front. The keys are known ones."""
+    """msgspec's message, with the key and the value in front."""
     expected, _, path = message.partition(" - at `$.")
     path = path.removesuffix("`")
     kind: Any = Scenario
@@ -274,7 +272,7 @@ def _explain(message: str, values: Any) -> str:
 
 
 def _check_finite(values: Any, source: str, key: str = "") -> None:
-    """TOML knows `nan` and `inf`; a world does not, and no range above refuses them."""
+    """Reject TOML's `nan` and `inf`, which no range of the types excludes."""
     if isinstance(values, dict):
         for name, value in values.items():
             _check_finite(value, source, f"{key}.{name}" if key else name)
@@ -285,8 +283,8 @@ def _check_finite(values: Any, source: str, key: str = "") -> None:
         raise ScenarioError(f"{source}: {key} = {values}; expected a finite number")
 
 
-def _check_together(scenario: Scenario, source: str) -> None:
-    """What one value alone cannot show."""
+def _inconsistencies(scenario: Scenario) -> Iterator[str]:
+    """Errors of combined values, lazily: a later check relies on the earlier ones."""
     grid, mission = scenario.grid, scenario.mission
     top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
     extent = (
@@ -294,46 +292,44 @@ def _check_together(scenario: Scenario, source: str) -> None:
         f"in steps of {grid.cell_m:g}"
     )
     if grid.cell_at(mission.start_m) is None:
-        raise ScenarioError(
-            f"{source}: mission.start_m = {list(mission.start_m)}; expected the centre of a cell: "
+        yield (
+            f"mission.start_m = {list(mission.start_m)}; expected the centre of a cell: "
             f"{extent}, altitude {grid.altitude_min_m:g} to {top_m:g} m in steps of {grid.altitude_step_m:g}"
         )
     if grid.cell_at((*mission.dock_m, grid.altitude_min_m)) is None:
-        raise ScenarioError(
-            f"{source}: mission.dock_m = {list(mission.dock_m)}; expected the centre of a cell: {extent}"
-        )
-    away = sum(abs(a - b) for a, b in zip(scenario.start_cell[:2], scenario.dock_cell, strict=True))
-    if away > mission.max_steps:
-        raise ScenarioError(
-            f"{source}: mission.max_steps = {mission.max_steps}; expected at least {away}, "
+        yield f"mission.dock_m = {list(mission.dock_m)}; expected the centre of a cell: {extent}"
+    moves = sum(abs(a - b) for a, b in zip(scenario.start_cell[:2], scenario.dock_cell, strict=True))
+    if moves > mission.max_steps:
+        yield (
+            f"mission.max_steps = {mission.max_steps}; expected at least {moves}, "
             "the moves from start to dock"
         )
     if (mission.max_steps + 1) * mission.step_s >= TIME_MAX_S:
-        raise ScenarioError(
-            f"{source}: mission.step_s = {mission.step_s:g}; expected less than "
+        yield (
+            f"mission.step_s = {mission.step_s:g}; expected less than "
             f"{TIME_MAX_S / (mission.max_steps + 1):g}, so that mission.max_steps of it fit into a ROS time"
         )
     if grid.altitude_min_m > mission.d_cons_m:
-        raise ScenarioError(
-            f"{source}: mission.d_cons_m = {mission.d_cons_m:g}; expected at least "
-            f"grid.altitude_min_m = {grid.altitude_min_m:g}, or nobody can ever be served"
+        yield (
+            f"mission.d_cons_m = {mission.d_cons_m:g}; expected at least "
+            f"grid.altitude_min_m = {grid.altitude_min_m:g}, or no user can be served"
         )
     for i, centre_m in enumerate(scenario.users.cluster_centres_m):
-        away_m = _least_distance_m(centre_m, scenario)
-        if away_m > mission.d_cons_m:
-            raise ScenarioError(
-                f"{source}: users.cluster_centres_m[{i}] = {list(centre_m)}: from the nearest cell its disc "
-                f"is {away_m:.1f} m away; expected at most mission.d_cons_m = {mission.d_cons_m:g}, or its "
-                "users are out of reach"
+        distance_m = _min_distance_m(centre_m, scenario)
+        if distance_m > mission.d_cons_m:
+            yield (
+                f"users.cluster_centres_m[{i}] = {list(centre_m)}: its disc is {distance_m:.1f} m from the "
+                f"nearest cell; expected at most mission.d_cons_m = {mission.d_cons_m:g}, or its users are "
+                "out of reach"
             )
 
 
-def _least_distance_m(centre_m: tuple[float, float], scenario: Scenario) -> float:
-    """Distance between the disc of a cluster and the cell nearest to it, metres."""
+def _min_distance_m(centre_m: tuple[float, float], scenario: Scenario) -> float:
+    """3D distance between the disc of a cluster and the cell nearest to it, metres."""
     grid = scenario.grid
     cell_m = [
         min(max(round(at_m / grid.cell_m), 0), n - 1) * grid.cell_m
         for at_m, n in zip(centre_m, (grid.n_x, grid.n_y), strict=True)
     ]
-    level_m = max(0.0, math.dist(centre_m, cell_m) - scenario.users.cluster_radius_m)
-    return math.hypot(level_m, grid.altitude_min_m)
+    horizontal_m = max(0.0, math.dist(centre_m, cell_m) - scenario.users.cluster_radius_m)
+    return math.hypot(horizontal_m, grid.altitude_min_m)

@@ -1,20 +1,21 @@
 """The whole world as a value and two functions: `initial` and `step`.
 
-Within a step, in this order: the UAV moves, the users walk, then rates hold for the whole step and
-data is booked. The ROS nodes compose the same functions, split over processes.
+Within a step, in this order: the UAV moves, the users walk, then rates hold for the whole step and data is
+collected. The ROS nodes compose the same functions, split over processes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
-from uav_dc_ros.core import mission, mobility, radio, reward
+from uav_dc_ros.core import mission, mobility, observations, radio, reward
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """What the channel gives in one step. `U` is the number of users.
+    """The channel in one step. `U` is the number of users.
 
     Attributes:
         sinr: linear, `[..., U]`.
@@ -52,10 +53,10 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a step brought, each `[...]`.
+    """The result of a step, each `[...]`.
 
     Attributes:
-        reward: what the agent is paid.
+        reward: the agent's reward.
         terminated: the mission is over.
         truncated: the mission was cut off (`on_arrival`: out of steps before the dock).
         landed: the mission is over and the UAV is over the dock.
@@ -70,35 +71,20 @@ class Outcome:
 
 
 def initial(scenario: Scenario, draws: Array) -> State:
-    """The world before the first step.
-
-    Args:
-        scenario: the world's values.
-        draws: uniform in [0, 1), `[..., U, 2]`; their library, dtype and device carry over.
-    """
+    """The world before the first step, from uniform draws `[..., U, 2]`, whose library and dtype it takes."""
     xp = array_namespace(draws)
-    nothing = xp.zeros_like(draws[..., 0])
-    zero = xp.sum(nothing, axis=-1)
+    zeros = xp.zeros_like(draws[..., 0])
+    zero = xp.sum(zeros, axis=-1)
     step = xp.astype(zero, xp.int64)
+    centres_m = constant(scenario.user_centres_m, draws)
     return State(
         step=step,
         cell=step[..., None] + constant(scenario.start_cell, step),
-        users_m=place_users(scenario, draws),
-        data_bits=nothing,
-        collected=nothing > 0.0,
+        users_m=mobility.scatter(centres_m, scenario.users.cluster_radius_m, draws),
+        data_bits=zeros,
+        collected=zeros > 0.0,
         total_reward=zero,
     )
-
-
-def place_users(scenario: Scenario, draws: Array) -> Array:
-    """Users at their start, metres, `[..., U, 2]`; draws as in `initial`."""
-    centres_m = constant(scenario.user_centres_m, draws)
-    return mobility.scatter(centres_m, scenario.users.cluster_radius_m, draws)
-
-
-def walk_users(scenario: Scenario, users_m: Array, draws: Array) -> Array:
-    """Users one step later, metres, `[..., U, 2]`; draws as in `initial`."""
-    return mobility.walk(users_m, scenario.users.v_max_mps, scenario.mission.step_s, draws)
 
 
 def measure(scenario: Scenario, uav_m: Array, users_m: Array, collected: Array) -> Link:
@@ -106,31 +92,20 @@ def measure(scenario: Scenario, uav_m: Array, users_m: Array, collected: Array) 
     values = scenario.radio
     distance_m = radio.distance(uav_m, users_m)
     served = mission.served(distance_m, collected, scenario.mission.d_cons_m)
-    sinr = radio.sinr(
-        radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent),
-        values.tx_power_w,
-        values.noise_power_w,
-        values.interference,
-        served,
-    )
+    gain = radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent)
+    sinr = radio.sinr(gain, values.tx_power_w, values.noise_power_w, values.interference, served)
     rate_bps = radio.rate_bps(sinr, values.bandwidth_hz)
     return Link(sinr=sinr, rate_bps=rate_bps, served=served, sum_rate_bps=mission.sum_rate(served, rate_bps))
 
 
 def collect(scenario: Scenario, link: Link, data_bits: Array, collected: Array) -> tuple[Array, Array]:
     """`data_bits` and `collected` after a step over `link`, `[..., U]`."""
-    return mission.collect(
-        data_bits,
-        collected,
-        link.served,
-        link.rate_bps,
-        scenario.mission.step_s,
-        scenario.mission.r_min_bits,
-    )
+    step_s, r_min_bits = scenario.mission.step_s, scenario.mission.r_min_bits
+    return mission.collect(data_bits, collected, link.served, link.rate_bps, step_s, r_min_bits)
 
 
 def total_reward(scenario: Scenario, cell: Array, data_bits: Array, rewards: Rewards | None = None) -> Array:
-    """r^t (eq. 7) of a UAV in `cell` `[..., 3]` that holds `data_bits` `[..., U]`; shape `[...]`."""
+    """r^t (eq. 7), `[...]`, of a UAV in `cell` `[..., 3]` that holds `data_bits` `[..., U]`."""
     values = rewards or scenario.reward
     distance = mission.dock_distance_cells(cell, scenario.dock_cell, like=data_bits)
     return reward.total(
@@ -143,11 +118,10 @@ def dock_distance_m(scenario: Scenario, cell: Array, like: Array) -> Array:
     return mission.dock_distance_cells(cell, scenario.dock_cell, like) * scenario.grid.cell_m
 
 
-def ends(scenario: Scenario, step: Array, cell: Array) -> tuple[Array, Array, Array]:
+def end_of_mission(scenario: Scenario, step: Array, cell: Array) -> tuple[Array, Array, Array]:
     """Whether the mission has terminated, was truncated, and has landed, bool `[...]` each.
 
-    Under `at_time_limit` the last step is the mission's own end, so it is termination: the value of
-    a state behind it is zero, not unknown.
+    Under `at_time_limit` the last step is a termination: the value of a state behind it is zero, not unknown.
     """
     docked = mission.at_dock(cell, scenario.dock_cell)
     out_of_steps = step >= scenario.mission.max_steps
@@ -159,26 +133,23 @@ def ends(scenario: Scenario, step: Array, cell: Array) -> tuple[Array, Array, Ar
 def step(
     scenario: Scenario, state: State, action: Array, draws: Array, rewards: Rewards | None = None
 ) -> tuple[State, Outcome]:
-    """One step of the world.
+    """The world after one step, and the step's outcome.
 
     Args:
         scenario: the world's values.
         state: the world before the step.
         action: value of a `grid.Action`, integers `[...]`.
         draws: uniform in [0, 1), `[..., U, 2]`.
-        rewards: how each world is paid, `[...]`; as the scenario says unless told.
-
-    Returns:
-        The world after the step, and what the step brought.
+        rewards: reward settings of each world, `[...]`; default: the scenario's.
     """
     cell = scenario.grid.move(state.cell, action)
-    users_m = walk_users(scenario, state.users_m, draws)
+    users_m = mobility.walk(state.users_m, scenario.users.v_max_mps, scenario.mission.step_s, draws)
     uav_m = scenario.grid.centre_m(cell, like=users_m)
     link = measure(scenario, uav_m, users_m, state.collected)
     data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
     total = total_reward(scenario, cell, data_bits, rewards)
     n_steps = state.step + 1
-    terminated, truncated, landed = ends(scenario, n_steps, cell)
+    terminated, truncated, landed = end_of_mission(scenario, n_steps, cell)
     after = State(
         step=n_steps,
         cell=cell,
@@ -188,10 +159,60 @@ def step(
         total_reward=total,
     )
     outcome = Outcome(
-        reward=reward.earned(total, state.total_reward, (rewards or scenario.reward).form),
+        reward=reward.step_reward(total, state.total_reward, (rewards or scenario.reward).form),
         terminated=terminated,
         truncated=truncated,
         landed=landed,
         link=link,
     )
     return after, outcome
+
+
+def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
+    """The observation of a state, float32 `[..., D]`; see `observations.encode`."""
+    return observations.encode(
+        kind,
+        scenario,
+        cell=state.cell,
+        step=state.step,
+        data_bits=state.data_bits,
+        collected=state.collected,
+    )
+
+
+def select(where: Array, chosen: State, other: State) -> State:
+    """`chosen` in the worlds where `where` (bool `[...]`) holds, `other` elsewhere."""
+    xp = array_namespace(where)
+
+    def pick(a: Array, b: Array) -> Array:
+        return xp.where(xp.reshape(where, (*where.shape, *(1,) * (a.ndim - where.ndim))), a, b)
+
+    return State(**{f.name: pick(getattr(chosen, f.name), getattr(other, f.name)) for f in fields(State)})
+
+
+class BatchWorld:
+    """Worlds `[N]` of one scenario that advance together and restart each by itself, on numpy or torch.
+
+    Attributes:
+        scenario: the values of every world.
+        state: all worlds between two steps, `[N, ...]`.
+    """
+
+    def __init__(self, scenario: Scenario, draws: Array, rewards: Rewards | None = None) -> None:
+        """Worlds before their first step; arguments as in `initial` and `step`."""
+        self.scenario = scenario
+        self._rewards = rewards
+        self.state = initial(scenario, draws)
+
+    def step(self, action: Array, draws: Array) -> Outcome:
+        """One step of every world: integers `[N]`, and uniform draws `[N, U, 2]`."""
+        self.state, outcome = step(self.scenario, self.state, action, draws, self._rewards)
+        return outcome
+
+    def restart(self, where: Array, draws: Array) -> None:
+        """Restart the worlds in `where` (bool `[N]`) from their part of `draws` `[N, U, 2]`."""
+        self.state = select(where, initial(self.scenario, draws), self.state)
+
+    def observe(self, kind: Observation) -> Array:
+        """The observation of each world, float32 `[N, D]`."""
+        return observe(kind, self.scenario, self.state)

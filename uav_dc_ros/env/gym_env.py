@@ -11,10 +11,10 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from uav_dc_ros import scenarios
 from uav_dc_ros.core import observations, world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import observe
 from uav_dc_ros.env.trajectory import Trajectory
 
 RENDER_MODES = ("rgb_array",)

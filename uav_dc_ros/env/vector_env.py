@@ -11,10 +11,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.batch import BatchWorld
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import BatchWorld
 from uav_dc_ros.env.gym_env import ACTIONS_TEXT, checked, info, spaces_of
 
 

@@ -24,8 +24,8 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import node_main
@@ -286,7 +286,7 @@ class WorldNode(MissionNode):
         self._users.walk()
         self._step += 1
         self._action = None
-        terminated, truncated, landed = core.ends(self.scenario, np.asarray(self._step), self._cell)
+        terminated, truncated, landed = core.end_of_mission(self.scenario, np.asarray(self._step), self._cell)
         if terminated or truncated:
             self._phase = Phase.LANDED if landed else Phase.TIMEOUT
 
@@ -325,7 +325,7 @@ class WorldNode(MissionNode):
         self.publish("target", pose)  # a simulated vehicle is at its target
         if self.pace is None and self._phase is Phase.READY:  # while the other nodes compute
             step = self._step + 1
-            self._next_users = self._mission, step, self._encode_users(step, self._users.ahead_m())
+            self._next_users = self._mission, step, self._encode_users(step, self._users.next_m())
 
     def _encode_users(self, step: int, users_m: Array) -> bytes:
         """The encoded `users` of a step at `users_m`, metres, `[U, 2]`."""

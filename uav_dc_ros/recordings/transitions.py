@@ -124,14 +124,18 @@ class RecordedTransitions:
 
     def _transition(self, before: _State, after: _State, action: Action) -> Transition:
         scenario = self._scenario
-        terminated, truncated, _ = world.ends(scenario, np.asarray(after.step), np.asarray(after.cell))
+        terminated, truncated, _ = world.end_of_mission(
+            scenario, np.asarray(after.step), np.asarray(after.cell)
+        )
         return Transition(
             flight=before.flight,
             mission=before.mission,
             step=before.step,
             observation=before.observation,
             action=int(action),
-            reward=float(core_reward.earned(after.total_reward, before.total_reward, scenario.reward.form)),
+            reward=float(
+                core_reward.step_reward(after.total_reward, before.total_reward, scenario.reward.form)
+            ),
             next_observation=after.observation,
             terminated=bool(terminated),
             truncated=bool(truncated),

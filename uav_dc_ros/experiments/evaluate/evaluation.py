@@ -11,9 +11,9 @@ import numpy as np
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.stats import interval
+from uav_dc_ros.core.world import observe
 from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, roll_out
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from uav_dc_ros.core import mission, world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.batch import select
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import select
 
 # Greedy or not: from the state of the missions, `[..., S]`, an action for each, integers `[..., S]`.
 Act = Callable[[world.State], Array]

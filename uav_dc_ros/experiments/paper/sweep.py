@@ -13,8 +13,8 @@ from uav_dc_ros import files, scenarios
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.batch import observe
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import observe
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.trajectory import roll_out_trajectory

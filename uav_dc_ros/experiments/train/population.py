@@ -11,7 +11,7 @@ from uav_dc_ros.agents.policy import Algorithm, Hyperparameters
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.observations import Observation
-from uav_dc_ros.core.scenario import Reward, Scenario
+from uav_dc_ros.core.scenario import RewardSettings, Scenario
 from uav_dc_ros.errors import TrainingError
 
 
@@ -32,7 +32,7 @@ class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     environment: Annotated[int, Meta(ge=0)] | None = None
     algorithm: Algorithm
     aggregation: network.Aggregation = "mean"
-    reward: Reward
+    reward: RewardSettings
     hyperparameters: Hyperparameters
 
 

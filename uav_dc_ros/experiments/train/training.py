@@ -18,8 +18,8 @@ from uav_dc_ros.agents.dqn import Learner, Member
 from uav_dc_ros.agents.replay import ReplayBuffer, Transitions
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.batch import BatchWorld
 from uav_dc_ros.core.reward import Rewards
+from uav_dc_ros.core.world import BatchWorld
 from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
 from uav_dc_ros.experiments.train.population import Population, Run, architecture, layout
 from uav_dc_ros.recordings.transitions import Transition

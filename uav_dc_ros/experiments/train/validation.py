@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.batch import observe
-from uav_dc_ros.core.world import State
+from uav_dc_ros.core.world import State, observe
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.experiments.train.population import layout
 from uav_dc_ros.experiments.train.training import Training, rewards

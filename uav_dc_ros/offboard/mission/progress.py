@@ -102,7 +102,7 @@ class MissionProgress:
         offsets = (abs(p - t) / size for p, t, size in zip(position, self.target, sizes_m, strict=True))
         if max(offsets) > settings.max_offset_cells:
             return False
-        lands = bool(core.ends(self.scenario, np.asarray(self.step + 1), np.asarray(self.goal))[2])
+        lands = bool(core.end_of_mission(self.scenario, np.asarray(self.step + 1), np.asarray(self.goal))[2])
         return not lands or self.dock_distance_m(position) <= settings.landing_radius_m
 
     def arrive(self, reached: bool = True) -> None:
@@ -122,7 +122,7 @@ class MissionProgress:
         return bool(self._ends()[2])
 
     def _ends(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return core.ends(self.scenario, np.asarray(self.step), np.asarray(self.cell))
+        return core.end_of_mission(self.scenario, np.asarray(self.step), np.asarray(self.cell))
 
 
 class Dwell:

@@ -168,7 +168,7 @@ class MissionRows:
         self._total = step.step, total
         if before is None or before[0] != step.step - 1:
             return total, None
-        return total, float(core_reward.earned(total, before[1], self._scenario.reward.form))
+        return total, float(core_reward.step_reward(total, before[1], self._scenario.reward.form))
 
     def _users(self, step: RecordedStep) -> Rows:
         if step.users is None and step.rates is None:

@@ -18,8 +18,8 @@ from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.users import WalkingUsers
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.recordings.recorded_step import RecordedStep, differ_in_time_only, with_progress_of
@@ -197,7 +197,9 @@ class WorldCheck(Check):
         remaining = max(scenario.mission.max_steps - step.step, 0)
         found = self.compare(step, "mission", "fingerprint", status.fingerprint, scenario.fingerprint)
         found += self.compare(step, "mission", "remaining_steps", status.remaining_steps, remaining)
-        terminated, truncated, landed = world.ends(scenario, np.asarray(step.step), np.asarray(status.cell))
+        terminated, truncated, landed = world.end_of_mission(
+            scenario, np.asarray(step.step), np.asarray(status.cell)
+        )
         phase = Phase.READY
         if step.step and (terminated or truncated):
             phase = Phase.LANDED if landed else Phase.TIMEOUT
