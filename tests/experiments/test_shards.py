@@ -147,7 +147,7 @@ def test_only_code_that_trains_changes_the_name(tmp_path):
     package = copy_of_package(tmp_path)
     for name in ("nodes/world", "bags/read", "offboard/frames", "planners/plans", "experiments/paper/claims"):
         assert not changes_the_name(package, f"{name}.py"), name
-    for name in ("core/world", "core/radio", "agents/dqn", "core/batch", "experiments/train/training"):
+    for name in ("core/world", "core/radio", "agents/dqn", "core/mobility", "experiments/train/training"):
         assert changes_the_name(package, f"{name}.py"), name
 
 
