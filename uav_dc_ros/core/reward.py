@@ -55,7 +55,8 @@ def total(
     Args:
         data_bits: data collected while P(m, k) was 1, bit, `[..., U]` with U = M K users.
         r_plus: `[...]`.
-        beta, zeta: weights of the data and of the trajectory, numbers or `[...]`.
+        beta: weight of the data, a number or `[...]`.
+        zeta: weight of the trajectory, a number or `[...]`.
         data_scale_bits: data of a user that counts as 1, bit, a number or `[...]`.
     """
     return beta * (array_namespace(data_bits).mean(data_bits, axis=-1) / data_scale_bits) + zeta * r_plus
@@ -68,7 +69,8 @@ def step_reward(total: Array, previous_total: Array, form: RewardForm | Array) -
     all differences so far; that sum telescopes to r^t itself, since a mission starts from r = 0.
 
     Args:
-        total, previous_total: r^t and r^(t-1), `[...]`; the latter is 0 at the first step.
+        total: r^t, `[...]`.
+        previous_total: r^(t-1), `[...]`; 0 at the first step.
         form: `immediate` or `episode`, or for each world whether it is the episode's, bool `[...]`.
     """
     if isinstance(form, str):
