@@ -10,12 +10,12 @@ import numpy as np
 
 from uav_dc_ros import scenarios
 from uav_dc_ros.experiments.paper.plan import runs
-from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results, World
-from uav_dc_ros.experiments.paper.setting import FULL, Planned, Scale, Setting
+from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results, ScenarioFacts
+from uav_dc_ros.experiments.paper.setting import FULL, PlannedRun, Scale, Setting
 
 SHORT = msgspec.structs.replace(FULL, episodes=400)
-WORLDS = {name: World.of(scenarios.load(name)) for name in ("three_clusters", "five_clusters")}
-# Where a made-up run ends, unless told. Its reward is that of its ratio, as in the paper.
+WORLDS = {name: ScenarioFacts.of(scenarios.load(name)) for name in ("three_clusters", "five_clusters")}
+# Where a made-up run ends by default. Its reward is that of its ratio, as in the paper.
 LEVELS = {
     "episode_return": 50.0,
     "throughput_bps": 2e5,
@@ -26,7 +26,7 @@ LEVELS = {
 
 
 @functools.cache
-def planned_runs(scale: Scale) -> tuple[Planned, ...]:
+def planned_runs(scale: Scale) -> tuple[PlannedRun, ...]:
     """The plan of a scale."""
     return tuple(runs(scale))
 

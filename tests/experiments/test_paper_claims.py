@@ -7,20 +7,22 @@ import numpy as np
 import pytest
 
 from tests.experiments.paper_sweeps import SHORT, realistic, sweep
-from uav_dc_ros.experiments.paper import evidence
+from uav_dc_ros.core.stats import Interval
 from uav_dc_ros.experiments.paper.claims import CLAIMS, check, finding
-from uav_dc_ros.experiments.paper.evidence import (
-    Evidence,
+from uav_dc_ros.experiments.paper.criteria import (
+    RULES,
+    Criterion,
     all_within,
     everywhere,
     fall,
     greater,
     joint,
     lead,
-    settling,
     within,
 )
+from uav_dc_ros.experiments.paper.evidence import Evidence, settling
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
+from uav_dc_ros.experiments.paper.report import tables_md
 from uav_dc_ros.experiments.paper.setting import FULL, RATIOS, SMOKE, Setting
 
 ONE = RATIOS.index((1, 1))
@@ -147,22 +149,22 @@ def favourite_of_17(s):
     return dueling(s) and exponential(s) and episode(s) and s.ratio == (4, 1)
 
 
-def weighed(results, claim):
+def tested(results, claim):
     return finding(next(one for one in CLAIMS if one.id == claim), Evidence(results))
 
 
 @pytest.mark.parametrize("claim", TRUE)
 def test_a_claim_that_is_true_holds(claim):
-    found = weighed(sweep(TRUE[claim]), claim)
-    assert found.verdict == "holds", found.weighed.parts
-    assert found.decisive == found.weighed.parts[0]
+    found = tested(sweep(TRUE[claim]), claim)
+    assert found.verdict == "holds", found.assessment.criteria
+    assert found.decisive == found.assessment.criteria[0]
 
 
 @pytest.mark.parametrize("case", FALSE)
 def test_a_claim_of_which_one_part_is_false_does_not_hold(case):
     claim, levels = FALSE[case]
-    found = weighed(sweep(levels), claim)
-    assert found.verdict == "does not hold", found.weighed.parts
+    found = tested(sweep(levels), claim)
+    assert found.verdict == "does not hold", found.assessment.criteria
     assert found.decisive.verdict == "does not hold"
 
 
@@ -184,8 +186,8 @@ def test_environments_that_disagree_decide_nothing(claim):
     if claim == "C13":
         one = [i for i in turned if good.planned[i].setting.ratio == (4, 1)]
         good.curves["throughput_bps"][one] *= 0.8
-    found = weighed(good, claim)
-    assert found.verdict == "undecided", found.weighed.parts
+    found = tested(good, claim)
+    assert found.verdict == "undecided", found.assessment.criteria
 
 
 once = functools.cache(realistic)
@@ -210,11 +212,15 @@ def test_runs_that_were_not_made_leave_claims_untested():
 
 
 @pytest.mark.parametrize("scale", [FULL, SMOKE], ids=["full", "smoke"])
-def test_every_claim_can_be_weighed(scale):
-    for one in check(once(scale)):
+def test_every_claim_can_be_tested(scale):
+    results = once(scale)
+    for one in check(results):
         assert one.verdict != "not tested"
-        assert all(np.isfinite(part.effect).all() for part in (*one.weighed.parts, *one.weighed.beside))
-        assert any(table.rows for table in one.weighed.tables)
+        criteria = (*one.assessment.criteria, *one.assessment.secondary)
+        assert all(np.isfinite(criterion.effect).all() for criterion in criteria)
+        assert any(
+            text.count("\n") > 1 for table in one.claim.tables for text in tables_md(Evidence(results), table)
+        )
 
 
 def test_convergence_is_where_a_curve_gets_to_its_level_and_stays():
@@ -275,7 +281,7 @@ def test_the_rules_of_everywhere():
     assert (part.effect.mean, part.detail) == (-1.0, "as claimed at 2 of 3 ratios, not at 1:2")
 
 
-def test_what_is_shown_of_everywhere_says_what_the_verdict_says():
+def test_the_effect_shown_of_everywhere_agrees_with_its_verdict():
     """The worst mean may belong to a ratio that is undecided: it is not what decided."""
     effects = np.array([[-2, -0.3, 1], [1, -0.2, 1], [-1.5, -0.25, 1], [1, -0.3, 1], [-1, -0.3, 1]])
     part = everywhere("", effects, RATIOS[:3], "")
@@ -309,14 +315,17 @@ def test_a_fall_is_a_slope_turned_round():
     np.testing.assert_allclose(fall(np.array([[4.0, 3.0, 2.0], [1.0, 1.0, 1.0]])), [1.0, 0.0], atol=1e-12)
 
 
-def test_one_part_that_fails_decides():
-    assert joint(["holds", "holds"]) == "holds"
-    assert joint(["holds", "undecided"]) == "undecided"
-    assert joint(["undecided", "does not hold", "holds"]) == "does not hold"
+def test_one_criterion_that_fails_decides():
+    def of(*verdicts):
+        return joint([Criterion("", Interval(0, 0, 0), "", "", verdict) for verdict in verdicts])
+
+    assert of("holds", "holds") == "holds"
+    assert of("holds", "undecided") == "undecided"
+    assert of("undecided", "does not hold", "holds") == "does not hold"
 
 
 def test_the_rules_name_the_numbers_they_use():
-    assert evidence.RULES.count("20%") == 1
-    assert "±5%" in evidence.RULES
-    assert "over 5 points" in evidence.RULES
+    assert RULES.count("20%") == 1
+    assert "±5%" in RULES
+    assert "over 5 points" in RULES
     assert SHORT.repeats == FULL.repeats

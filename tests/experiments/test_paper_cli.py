@@ -41,7 +41,7 @@ def smoke(tmp_path_factory):
     return folder
 
 
-def test_smoke_makes_what_is_asked_for(smoke):
+def test_smoke_makes_the_figures_of_only(smoke):
     check_made(smoke, SOME)
 
 
@@ -139,23 +139,23 @@ def test_a_mistake_is_one_line(tmp_path, monkeypatch, capsys, options, complaint
     with pytest.raises(SystemExit) as ended:
         cli.main(["--scale", "smoke", "--only", "lr", *options])
     assert ended.value.code == 2
-    said = capsys.readouterr().err.strip()
-    assert complaint in said
-    assert said.startswith("python -m uav_dc_ros.paper: ")
-    assert len(said.splitlines()) == 1
+    error = capsys.readouterr().err.strip()
+    assert complaint in error
+    assert error.startswith("python -m uav_dc_ros.paper: ")
+    assert len(error.splitlines()) == 1
     assert not (tmp_path / "paper_results").exists(), "nothing that would be in the way of the next command"
 
 
-def test_half_a_sweep_is_gone_on_with_as_it_was_begun(tmp_path, monkeypatch, capsys):
+def test_half_a_sweep_is_resumed_with_its_own_options_only(tmp_path, monkeypatch, capsys):
     """Another --only would train other shards, and take these for done with."""
     monkeypatch.chdir(tmp_path)
     kept = tmp_path / "paper_results" / "shards" / "shard_0.safetensors"
 
-    def interrupt(shards, folder, n_workers, tell):
+    def interrupt(shards, folder, n_workers, on_progress):
         kept.write_bytes(b"")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "train_here", interrupt)
+    monkeypatch.setattr(cli, "train_locally", interrupt)
     with pytest.raises(SystemExit) as ended:
         cli.main(["--scale", "smoke", "--only", "lr", "batch"])
     assert ended.value.code == 130

@@ -12,7 +12,14 @@ from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
-from uav_dc_ros.experiments.paper.results import CURVES_FILE, GREEDY, METRICS, RUNS_FILE, Results, World
+from uav_dc_ros.experiments.paper.results import (
+    CURVES_FILE,
+    GREEDY,
+    METRICS,
+    RUNS_FILE,
+    Results,
+    ScenarioFacts,
+)
 from uav_dc_ros.experiments.paper.setting import SMOKE, Setting
 from uav_dc_ros.planners import PLANNERS
 
@@ -136,11 +143,11 @@ def test_the_throughput_gives_the_data_term(name):
     scenario = changed(name, reward={"beta": 3.0, "zeta": 2.0, "r_plus": "binary"})
     for planner in ("tour", "random"):
         missions = roll_out(scenario, PLANNERS[planner](scenario), range(5))
-        data = World.of(scenario).data_per_bps * missions.sum_rate_bps
+        data = ScenarioFacts.of(scenario).data_per_bps * missions.sum_rate_bps
         np.testing.assert_allclose(missions.reward, 3 * data + 2 * missions.landed, rtol=1e-9)
 
 
 def test_a_world_whose_missions_end_on_arrival_is_refused():
     with pytest.raises(TrainingError, match="episode_end = 'on_arrival'; expected 'at_time_limit'"):
-        World.of(changed("five_clusters", mission={"episode_end": "on_arrival"}))
-    assert World.of(scenarios.load("five_clusters")).n_users == 50
+        ScenarioFacts.of(changed("five_clusters", mission={"episode_end": "on_arrival"}))
+    assert ScenarioFacts.of(scenarios.load("five_clusters")).n_users == 50

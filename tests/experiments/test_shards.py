@@ -16,9 +16,9 @@ from tests.support.worlds import tiny
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Hyperparameters
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.paper import local_workers, ray_workers, shards
-from uav_dc_ros.experiments.paper.local_workers import train_here
+from uav_dc_ros.experiments.paper import shards, workers
 from uav_dc_ros.experiments.paper.shards import Shard
+from uav_dc_ros.experiments.paper.workers import train_locally
 from uav_dc_ros.experiments.train.population import Population, Run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -51,10 +51,10 @@ def expected():
 
 
 def test_workers_bring_what_one_process_brings(tmp_path, expected):
-    told, two = [], list(expected)[:2]
-    train_here(two, tmp_path, 2, lambda name, n_flown: told.append((name, n_flown)))
+    reports, two = [], list(expected)[:2]
+    train_locally(two, tmp_path, 2, lambda name, n_flown: reports.append((name, n_flown)))
     assert all(content(tmp_path, one) == expected[one] for one in two)
-    assert {name for name, n_flown in told if n_flown == 40} == {one.name for one in two}
+    assert {name for name, n_flown in reports if n_flown == 40} == {one.name for one in two}
     assert not multiprocessing.active_children()
     assert sorted(os.listdir(tmp_path)) == sorted(shards.result_file(tmp_path, one).name for one in two)
 
@@ -69,13 +69,13 @@ def test_a_killed_worker_is_replaced(tmp_path, expected, monkeypatch):
             killed.append(child.pid)
             os.kill(child.pid, signal.SIGKILL)
 
-    train_here(list(expected)[:1], tmp_path, 1, kill)
+    train_locally(list(expected)[:1], tmp_path, 1, kill)
     assert killed
     one = next(iter(expected))
     assert content(tmp_path, one) == expected[one]
 
 
-def test_a_shard_goes_on_from_its_checkpoint(tmp_path, expected, monkeypatch):
+def test_a_shard_resumes_from_its_checkpoint(tmp_path, expected, monkeypatch):
     """Interrupted three times, each time with the last episode not yet saved, it ends as if it never was."""
     one, result = next(iter(expected.items()))
     monkeypatch.setattr(shards, "_CHECKPOINT_EVERY_S", 0.0)
@@ -103,9 +103,9 @@ def test_a_shard_whose_worker_always_dies_is_given_up(tmp_path, monkeypatch):
             os.kill(child.pid, signal.SIGKILL)
 
     with pytest.raises(TrainingError, match=rf"{one.name} died 3 times.*exit code -9.*--resume"):
-        train_here([one], tmp_path, 1, kill)
+        train_locally([one], tmp_path, 1, kill)
     assert not multiprocessing.active_children()
-    assert local_workers._TRIES == 3
+    assert workers._TRIES == 3
 
 
 def test_ctrl_c_leaves_no_worker(tmp_path):
@@ -113,18 +113,18 @@ def test_ctrl_c_leaves_no_worker(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_here([shard(0), shard(1)], tmp_path, 1, interrupt)
+        train_locally([shard(0), shard(1)], tmp_path, 1, interrupt)
     assert not multiprocessing.active_children()
 
 
-def test_a_fault_of_a_worker_is_told(tmp_path):
+def test_an_error_in_a_worker_is_reported(tmp_path):
     one = shard(0)
     shards.checkpoint_file(tmp_path, one).write_bytes(b"no checkpoint")
     with pytest.raises(TrainingError, match=f"{one.name} failed: .*cannot be read"):
-        train_here([one], tmp_path, 1, nothing)
+        train_locally([one], tmp_path, 1, nothing)
 
 
-def test_a_name_tells_the_content():
+def test_names_differ_with_the_content():
     assert shard(0).name == shard(0).name
     others = [shard(1), shard(0, episodes=41), shard(0, scenario=tiny(mission={"max_steps": 9}))]
     assert len({one.name for one in (shard(0), *others)}) == 4
@@ -133,14 +133,14 @@ def test_a_name_tells_the_content():
 def copy_of_package(tmp_path):
     package = Path(uav_dc_ros.__file__).parent
     shutil.copytree(package, tmp_path / "uav_dc_ros", ignore=shutil.ignore_patterns("__pycache__", "share"))
-    assert shards.code_of(tmp_path) == shards.code()
+    assert shards.code_hash_of(tmp_path) == shards.code_hash()
     return tmp_path / "uav_dc_ros"
 
 
 def changes_the_name(package, file):
-    path, before = package / file, shards.code_of(package.parent)
+    path, before = package / file, shards.code_hash_of(package.parent)
     path.write_text(path.read_text("utf-8") + "# changed\n", "utf-8")
-    return shards.code_of(package.parent) != before
+    return shards.code_hash_of(package.parent) != before
 
 
 def test_only_code_that_trains_changes_the_name(tmp_path):
@@ -168,7 +168,7 @@ def test_a_damaged_result_is_named(tmp_path, expected, damage):
     one, result = next(iter(expected.items()))
     shards.result_file(tmp_path, one).write_bytes(damage(result))
     with pytest.raises(TrainingError, match=f"{one.name}.safetensors: cannot be read.*delete it"):
-        shards.load(tmp_path, one)
+        shards.load_result(tmp_path, one)
 
 
 @pytest.mark.long
@@ -181,26 +181,26 @@ def test_a_ray_cluster_that_loses_a_node_brings_the_same(tmp_path, expected):
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     try:
         second = cluster.add_node(num_cpus=1)
-        told = []
+        reports = []
 
         def kill(name, n_flown):
-            told.append(name)
-            if len(told) == 1:  # two shards are left, one on each node
+            reports.append(name)
+            if len(reports) == 1:  # two shards are left, one on each node
                 cluster.remove_node(second, allow_graceful=False)
 
-        ray_workers.train_on_ray(list(expected), tmp_path, cluster.address, kill)
+        workers.train_on_ray(list(expected), tmp_path, cluster.address, kill)
     finally:
         cluster.shutdown()
-    assert sorted(told) == sorted(one.name for one in expected)
+    assert sorted(reports) == sorted(one.name for one in expected)
     assert all(content(tmp_path, one) == result for one, result in expected.items())
 
 
 def test_an_address_without_a_cluster_is_one_line(tmp_path):
     pytest.importorskip("ray")
     with pytest.raises(TrainingError, match=r"^--ray 127.0.0.1:1: no cluster answers: Connection refused$"):
-        ray_workers.train_on_ray([shard(0)], tmp_path, "127.0.0.1:1", nothing)
+        workers.train_on_ray([shard(0)], tmp_path, "127.0.0.1:1", nothing)
 
 
-def test_a_node_with_another_version_says_so():
+def test_a_node_with_other_code_is_refused():
     with pytest.raises(TrainingError, match=f"has uav_dc_ros {__version__} with code .*; expected code 0123"):
-        ray_workers._work(shard(0), "0123")
+        workers._work_on_node(shard(0), "0123")

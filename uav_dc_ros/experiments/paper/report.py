@@ -1,4 +1,4 @@
-"""The document of a sweep: figures, `claims.md` for people, `claims.json` for programs."""
+"""The report of a sweep: figures, `claims.md` for people, `claims.json` for programs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,13 +7,15 @@ from typing import Any
 import msgspec
 
 from uav_dc_ros import files
-from uav_dc_ros.core.stats import Interval
+from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.experiments.paper.claims import Finding, check, count
-from uav_dc_ros.experiments.paper.evidence import RULES, Part, Table, Verdict
+from uav_dc_ros.experiments.paper.criteria import RULES, Criterion, Table, Verdict
+from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import Metadata, Results
+from uav_dc_ros.experiments.paper.setting import domain, name
 
 CLAIMS_FILE, VERDICTS_FILE = "claims.md", "claims.json"
 _VERDICTS: dict[Verdict, str] = {
@@ -22,34 +24,48 @@ _VERDICTS: dict[Verdict, str] = {
     "undecided": "are undecided",
     "not tested": "were not tested",
 }
+# Measure: title, divisor, decimals.
+_UNITS = {
+    "reward": ("reward", 1.0, 3),
+    "reward_share": ("reward share", 1.0, 3),
+    "common_share": ("reward share with the binary R_plus for all", 1.0, 3),
+    "greedy_reward": ("reward of greedy missions", 1.0, 3),
+    "greedy_reward_share": ("reward share of greedy missions", 1.0, 3),
+    "throughput_bps": ("throughput, Mbit/s", 1e6, 4),
+    "greedy_throughput_bps": ("throughput of greedy missions, Mbit/s", 1e6, 4),
+    "users_collected": ("users collected", 1.0, 1),
+    "greedy_users_collected": ("users collected in greedy missions", 1.0, 1),
+    "landing_rate": ("share of missions that landed", 1.0, 2),
+    "greedy_landing_rate": ("share of greedy missions that landed", 1.0, 2),
+    "arrival_step": ("arrival step, T_cons when not landed", 1.0, 1),
+    "greedy_arrival_step": ("arrival step of greedy missions, T_cons when not landed", 1.0, 1),
+    "convergence": ("convergence, episodes; all of them where it never converged", 1.0, 0),
+    "fluctuation": ("fluctuation of the reward", 1.0, 4),
+}
 
 
 def write(
     results: Results, tracks: Sequence[Trajectory], folder: Path, only: Sequence[str] | None = None
 ) -> None:
-    """Draws figures and writes what came of the claims into an existing folder.
+    """Writes the figures in `only`, or all that the results allow, and the claims into an existing folder.
 
-    Args:
-        results: what was measured.
-        tracks: greedy missions for the figure `Traj`.
-        folder: where to.
-        only: figures to draw; None for all that the results allow.
+    `tracks` are the greedy missions of the figure `Traj`.
     """
-    possible = drawable(results)
-    for name in possible if only is None else only:
-        draw(name, results, tracks, folder / f"{name}.png")
+    for figure in drawable(results) if only is None else only:
+        draw(figure, results, tracks, folder / f"{figure}.png")
     findings = check(results)
-    drawn = [name for name in FIGURES if (folder / f"{name}.png").is_file()]
+    drawn = [figure for figure in FIGURES if (folder / f"{figure}.png").is_file()]
     files.write(folder / CLAIMS_FILE, claims_md(results, findings, drawn).encode())
     verdicts = msgspec.json.format(msgspec.json.encode([_plain(one) for one in findings]), indent=2)
     files.write(folder / VERDICTS_FILE, verdicts + b"\n")
 
 
 def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str]) -> str:
-    """The text of `claims.md`; `drawn` are the figures that lie beside it."""
+    """The text of `claims.md`; `drawn` are the figures beside it."""
     counts = ", ".join(
         f"{n} {words}" for verdict, words in _VERDICTS.items() if (n := count(findings, verdict))
     )
+    evidence = Evidence(results)
     sections = [
         "# What came of the paper's claims",
         *_warning(results.metadata),
@@ -62,9 +78,9 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
         "The settings were fixed before the sweep ran, and the rules before any of its results was seen.",
         RULES,
         "## The figures",
-        *(_figure(name) for name in drawn),
+        *map(_figure, drawn),
         "## The claims",
-        *(section for finding in findings for section in _section(finding, drawn)),
+        *(section for finding in findings for section in _sections(finding, evidence, drawn)),
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -98,11 +114,13 @@ def _provenance(results: Results) -> str:
 
 def _summary(findings: Sequence[Finding]) -> str:
     rows = ["| | setting | claim | verdict | effect [95% interval] |", "|---|---|---|---|---|"]
-    for claim, verdict, _ in findings:
-        rows.append(f"| [{claim.id}](#{claim.id.lower()}) | {claim.setting} | {claim.text} | **{verdict}** |")
-    for i, finding in enumerate(findings):
-        part = finding.decisive
-        rows[2 + i] += f" {_effect(part.effect, part.unit)} |" if part else " |"
+    for finding in findings:
+        claim, criterion = finding.claim, finding.decisive
+        effect = f" {_effect(criterion.effect, criterion.unit)}" if criterion else ""
+        rows.append(
+            f"| [{claim.id}](#{claim.id.lower()}) | {claim.setting} | {claim.text} | "
+            f"**{finding.verdict}** |{effect} |"
+        )
     return "\n".join(rows)
 
 
@@ -111,38 +129,70 @@ def _figure(name: str) -> str:
     return f"### {name}\n\n![{plan.caption}]({name}.png)\n\n{plan.caption}. Claims: {', '.join(plan.claims)}."
 
 
-def _section(finding: Finding, drawn: Sequence[str]) -> list[str]:
-    claim, verdict, weighed = finding
+def _sections(finding: Finding, evidence: Evidence, drawn: Sequence[str]) -> list[str]:
+    claim, verdict, assessment = finding
     figures = ", ".join(f"[{name}](#{name.lower()})" if name in drawn else name for name in claim.figures)
     sections = [
         f"### {claim.id}",
         f"*{claim.setting}:* {claim.text}. Figure {figures}. **{verdict[0].upper()}{verdict[1:]}.**",
     ]
-    if weighed.parts:
-        sections.append(_parts(weighed.parts, decide=True))
-    if weighed.beside:
-        sections += ["Beside:", _parts(weighed.beside, decide=False)]
-    sections += [_table(table) for table in weighed.tables if table.rows]
+    if verdict != "not tested":
+        sections.append(_criteria(assessment.criteria, "verdict"))
+        if assessment.secondary:
+            sections += ["Beside:", _criteria(assessment.secondary, "it would say")]
+        sections += [text for table in claim.tables for text in tables_md(evidence, table)]
     if claim.notes:
         sections.append("\n".join(f"- {note}" for note in claim.notes))
     return sections
 
 
-def _parts(parts: Sequence[Part], decide: bool) -> str:
-    last = ("verdict", "---") if decide else ("it would say", "---")
-    rows = [f"| part | effect [95% interval] | {last[0]} |", f"|---|---|{last[1]}|"]
-    for part in parts:
-        text = f"{part.text}; {part.rule}" if part.rule else part.text
-        detail = f" ({part.detail})" if part.detail else ""
-        rows.append(f"| {text}{detail} | {_effect(part.effect, part.unit)} | {part.verdict} |")
-    return "\n".join(rows)
+def _criteria(criteria: Sequence[Criterion], verdict_title: str) -> str:
+    rows = []
+    for one in criteria:
+        detail = f" ({one.detail})" if one.detail else ""
+        rows.append((f"{one.text}; {one.rule}{detail}", _effect(one.effect, one.unit), one.verdict))
+    return _markdown(("part", "effect [95% interval]", verdict_title), rows)
 
 
-def _table(table: Table) -> str:
-    lines = [f"**{table.title[0].upper()}{table.title[1:]}**\n"] if table.title else []
-    lines += [f"| {' | '.join(table.header)} |", f"|{'---|' * len(table.header)}"]
-    lines += [f"| {' | '.join(row)} |" for row in table.rows]
-    return "\n".join(lines)
+def tables_md(evidence: Evidence, table: Table) -> list[str]:
+    """A table in Markdown; with `columns`, one for each measure. Settings without runs are left out."""
+    if table.columns is None:
+        header = [_UNITS[measure][0] for measure in table.measures]
+        return [_markdown(["", *header], _rows(evidence, table, table.measures))]
+    header = [name(value) for value in domain(table.columns, evidence.scale)]
+    sections = []
+    for measure in table.measures:
+        title = _UNITS[measure][0]
+        text = _markdown(["", *header], _rows(evidence, table, [measure], table.columns))
+        sections.append(f"**{title[0].upper()}{title[1:]}**\n\n{text}")
+    return sections
+
+
+def _rows(evidence: Evidence, table: Table, measures: Sequence[str], *axes: str) -> list[list[str]]:
+    """For each setting its label, and a cell for each measure and each value on `axes`."""
+    rows = []
+    for setting in table.setting.along(table.rows, evidence.scale):
+        row = [", ".join(map(name, setting.values(table.rows or ("algorithm",))))]
+        try:
+            for measure in measures:
+                values = evidence.of(measure, setting, *axes)
+                row += [_cell(interval(column), measure) for column in values.reshape(len(values), -1).T]
+        except NotMeasured:
+            continue
+        rows.append(row)
+    return rows
+
+
+def _cell(effect: Interval, measure: str) -> str:
+    """A mean with its interval in the unit of the measure's title."""
+    _, unit, decimals = _UNITS[measure]
+    mean, low, high = (f"{value / unit:.{decimals}f}" for value in effect)
+    return f"{mean} [{low}, {high}]"
+
+
+def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"| {' | '.join(row)} |" for row in (header, *rows)]
+    return "\n".join([lines[0], f"|{'---|' * len(header)}", *lines[1:]])
 
 
 def _effect(effect: Interval, unit: str) -> str:
@@ -153,15 +203,15 @@ def _effect(effect: Interval, unit: str) -> str:
 def _plain(finding: Finding) -> dict[str, Any]:
     """A finding as JSON can hold it."""
 
-    def plain(part: Part) -> dict[str, Any]:
-        return {**part._asdict(), "effect": part.effect._asdict()}
+    def plain(criteria: Sequence[Criterion]) -> list[dict[str, Any]]:
+        return [one._asdict() | {"effect": one.effect._asdict()} for one in criteria]
 
-    claim, verdict, weighed = finding
+    claim, verdict, assessment = finding
     return {
         "id": claim.id,
         "setting": claim.setting,
         "claim": claim.text,
         "verdict": verdict,
-        "parts": [plain(part) for part in weighed.parts],
-        "beside": [plain(part) for part in weighed.beside],
+        "parts": plain(assessment.criteria),
+        "beside": plain(assessment.secondary),
     }

@@ -1,4 +1,4 @@
-"""What the sweep measured, in memory and on disk.
+"""The results of a sweep, in memory and on disk.
 
 Two Parquet files: `runs.parquet`, a row for each run; `curves.parquet`, a row for each point of each run's
 curves. Each carries the metadata as JSON under the key `uav_dc_ros`.
@@ -18,10 +18,10 @@ from uav_dc_ros import __version__, files
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.paper.setting import Planned, Scale, Setting
+from uav_dc_ros.experiments.paper.setting import PlannedRun, Scale, Setting
 from uav_dc_ros.experiments.train.episode_stats import CURVES
 
-# Of the missions flown to learn, exploration included, as in the paper's curves: `CURVES` without the loss.
+# Of training missions, exploration included, as in the paper's curves: `CURVES` without the loss.
 METRICS = CURVES[:-1]
 # The same of greedy missions after training, in the run's environment.
 GREEDY = (
@@ -36,10 +36,11 @@ RUNS_FILE, CURVES_FILE = "runs.parquet", "curves.parquet"
 _KEY = b"uav_dc_ros"
 
 _TYPES = {str: pa.string(), int: pa.int32(), float: pa.float64()}
+_SETTING_TYPES = {f.name: _TYPES.get(f.type, pa.string()) for f in msgspec.structs.fields(Setting)}
 _RUNS_SCHEMA = pa.schema(
     [
         ("run", pa.int32()),
-        *((f.name, _TYPES.get(f.type, pa.string())) for f in msgspec.structs.fields(Setting)),
+        *_SETTING_TYPES.items(),
         ("environment", pa.int32()),
         ("repeat", pa.int32()),
         ("seed", pa.int64()),
@@ -51,8 +52,8 @@ _CURVES_SCHEMA = pa.schema(
 )
 
 
-class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What reading the results takes of a scenario.
+class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The values of a scenario that the results depend on.
 
     Attributes:
         fingerprint: hash of the scenario's values.
@@ -69,40 +70,38 @@ class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     data_per_bps: float
 
     @classmethod
-    def of(cls, scenario: Scenario) -> "World":
-        """Raises TrainingError when missions end on arrival: the throughput would not give the data."""
-        values = scenario.mission
-        if values.episode_end != "at_time_limit":
+    def of(cls, scenario: Scenario) -> "ScenarioFacts":
+        """Raises TrainingError if missions end on arrival: the throughput would not determine the data."""
+        mission, n_users = scenario.mission, scenario.n_users
+        if mission.episode_end != "at_time_limit":
             raise TrainingError(
-                f"{scenario.name}: mission.episode_end = {values.episode_end!r}; expected 'at_time_limit', "
+                f"{scenario.name}: mission.episode_end = {mission.episode_end!r}; expected 'at_time_limit', "
                 "or missions of different lengths would be compared"
             )
         return cls(
             fingerprint=scenario.fingerprint,
-            n_users=scenario.n_users,
-            max_steps=values.max_steps,
-            data_per_bps=values.max_steps
-            * values.step_s
-            / (scenario.n_users * scenario.reward.data_scale_bits),
+            n_users=n_users,
+            max_steps=mission.max_steps,
+            data_per_bps=mission.max_steps * mission.step_s / (n_users * scenario.reward.data_scale_bits),
         )
 
 
 class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where results come from.
+    """The origin of results.
 
     Attributes:
-        command: the command that made them.
-        scale: how much of the sweep it ran.
+        command: that made them.
+        scale: of the sweep.
         worlds: by the names of the scenarios.
-        greedy_missions: greedy missions flown by each run after training.
-        wall_time_s: how long it took, seconds.
-        device: what computed it, in words.
+        greedy_missions: number flown by each run after training.
+        wall_time_s: of an uninterrupted sweep, seconds.
+        device: in words.
         version: of the package.
     """
 
     command: str
     scale: Scale
-    worlds: dict[str, World]
+    worlds: dict[str, ScenarioFacts]
     greedy_missions: int
     wall_time_s: float | None = None
     device: str = ""
@@ -111,10 +110,10 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """Runs and what they measured.
+    """Runs and their measures.
 
     Attributes:
-        metadata: where they come from.
+        metadata: their origin.
         planned: the runs.
         episode: number of the last episode of each point, `[n_points]`.
         curves: by `METRICS`: a mean over the episodes of each point, float32 `[n_runs, n_points]`.
@@ -122,13 +121,13 @@ class Results:
     """
 
     metadata: Metadata
-    planned: tuple[Planned, ...]
+    planned: tuple[PlannedRun, ...]
     episode: Array
     curves: dict[str, Array]
     greedy: dict[str, Array]
 
     def __post_init__(self) -> None:
-        """Raises TrainingError for a shape or name that does not fit, a number not finite, or a run twice."""
+        """Raises TrainingError for a wrong shape or name, a number that is not finite, or a repeated run."""
         _check_arrays("curves", self.curves, METRICS, (len(self.planned), len(self.episode)))
         _check_arrays("greedy", self.greedy, GREEDY, (len(self.planned),))
         if len(set(self.planned)) < len(self.planned):
@@ -151,10 +150,10 @@ class Results:
 
     @cached_property
     def _by_setting(self) -> dict[Setting, list[int]]:
-        found: dict[Setting, list[int]] = {}
+        indices: dict[Setting, list[int]] = {}
         for i, run in enumerate(self.planned):
-            found.setdefault(run.setting, []).append(i)
-        return found
+            indices.setdefault(run.setting, []).append(i)
+        return indices
 
     def save(self, folder: Path) -> None:
         """Writes both files into an existing folder, each in one move.
@@ -163,46 +162,42 @@ class Results:
             TrainingError: they cannot be written.
         """
         n_runs, n_points = len(self.planned), len(self.episode)
-        rows = [
-            {
-                "run": i,
-                **msgspec.structs.asdict(run.setting),
-                "environment": run.environment,
-                "repeat": run.repeat,
-                "seed": run.seed,
-            }
-            for i, run in enumerate(self.planned)
-        ]
-        columns = {name: [row[name] for row in rows] for name in _RUNS_SCHEMA.names if name not in GREEDY}
+        runs = {
+            "run": range(n_runs),
+            **{name: [getattr(run.setting, name) for run in self.planned] for name in _SETTING_TYPES},
+            **{
+                name: [getattr(run, name) for run in self.planned]
+                for name in ("environment", "repeat", "seed")
+            },
+            **{name: np.asarray(self.greedy[name], np.float32) for name in GREEDY},
+        }
         curves = {
             "run": np.repeat(np.arange(n_runs, dtype=np.int32), n_points),
             "episode": np.tile(np.asarray(self.episode, np.int32), n_runs),
             **{name: np.asarray(self.curves[name], np.float32).ravel() for name in METRICS},
         }
-        greedy = {name: np.asarray(self.greedy[name], np.float32) for name in GREEDY}
         metadata = {_KEY: msgspec.json.encode(self.metadata)}
         _write(folder / CURVES_FILE, curves, _CURVES_SCHEMA.with_metadata(metadata))
-        _write(folder / RUNS_FILE, columns | greedy, _RUNS_SCHEMA.with_metadata(metadata))
+        _write(folder / RUNS_FILE, runs, _RUNS_SCHEMA.with_metadata(metadata))
 
     @classmethod
     def load(cls, folder: Path) -> "Results":
         """Reads what `save` wrote.
 
         Raises:
-            TrainingError: a file is missing or damaged, has other columns, or does not belong to the other.
+            TrainingError: a file is missing or damaged, has other columns, or is of another sweep.
         """
         runs, metadata = _read(folder / RUNS_FILE, _RUNS_SCHEMA)
         curves, other = _read(folder / CURVES_FILE, _CURVES_SCHEMA)
         if metadata != other:
             raise TrainingError(f"{folder}: {RUNS_FILE} and {CURVES_FILE} are of different sweeps")
-        settings = [f.name for f in msgspec.structs.fields(Setting)]
         planned = []
         for row in runs.to_pylist():
             try:
-                setting = msgspec.convert({name: row[name] for name in settings}, Setting)
+                setting = msgspec.convert({name: row[name] for name in _SETTING_TYPES}, Setting)
             except msgspec.ValidationError as error:
                 raise TrainingError(f"{folder / RUNS_FILE}: run {row['run']}: {error}") from None
-            planned.append(Planned(setting, row["environment"], row["repeat"]))
+            planned.append(PlannedRun(setting, row["environment"], row["repeat"]))
         n_runs, n_points = len(planned), metadata.scale.n_points
         values = {name: curves[name].to_numpy() for name in _CURVES_SCHEMA.names}
         episode = values["episode"][:n_points]
@@ -251,15 +246,14 @@ def _read(path: Path, schema: pa.Schema) -> tuple[pa.Table, Metadata]:
     try:
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
-        found = table.schema
-        metadata = msgspec.json.decode((found.metadata or {})[_KEY], type=Metadata)
+        metadata = msgspec.json.decode((table.schema.metadata or {})[_KEY], type=Metadata)
     except KeyError:
         raise TrainingError(f"{path}: no metadata of a sweep; expected the key 'uav_dc_ros'") from None
     except (OSError, pa.ArrowException, msgspec.DecodeError, UnicodeDecodeError) as error:
         raise TrainingError(f"{path} cannot be read: {error}") from None
-    if not found.equals(schema):
+    if not table.schema.equals(schema):
         raise TrainingError(
-            f"{path} has columns {', '.join(found.names)}; expected {', '.join(schema.names)}"
+            f"{path} has columns {', '.join(table.schema.names)}; expected {', '.join(schema.names)}"
         )
     if any(column.null_count for column in table.columns):
         raise TrainingError(f"{path}: a value is missing")

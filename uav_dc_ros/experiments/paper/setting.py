@@ -1,13 +1,14 @@
-"""What a run of the sweep is: its setting, environment and repeat, and how large the sweep is.
+"""Settings, runs and scales of the sweep.
 
-Seeds: the run of environment e and repeat r has seed `1000 r + e`, whatever its setting. So all settings
-meet the same users with the same random numbers, and a difference between two settings within one
-environment owes nothing to the draw of either (common random numbers). The streams of two runs stay equal
-for as long as they draw equally many numbers, so between batch sizes only the users' start is shared.
+The run of environment e and repeat r has the seed `1000 r + e` in every setting. So all settings have the
+same users and the same random numbers, and differences within an environment are paired (common random
+numbers). Two runs share their stream as long as they draw equally many numbers, so runs with different batch
+sizes share only the initial users.
 """
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from typing import NamedTuple, TypeAlias
 
 import msgspec
@@ -20,7 +21,7 @@ from uav_dc_ros.experiments.train.population import Run
 
 Ratio: TypeAlias = tuple[float, float]
 
-# The paper's state: all a network sees is the UAV's cell.
+# The paper's state: a network's input is the UAV's cell.
 OBSERVATION: Observation = "position"
 # The paper names no layers. Two of 64 are ample for the 363 cells of the field.
 HIDDEN = (64, 64)
@@ -35,11 +36,11 @@ ENVIRONMENTS = (0, 1, 2, 3, 4)
 
 
 class Scale(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How much of the sweep is run.
+    """Size of a sweep.
 
     Attributes:
         name: `full` or `smoke`.
-        episodes: missions that every run flies to learn.
+        episodes: training missions of every run.
         episodes_per_point: consecutive missions whose mean is a point of a curve.
         environments: layouts of the users.
         repeats: runs of each setting in each environment.
@@ -72,11 +73,10 @@ FULL = Scale(
     # Ten missions even out the exploration of each, and leave a hundred points.
     episodes_per_point=10,
     environments=ENVIRONMENTS,
-    # The paper runs once in each of its five settings. A second run beside the first keeps the luck of one
-    # network out of what is said of a layout.
+    # The paper runs once in each of its five environments. A second run evens out the luck of one network.
     repeats=2,
     ratios=RATIOS,
-    # The paper gives the winners, 0.9 and 0.9, and not what they were compared with: values on either side.
+    # The paper states the best values, 0.9 and 0.9, and not the grid: values on either side.
     gammas=(0.8, 0.9, 0.95, 0.99),
     epsilons=(0.7, 0.8, 0.9, 0.95),
     # Likewise: powers of two around 32.
@@ -84,8 +84,8 @@ FULL = Scale(
     # All four are in the paper's text.
     learning_rates=(1e-2, 1e-3, 1e-4, 1e-5),
 )
-# Proves in a minute that every figure and every claim can be made; what they show then means nothing. The
-# ratios are those that a claim names, and one on either side of 1:1 for the claims on "above" and "below".
+# Shows in a minute that every figure and every claim can be made; its numbers mean nothing. The ratios are
+# those that a claim names, and one on either side of 1:1 for the claims on "above" and "below".
 SMOKE = Scale(
     name="smoke",
     episodes=10,
@@ -102,7 +102,7 @@ SCALES = {scale.name: scale for scale in (FULL, SMOKE)}
 
 
 class Setting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the paper compares: a scenario, a learner and what it is paid. The defaults are the paper's."""
+    """What the paper compares: a scenario, a learner and a reward. The defaults are the paper's."""
 
     scenario: str = "five_clusters"
     algorithm: Algorithm = "dqn"
@@ -126,14 +126,23 @@ class Setting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             values["beta"], values["zeta"] = values.pop("ratio")  # type: ignore[misc]
         return msgspec.structs.replace(self, **values)
 
+    def along(self, axes: Sequence[str], scale: Scale) -> list["Setting"]:
+        """Every combination of the values of `axes` in the sweep; the last axis varies fastest."""
+        points = product(*(domain(axis, scale) for axis in axes))
+        return [self.with_(**dict(zip(axes, point, strict=True))) for point in points]
 
-class Planned(NamedTuple):
+    def values(self, axes: Sequence[str]) -> tuple[object, ...]:
+        """Its values on `axes`."""
+        return tuple(getattr(self, axis) for axis in axes)
+
+
+class PlannedRun(NamedTuple):
     """One run of the sweep.
 
     Attributes:
         setting: what is compared.
         environment: layout of the users.
-        repeat: which of several runs of the setting in the environment.
+        repeat: number of the run among those of the setting in the environment.
     """
 
     setting: Setting
@@ -146,7 +155,7 @@ class Planned(NamedTuple):
         return 1000 * self.repeat + self.environment
 
     def run(self, scale: Scale) -> Run:
-        """What the trainer needs of it, beside the scenario."""
+        """The run of the trainer."""
         setting = self.setting
         reward = msgspec.structs.replace(
             _scenario(setting.scenario).reward,
@@ -155,23 +164,24 @@ class Planned(NamedTuple):
             r_plus=setting.r_plus,
             form=setting.form,
         )
+        hyperparameters = Hyperparameters(
+            gamma=setting.gamma,
+            epsilon=setting.epsilon,
+            batch_size=setting.batch_size,
+            learning_rate=setting.learning_rate,
+            episodes=scale.episodes,
+        )
         return Run(
             seed=self.seed,
             environment=self.environment,
             algorithm=setting.algorithm,
             reward=reward,
-            hyperparameters=Hyperparameters(
-                gamma=setting.gamma,
-                epsilon=setting.epsilon,
-                batch_size=setting.batch_size,
-                learning_rate=setting.learning_rate,
-                episodes=scale.episodes,
-            ),
+            hyperparameters=hyperparameters,
         )
 
 
-def domain(name: str, scale: Scale) -> Sequence[object]:
-    """The values that something varied runs through."""
+def domain(axis: str, scale: Scale) -> Sequence[object]:
+    """The values of an axis in the sweep: a field of `Setting`, or `ratio`."""
     domains: dict[str, Sequence[object]] = {
         "algorithm": ALGORITHMS,
         "r_plus": R_PLUS,
@@ -182,7 +192,20 @@ def domain(name: str, scale: Scale) -> Sequence[object]:
         "batch_size": scale.batch_sizes,
         "learning_rate": scale.learning_rates,
     }
-    return domains[name]
+    return domains[axis]
+
+
+def name(value: object) -> str:
+    """A value of a setting in words."""
+    if isinstance(value, tuple):
+        return f"{value[0]:g}:{value[1]:g}"
+    words = {
+        "dqn": "DQL",
+        "dueling_dqn": "dueling DQL",
+        "three_clusters": "3 clusters",
+        "five_clusters": "5 clusters",
+    }
+    return words.get(value, value) if isinstance(value, str) else f"{value:g}"
 
 
 _scenario = cache(scenarios.load)

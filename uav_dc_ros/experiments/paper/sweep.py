@@ -1,4 +1,4 @@
-"""The sweep: planned runs become shards, shards become results."""
+"""The sweep: planned runs become shards, and their results become `Results`."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -21,66 +21,65 @@ from uav_dc_ros.experiments.evaluate.trajectory import roll_out_trajectory
 from uav_dc_ros.experiments.paper import shards
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results
-from uav_dc_ros.experiments.paper.setting import HIDDEN, OBSERVATION, Planned, Scale, Setting
-from uav_dc_ros.experiments.paper.shards import Shard, Trained
+from uav_dc_ros.experiments.paper.setting import HIDDEN, OBSERVATION, PlannedRun, Scale, Setting
+from uav_dc_ros.experiments.paper.shards import Shard, ShardResult
 from uav_dc_ros.experiments.train.population import Population, architecture, layout
 
 # Runs of a shard: enough to hide the overhead of an operation, few enough for a core's cache, and enough
 # shards to keep the workers busy to the end.
 _SHARD_RUNS = 128
-# Greedy missions of each run: seeds that no run was trained with and no policy is judged by.
+# First seed of the greedy missions and their number: disjoint from training, validation and test.
 GREEDY_SEEDS = (2_000_000, 20)
 
-# Trains shards and keeps their results in a folder.
-TrainAll = Callable[[Sequence[Shard], Path], None]
-# Where each run is: what its shard brought, and its place in there.
-Found: TypeAlias = dict[Planned, tuple[Trained, int]]
-# Networks by the environments that they learnt in.
-Trajectories: TypeAlias = dict[int, network.Parameters]
+# Trains shards and saves their results in a folder.
+TrainShards = Callable[[Sequence[Shard], Path], None]
+# The result of each run's shard, and the index of the run in it.
+RunResults: TypeAlias = dict[PlannedRun, tuple[ShardResult, int]]
+# Trained networks of the figure `Traj`, by environment.
+Networks: TypeAlias = dict[int, network.Parameters]
 
 
-def cut(planned: Sequence[Planned], scale: Scale) -> list[tuple[Shard, list[Planned]]]:
-    """The runs as shards, longest first, each with the runs it holds in order."""
-    alike: dict[tuple[str, int], list[Planned]] = defaultdict(list)
+def make_shards(planned: Sequence[PlannedRun], scale: Scale) -> list[tuple[Shard, list[PlannedRun]]]:
+    """The runs as shards, each with its runs in order; longest first, so that none starts last."""
+    groups: dict[tuple[str, int], list[PlannedRun]] = defaultdict(list)
     for one in planned:
-        # A batch up to the paper's 32 costs what 32 costs; only larger ones are kept apart.
-        alike[one.setting.scenario, max(one.setting.batch_size, 32)].append(one)
+        # A batch up to the paper's 32 costs as much as 32; only larger ones are separate.
+        groups[one.setting.scenario, max(one.setting.batch_size, 32)].append(one)
     made = []
-    for (scenario, _), runs in alike.items():
+    for (scenario, _), runs in groups.items():
         # Neighbours with one learning rate share a step of the optimiser.
         runs = sorted(runs, key=lambda one: one.setting.learning_rate)
         for part in np.array_split(np.arange(len(runs)), -(-len(runs) // _SHARD_RUNS)):
             own = [runs[i] for i in part]
             population = _population(scenario, own, scale)
             made.append((Shard(population=population, greedy_seeds=GREEDY_SEEDS), own))
-    # Longest first, so that no worker begins a long one when the others are done.
     return sorted(made, key=lambda one: (-one[0].n_steps, one[0].name))
 
 
-def train(planned: Sequence[Planned], scale: Scale, folder: Path, train_all: TrainAll) -> Found:
-    """Trains what is planned, but for shards whose results are in `folder` already."""
-    made = cut(planned, scale)
+def train(planned: Sequence[PlannedRun], scale: Scale, folder: Path, train_shards: TrainShards) -> RunResults:
+    """Trains the shards whose results are not in `folder`, and loads all results."""
+    made = make_shards(planned, scale)
     missing = [shard for shard, _ in made if not shards.result_file(folder, shard).is_file()]
     if missing:
-        train_all(missing, folder)
-    found: Found = {}
+        train_shards(missing, folder)
+    found: RunResults = {}
     for shard, own in made:
-        trained = shards.load(folder, shard)
-        found |= {one: (trained, run) for run, one in enumerate(own)}
+        result = shards.load_result(folder, shard)
+        found |= {one: (result, run) for run, one in enumerate(own)}
     return found
 
 
-def collect(planned: Sequence[Planned], metadata: Metadata, found: Found) -> Results:
-    """What the runs measured, as means over the episodes of a point and over the greedy missions."""
+def collect(planned: Sequence[PlannedRun], metadata: Metadata, found: RunResults) -> Results:
+    """The measures of the runs, as means over the episodes of a point and over the greedy missions."""
     n_points, per_point = metadata.scale.n_points, metadata.scale.episodes_per_point
 
-    def curve(one: Planned, name: str) -> Array:
-        trained, run = found[one]
-        return trained.curves[name][: n_points * per_point, run].reshape(n_points, per_point).mean(axis=1)
+    def curve(one: PlannedRun, name: str) -> Array:
+        result, run = found[one]
+        return result.curves[name][: n_points * per_point, run].reshape(n_points, per_point).mean(axis=1)
 
-    def greedy(one: Planned, name: str) -> float:
-        trained, run = found[one]
-        missions, max_steps = trained.greedy, metadata.worlds[one.setting.scenario].max_steps
+    def greedy(one: PlannedRun, name: str) -> float:
+        result, run = found[one]
+        missions, max_steps = result.greedy, metadata.worlds[one.setting.scenario].max_steps
         values = {
             "greedy_reward": missions.reward,
             "greedy_return": missions.episode_return,
@@ -100,37 +99,37 @@ def collect(planned: Sequence[Planned], metadata: Metadata, found: Found) -> Res
     )
 
 
-def trajectories(planned: Sequence[Planned], scale: Scale, found: Found) -> Trajectories:
-    """The networks of the figure `Traj`; none when its runs are not planned."""
+def trajectory_networks(planned: Sequence[PlannedRun], scale: Scale, found: RunResults) -> Networks:
+    """The networks of the figure `Traj`; none if its runs are not planned."""
     setting = _trajectory_setting(scale)
     own = {one.environment: found[one] for one in planned if one.setting == setting and one.repeat == 0}
-    return {environment: trained.parameters[run] for environment, (trained, run) in own.items()}
+    return {environment: result.parameters[run] for environment, (result, run) in own.items()}
 
 
-def fly_tracks(networks: Trajectories, scale: Scale) -> list[Trajectory]:
+def roll_out_trajectories(networks: Networks, scale: Scale) -> list[Trajectory]:
     """A greedy mission of each network in its environment."""
     scenario, sizes = _trajectory_network(scale)
 
-    def track(environment: int) -> Trajectory:
+    def trajectory(environment: int) -> Trajectory:
         def act(state: world.State) -> Array:
-            seen = observe(OBSERVATION, scenario, state)
-            return network.q_values(sizes, networks[environment], seen).argmax(-1)
+            observation = observe(OBSERVATION, scenario, state)
+            return network.q_values(sizes, networks[environment], observation).argmax(-1)
 
         return roll_out_trajectory(scenario, act, GREEDY_SEEDS[0], layout(environment, (scenario.n_users, 2)))
 
-    return [track(environment) for environment in sorted(networks)]
+    return [trajectory(environment) for environment in sorted(networks)]
 
 
-def save_trajectories(networks: Trajectories, path: Path) -> None:
+def save_networks(networks: Networks, path: Path) -> None:
     """Writes the networks, each parameter as `ENVIRONMENT.NAME`."""
     arrays = {f"{e}.{name}": values for e, own in networks.items() for name, values in own.items()}
     files.write(path, safetensors.numpy.save(arrays))
 
 
-def load_trajectories(path: Path, scale: Scale) -> Trajectories:
-    """Reads what `save_trajectories` wrote; raises TrainingError for anything else."""
+def load_networks(path: Path, scale: Scale) -> Networks:
+    """Reads what `save_networks` wrote; raises TrainingError for other content."""
     expected = network.shapes(_trajectory_network(scale)[1])
-    networks: Trajectories = defaultdict(dict)
+    networks: Networks = defaultdict(dict)
     try:
         for key, values in safetensors.numpy.load(path.read_bytes()).items():
             environment, _, name = key.partition(".")
@@ -149,13 +148,13 @@ def _trajectory_setting(scale: Scale) -> Setting:
 
 
 def _trajectory_network(scale: Scale) -> tuple[Scenario, network.Architecture]:
-    """The world of the figure `Traj`, and the sizes of its networks."""
+    """The scenario of the figure `Traj`, and the sizes of its networks."""
     setting = _trajectory_setting(scale)
-    population = _population(setting.scenario, [Planned(setting, 0, 0)], scale)
+    population = _population(setting.scenario, [PlannedRun(setting, 0, 0)], scale)
     return population.scenario, architecture(population, population.runs[0])
 
 
-def _population(scenario: str, runs: Sequence[Planned], scale: Scale) -> Population:
+def _population(scenario: str, runs: Sequence[PlannedRun], scale: Scale) -> Population:
     return Population(
         scenario=scenarios.load(scenario),
         observation=OBSERVATION,
