@@ -149,13 +149,13 @@ def favourite_of_17(s):
     return dueling(s) and exponential(s) and episode(s) and s.ratio == (4, 1)
 
 
-def tested(results, claim):
+def finding_of(results, claim):
     return finding(next(one for one in CLAIMS if one.id == claim), Evidence(results))
 
 
 @pytest.mark.parametrize("claim", TRUE)
 def test_a_claim_that_is_true_holds(claim):
-    found = tested(sweep(TRUE[claim]), claim)
+    found = finding_of(sweep(TRUE[claim]), claim)
     assert found.verdict == "holds", found.assessment.criteria
     assert found.decisive == found.assessment.criteria[0]
 
@@ -163,7 +163,7 @@ def test_a_claim_that_is_true_holds(claim):
 @pytest.mark.parametrize("case", FALSE)
 def test_a_claim_of_which_one_part_is_false_does_not_hold(case):
     claim, levels = FALSE[case]
-    found = tested(sweep(levels), claim)
+    found = finding_of(sweep(levels), claim)
     assert found.verdict == "does not hold", found.assessment.criteria
     assert found.decisive.verdict == "does not hold"
 
@@ -186,7 +186,7 @@ def test_environments_that_disagree_decide_nothing(claim):
     if claim == "C13":
         one = [i for i in turned if good.planned[i].setting.ratio == (4, 1)]
         good.curves["throughput_bps"][one] *= 0.8
-    found = tested(good, claim)
+    found = finding_of(good, claim)
     assert found.verdict == "undecided", found.assessment.criteria
 
 
