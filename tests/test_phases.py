@@ -57,7 +57,7 @@ def test_in_the_air_it_is_the_end_of_the_mission(
 ) -> None:
     monkeypatch.setattr(MissionController, "is_strict", False)
     flight = fly_to_step(3)
-    flight.bridge.course.step += more_steps
+    flight.bridge.progress.step += more_steps
     flight._step += more_steps
     before = len(flight.log)
     (flight.bridge._end if wrong.is_over else flight.bridge._enter)(wrong, "wrong")

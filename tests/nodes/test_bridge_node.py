@@ -132,7 +132,7 @@ def test_the_vehicle_is_seen_obeying_while_the_bridge_stops(made: Made) -> None:
     made.vehicle.send_command = lambda command: publisher.publish(String(data=command.mode))  # type: ignore[method-assign]
     node.trigger_deactivate()
     assert node._known.mode is Mode.RETURN
-    assert node.bridge.is_done_with(node._known)
+    assert node.bridge.can_be_released(node._known)
     assert vehicle.closed == 1
 
 
@@ -276,7 +276,7 @@ def test_a_position_that_cannot_be_true_is_not_published(made: Made, monkeypatch
 
 def test_steps_that_were_not_reached_are_told(made: Made) -> None:
     activate(made)
-    made.node.bridge.course.steps_not_reached = 3
+    made.node.bridge.progress.steps_not_reached = 3
     made.node._tell()
     assert isinstance(made.node._told, messages.Mission)
     assert made.node._told.steps_not_reached == 3

@@ -94,11 +94,11 @@ def test_ardupilot_is_taken_off_by_a_pilot_resumed_after_a_restart_and_taken_ove
         mavros.do("takeoff 10")
         flight.until(lambda: flight.bridge.phase is Phase.MOVING)
         assert flight.bridge.step == 0
-        standing, grid_origin = flight.bridge.standing, vehicle.grid_origin
+        standing, grid_origin = flight.bridge.checkpoint, vehicle.grid_origin
         vehicle.close()
 
         with mavros_of(node, grid_origin=grid_origin) as after:
-            resumed = Flight(executor, after, mavros, SafetySettings(), standing=standing)
+            resumed = Flight(executor, after, mavros, SafetySettings(), checkpoint=standing)
             resumed.until(lambda: resumed.bridge.phase is Phase.MOVING)
             assert after.grid_origin == grid_origin
             assert Phase.PREFLIGHT not in [phase for phase, _, _ in resumed.log]

@@ -186,7 +186,7 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
             vehicle.send_command(command)
         if bridge.phase is Phase.READY and bridge.fault is None:
             assert bridge.move(bridge.step, way_home(bridge)) is None
-            cells.append(bridge.course.goal)
+            cells.append(bridge.progress.goal)
         vehicle.set_setpoint(bridge.setpoint)
     assert bridge.phase is Phase.LANDED, log[-5:]
     assert cells == [(2, 0, 0), (2, 1, 0), (2, 1, 0)]

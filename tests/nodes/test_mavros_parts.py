@@ -406,7 +406,7 @@ def test_with_mavros_msgs_the_estimators_flags_count(wrong: dict[str, bool]) -> 
 @pytest.mark.parametrize("kind", ["PX4 Autopilot", "ArduPilot"])
 def test_with_mavros_msgs_an_estimate_that_a_cut_link_leaves_old_is_not_lost(kind: str) -> None:
     """The link is back: heartbeats come first. What ended while heartbeats came was lost."""
-    watch = FaultDetector(SafetySettings())
+    detector = FaultDetector(SafetySettings())
     telemetry = full(kind)
     sys_status = Message(sensors_enabled=1 << 21, sensors_health=0)
 
@@ -418,7 +418,7 @@ def test_with_mavros_msgs_an_estimate_that_a_cut_link_leaves_old_is_not_lost(kin
 
     def is_lost(now_s: float, heartbeat_s: float) -> bool:
         telemetry.on_state(Message(connected=True, armed=True, mode="GUIDED", system_status=4), heartbeat_s)
-        return watch.estimate_is_lost(now_s, watch.see(now_s, telemetry.snapshot(now_s)))
+        return detector.estimate_lost(now_s, detector.update(now_s, telemetry.snapshot(now_s)))
 
     telemetry.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.0)
     report(1.0)

@@ -727,7 +727,7 @@ class Flight:
     def note(self) -> None:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and self.log[-1][0] is not Phase.MOVING:
-            self.cells.append(bridge.course.goal)
+            self.cells.append(bridge.progress.goal)
         told = bridge.phase, bridge.step, bridge.reason
         if told not in self.log[-1:]:  # what is to be kept may change without
             self.log.append(told)
@@ -854,12 +854,12 @@ def test_without_a_position_it_holds_until_px4_gives_up(
 def test_a_bridge_that_is_started_again_in_the_air_goes_on(flight: Flight) -> None:
     flight.until(lambda: flight.bridge.step == 2)
     flight.do("speed 0.2")  # PX4 waits a second of its time, and no more
-    standing, grid_origin, place = flight.bridge.standing, flight.vehicle.grid_origin, Enu(7.0, 7.0, 7.0)
+    standing, grid_origin, place = flight.bridge.checkpoint, flight.vehicle.grid_origin, Enu(7.0, 7.0, 7.0)
     flight.vehicle.close()
     flight.bridge = MissionController(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
     flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], start=place, grid_origin=grid_origin)
     flight.vehicle.open()
-    flight.until(lambda: flight.log[-1][2].startswith("it flies already"))
+    flight.until(lambda: flight.log[-1][2].startswith("in the air when the bridge started"))
     flight.spun.pass_time(1.0, flight.tick)  # until PX4 has found the new publishers
     flight.do(f"speed {SPEED}")
     flight.finish()

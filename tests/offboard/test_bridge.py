@@ -83,7 +83,9 @@ def test_a_failsafe_is_watched_down_and_not_meddled_with(mode: Mode) -> None:
     flight.run(0.2)
     assert flight.bridge.phase is Phase.LANDING
     assert flight.bridge.setpoint is None
-    assert "changed by a pilot or by the autopilot's failsafe (it says: GCS Failsafe)" in flight.bridge.reason
+    assert (
+        "changed by a pilot or by the autopilot's failsafe (autopilot: GCS Failsafe)" in flight.bridge.reason
+    )
     flight.until(Phase.ABORTED, 600.0)
     assert flight.vehicle.asked == []
     assert not flight.vehicle.armed
@@ -120,7 +122,9 @@ def test_who_disarmed_it_is_told_with_what_the_autopilot_says() -> None:
     flight.vehicle.armed, flight.vehicle.mode = False, Mode.COMMANDED
     flight.vehicle.said = "Disarming motors"
     flight.run(0.2)
-    reason = "disarmed by a pilot or by the autopilot itself while it was takeoff (it says: Disarming motors)"
+    reason = (
+        "disarmed by a pilot or by the autopilot itself in the phase takeoff (autopilot: Disarming motors)"
+    )
     assert (flight.bridge.phase, flight.bridge.reason) == (Phase.ABORTED, reason)
 
 
@@ -167,7 +171,7 @@ def test_a_vehicle_that_refuses_to_return_is_told_to_land() -> None:
     asked = [command for command in flight.vehicle.asked if isinstance(command, SetMode)]
     tries = flight.bridge.settings.max_return_attempts
     assert asked[1:] == [SetMode(Mode.RETURN)] * tries + [SetMode(Mode.LAND)]
-    assert "it does not return" in flight.bridge.reason
+    assert "return not executed" in flight.bridge.reason
 
 
 def test_until_it_obeys_a_vehicle_that_is_to_land_is_held() -> None:
@@ -186,7 +190,7 @@ def test_a_vehicle_that_is_never_heard_of_again_ends_the_mission_without_a_wish(
     flight.vehicle.asked.clear()
     flight.vehicle.silent = True
     flight.until(Phase.ABORTED, 400.0)
-    assert "not heard of for 300 s" in flight.bridge.reason
+    assert "no heartbeat for 300 s" in flight.bridge.reason
     assert flight.vehicle.asked == []
 
 
@@ -258,7 +262,7 @@ def test_a_silent_policy_ends_the_mission_after_two_steps() -> None:
 
 def test_a_vehicle_that_flies_already_goes_on_where_it_was() -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
-    flight = Flight(SafetySettings(), vehicle, standing=Checkpoint(step=7, cell=(3, 3, 1), flies=True))
+    flight = Flight(SafetySettings(), vehicle, checkpoint=Checkpoint(step=7, cell=(3, 3, 1), airborne=True))
     flight.until(Phase.LANDED)
     assert flight.executed == list(range(7, SCENARIO.mission.max_steps))
 
@@ -272,7 +276,7 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
     while vehicle.now_s < at_s and not first.bridge.is_over:
         first.tick(0.2)
     before = first.bridge.phase
-    standing = msgspec.json.decode(msgspec.json.encode(first.bridge.standing), type=Checkpoint)
+    standing = msgspec.json.decode(msgspec.json.encode(first.bridge.checkpoint), type=Checkpoint)
     setpoint = first.bridge.setpoint
     flew = vehicle.armed and not vehicle.on_ground
     if flew and pilot:
@@ -283,7 +287,7 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
     for _ in range(round(gone_s)):
         vehicle.pass_time(1.0, setpoint)  # it goes on to its last setpoint
     asked = len(vehicle.asked)
-    second = Flight(ARMING, vehicle, standing=standing)
+    second = Flight(ARMING, vehicle, checkpoint=standing)
     while not second.bridge.is_over and vehicle.now_s < 4000.0:
         second.tick(0.2)
     assert second.bridge.is_over, second.log[-3:]
@@ -301,10 +305,10 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
 
 def test_a_bridge_that_comes_back_to_a_vehicle_outside_the_fence_brings_it_home() -> None:
     vehicle = Vehicle(position=Enu(2000.0, 300.0, 150.0), mode=Mode.COMMANDED, armed=True)
-    flight = Flight(ARMING, vehicle, standing=Checkpoint(step=7, cell=(3, 3, 1), flies=True))
+    flight = Flight(ARMING, vehicle, checkpoint=Checkpoint(step=7, cell=(3, 3, 1), airborne=True))
     flight.until(Phase.ABORTED)
     assert flight.executed == []
-    assert flight.bridge.reason.startswith("outside the fence when the bridge came back: 2000.0 m east")
+    assert flight.bridge.reason.startswith("outside the fence when the bridge restarted: 2000.0 m east")
     assert SetMode(Mode.RETURN) in vehicle.asked
 
 
@@ -313,7 +317,7 @@ def test_a_bridge_that_comes_back_knows_its_battery() -> None:
     first = Flight(vehicle=Vehicle(position=Enu(START.east_m, START.north_m, 0.0), battery_v=12.6))
     first.until(Phase.MOVING)
     first.vehicle.battery, first.vehicle.battery_v = 0.0, 12.3
-    second = Flight(ARMING, first.vehicle, standing=first.bridge.standing)
+    second = Flight(ARMING, first.vehicle, checkpoint=first.bridge.checkpoint)
     second.until(Phase.LANDED)
 
 
@@ -335,19 +339,19 @@ def test_a_vehicle_that_somebody_else_flew_is_not_armed_again(mode: Mode) -> Non
     flight.run(60.0)
     assert not vehicle.armed
     assert vehicle.asked == []
-    assert flight.bridge.reason == "a pilot had it: waiting for a pilot to set the mode and arm"
+    assert flight.bridge.reason == "a pilot had control: waiting for a pilot to set the mode and arm"
     vehicle.mode, vehicle.armed = Mode.COMMANDED, True
     flight.until(Phase.LANDED)
 
 
 def test_moves_out_of_turn_change_nothing() -> None:
     flight = fly_to_step(5)
-    before = flight.bridge.course.goal, flight.bridge.setpoint
+    before = flight.bridge.progress.goal, flight.bridge.setpoint
     assert "expected it to be ready" in str(flight.bridge.move(5, Action.UPWARD))
     flight.policy = None
     flight.until(Phase.READY)
     assert flight.bridge.move(5, Action.UPWARD) == "a move for step 5; expected 6"
-    assert (flight.bridge.course.goal, flight.bridge.setpoint) == before
+    assert (flight.bridge.progress.goal, flight.bridge.setpoint) == before
 
 
 FAULTS = st.sampled_from(

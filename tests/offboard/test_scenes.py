@@ -89,7 +89,7 @@ def test_one_odd_message_does_nothing(kind: str, line: str) -> None:
     flight.until_over()
     check_landed(flight)
     assert sum(flight.telemetry.discarded.values()) >= 1
-    assert not any(reason.startswith("goes on after") for _, _, reason in flight.log)
+    assert not any(reason.startswith("resumed after") for _, _, reason in flight.log)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -183,7 +183,7 @@ def test_wind_that_outdoes_the_vehicle_ends_with_a_landing_where_it_is(kind: str
     moving(flight)
     flight.do("wind 20 0")
     flight.until_over(120.0)
-    check_aborted(flight, "no nearer to cell", "it returns, and has come no nearer to home", "lands")
+    check_aborted(flight, "no nearer to cell", "return no nearer to home", "lands")
     returns, lands = ("RTL", "LAND") if kind == "ardupilot" else ("AUTO.RTL", "AUTO.LAND")
     assert [event["mode"] for event in flight.all("mode")][-2:] == [returns, lands]
 
@@ -205,7 +205,7 @@ def test_an_autopilot_s_fence_inside_the_field_is_refused_before_take_off(kind: 
 
 
 @pytest.mark.parametrize(
-    ("kind", "cause"), [("ardupilot", "does not take its target"), ("px4", "AUTO.RTL: changed by")]
+    ("kind", "cause"), [("ardupilot", "does not accept the setpoint"), ("px4", "AUTO.RTL: changed by")]
 )
 def test_an_autopilot_s_fence_that_comes_in_flight_is_noticed(kind: str, cause: str) -> None:
     """ArduCopter ignores a target outside in silence; PX4 returns, and says so."""
@@ -214,7 +214,7 @@ def test_an_autopilot_s_fence_that_comes_in_flight_is_noticed(kind: str, cause: 
     fence_in(flight, kind)
     flight.until_over(120.0)
     check_aborted(flight, cause)
-    assert flight.bridge.course.steps_not_reached == 0
+    assert flight.bridge.progress.steps_not_reached == 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -254,7 +254,7 @@ def test_a_second_bridge_that_comes_in_flight_is_reported(kind: str) -> None:
     flight.until_over(300.0)
     assert any("another system commands this vehicle: position targets" in why for _, _, why in flight.log)
     assert not flight.copter.armed
-    assert flight.bridge.course.steps_not_reached == 0, "no step counts that was not flown"
+    assert flight.bridge.progress.steps_not_reached == 0, "no step counts that was not flown"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -327,7 +327,7 @@ def test_a_descent_that_takes_longer_than_a_step_is_told_before_and_counted_afte
     assert any(warning in why for phase, _, why in flight.log if phase is Phase.PREFLIGHT)
     flight.until_over()
     assert flight.bridge.phase is Phase.TIMEOUT
-    assert flight.bridge.course.steps_not_reached == 3
+    assert flight.bridge.progress.steps_not_reached == 3
     assert not flight.copter.armed
 
 
@@ -337,7 +337,7 @@ def test_voltage_that_the_autopilot_finds_low_brings_it_home_though_the_count_is
     moving(flight)
     flight.do("volts 10.3")  # more than four fifths of what it had at rest
     flight.until_over(180.0)
-    check_aborted(flight, "at 10.3 V, 12.6 V at rest: the autopilot finds it low or broken")
+    check_aborted(flight, "at 10.3 V, 12.6 V at rest: the autopilot reports it low or broken")
     assert flight.copter.charge > 0.8
 
 

@@ -30,8 +30,8 @@ class Stubborn(Vehicle):
 
 def restarted(flight: Flight) -> Flight:
     """Another bridge beside the same vehicle, that knows what the journal tells."""
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Checkpoint)
-    return Flight(flight.bridge.settings, flight.vehicle, standing=standing)
+    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
+    return Flight(flight.bridge.settings, flight.vehicle, checkpoint=standing)
 
 
 def test_a_switch_on_the_ground_is_the_last_word() -> None:
@@ -74,7 +74,7 @@ def test_what_was_requested_is_kept_before_it_is_sent() -> None:
 
     def keep() -> None:
         note()
-        kept.append(flight.bridge.standing.allowed_mode)
+        kept.append(flight.bridge.checkpoint.allowed_mode)
         assert flight.vehicle.asked == [] or kept[-1] is not None
 
     flight.bridge._on_change = keep
@@ -190,7 +190,7 @@ def test_a_target_that_is_not_ours_for_long_ends_the_mission() -> None:
     vehicle.fence_m = 1.0  # it keeps the target that it has
     vehicle.target = Enu(0.0, 500.0, 150.0)
     flight.until(Phase.LANDING, 12.0)
-    assert "the autopilot does not take its target: it reports one" in flight.bridge.reason
+    assert "the autopilot does not accept the setpoint: its target is" in flight.bridge.reason
     flight.until(Phase.ABORTED)
 
 
@@ -228,7 +228,7 @@ def test_a_bridge_that_is_stopped_brings_a_vehicle_down_in_every_phase(
     flight.bridge.stop("the bridge was stopped", vehicle.told)
     flight.run(0.3)
     assert vehicle.asked == [SetMode(then)]
-    assert flight.bridge.is_done_with(vehicle.told)
+    assert flight.bridge.can_be_released(vehicle.told)
     flight.until(Phase.ABORTED)
     assert flight.bridge.reason == "the bridge was stopped"
 
@@ -280,7 +280,7 @@ def test_a_vehicle_that_was_armed_and_disarmed_before_take_off_is_not_armed_agai
     vehicle.asked.clear()
     flight.run(10.0)
     assert vehicle.asked == []
-    assert flight.bridge.reason == "a pilot had it: waiting for a pilot to set the mode and arm"
+    assert flight.bridge.reason == "a pilot had control: waiting for a pilot to set the mode and arm"
     again = restarted(flight)
     again.run(10.0)
     assert vehicle.asked == []
@@ -300,5 +300,5 @@ def test_a_vehicle_that_is_disarmed_as_a_bridge_comes_back_is_not_armed_again() 
     assert again.vehicle.asked == []
     assert (again.bridge.phase, again.bridge.reason) == (
         Phase.ABORTED,
-        "on the ground and disarmed when the bridge came back",
+        "on the ground and disarmed when the bridge restarted",
     )

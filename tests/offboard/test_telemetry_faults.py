@@ -136,9 +136,9 @@ class Distorted(Flight):
         before = self._step
         self._note()
         if self.bridge.step != before:
-            here = self.bridge._known.position
+            here = self.bridge._telemetry.position
             assert here is not None
-            centre, grid = self.bridge.course.centre(self.bridge.cell), FIELD.grid
+            centre, grid = self.bridge.progress.centre(self.bridge.cell), FIELD.grid
             for p, c, size_m in zip(
                 here, centre, (grid.cell_m, grid.cell_m, grid.altitude_step_m), strict=True
             ):
@@ -157,7 +157,7 @@ class Distorted(Flight):
             for fault in present:
                 known = distorted(fault, known, self.history, now_s)
             self.policy = None if any(f.kind == "silent policy" for f in present) else _way
-            bridge.policy_is_gone = any(f.kind == "policy gone" for f in present)
+            bridge.policy_lost = any(f.kind == "policy gone" for f in present)
             self.tick(TICK_S, known)
             if bridge.phase in ON_GROUND and now_s > 1200.0:
                 break

@@ -17,8 +17,8 @@ GROUND = Enu(START.east_m, START.north_m, 0.0)
 
 def restarted(flight: Flight) -> Flight:
     """Another bridge beside the same vehicle, that knows what the journal tells."""
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.standing), type=Checkpoint)
-    return Flight(flight.bridge.settings, flight.vehicle, standing=standing)
+    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
+    return Flight(flight.bridge.settings, flight.vehicle, checkpoint=standing)
 
 
 def drifting() -> Flight:
@@ -57,7 +57,7 @@ def test_a_landing_at_the_dock_goes_on_as_one() -> None:
     flight = fly_to_step(3)
     flight.vehicle.deaf = True
     flight.until(Phase.LANDING)
-    assert flight.bridge.standing.outcome is Phase.LANDED
+    assert flight.bridge.checkpoint.outcome is Phase.LANDED
     flight.vehicle.deaf = False
     again = restarted(flight)
     again.until(Phase.LANDED)
@@ -135,7 +135,7 @@ def test_a_mode_that_was_entered_is_known_to_a_bridge_that_is_started_anew() -> 
 
     def keep() -> None:
         note()
-        kept.append(flight.bridge.standing)
+        kept.append(flight.bridge.checkpoint)
 
     flight.bridge._on_change = keep
     while vehicle.mode is not Mode.COMMANDED:
@@ -145,7 +145,7 @@ def test_a_mode_that_was_entered_is_known_to_a_bridge_that_is_started_anew() -> 
     vehicle.armed = False
     vehicle.mode = Mode.OTHER
     vehicle._tell()
-    again = Flight(ARMING, vehicle, standing=kept[-1])
+    again = Flight(ARMING, vehicle, checkpoint=kept[-1])
     again.run(10.0)
     assert vehicle.asked == []
 
@@ -189,8 +189,8 @@ def test_a_vehicle_whose_clock_stands_is_asked_again(link_lost_timeout_s: float,
 @pytest.mark.parametrize("again", [True, False])
 def test_a_vehicle_that_flies_goes_straight_up_or_down_then_across(up_m: float, again: bool) -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, up_m), mode=Mode.COMMANDED, armed=True)
-    standing = Checkpoint(step=0, cell=SCENARIO.start_cell, flies=True) if again else None
-    flight = Flight(SafetySettings(), vehicle, standing=standing)
+    standing = Checkpoint(step=0, cell=SCENARIO.start_cell, airborne=True) if again else None
+    flight = Flight(SafetySettings(), vehicle, checkpoint=standing)
     while abs(vehicle.position.up_m - START.up_m) > 3.0:
         assert vehicle.position[:2] == (300.0, 300.0)
         flight.tick()

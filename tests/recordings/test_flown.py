@@ -165,7 +165,7 @@ def test_a_vehicle_that_is_ready_again_has_the_same_users_at_another_time():
     flight = flights.Flight(TINY, beat=frozen, patience_s=5.0)
     found, stream = read(flight.fly())
     reasons = [told.reason for told in found[0].phase_reports if told.phase is Phase.READY]
-    assert reasons[1:] == ["no position for 0.5 s", f"goes on after: {reasons[1]}"]
+    assert reasons[1:] == ["no position for 0.5 s", f"resumed after: {reasons[1]}"]
     kinds = [told.fault for told in found[0].phase_reports if told.phase is Phase.READY]
     assert kinds == [None, FaultKind.POSITION, None]
     assert found[0].flight == found[-1].flight == 0, "it is no other flight"
@@ -382,7 +382,7 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
     assert out.endswith("\nverified\n")
     assert "phases of 8 of 8 steps checked, all changes are allowed; 7 moves were started" in out
     told = [one for step in steps_of(bag)[0] for one in step.phase_reports]
-    gone = (True, FaultKind.POLICY, "the policy is gone")
+    gone = (True, FaultKind.POLICY, "policy lost")
     assert gone in {(one.held, one.fault, one.reason) for one in told}
     assert sum(one.phase is Phase.TAKEOFF for one in told) == 2
     status, out = run(capsys, "info", bag)

@@ -100,7 +100,7 @@ class Flight:
     def kill_bridge(self) -> None:
         """SIGKILL it; another one comes after a while."""
         assert self.bridge is not None
-        self._standing, self._setpoint = self.bridge.standing, self.bridge.setpoint
+        self._standing, self._setpoint = self.bridge.checkpoint, self.bridge.setpoint
         self.bridge, self._dead_until_s = None, self.vehicle.now_s + DEAD_S
 
     def set_clock(self, by_s: float) -> None:
@@ -121,7 +121,7 @@ class Flight:
         bridge, vehicle = self.bridge, self.vehicle
         if bridge is None:
             if vehicle.now_s >= self._dead_until_s:
-                self.bridge = self._bridge(standing=self._standing)
+                self.bridge = self._bridge(checkpoint=self._standing)
             vehicle.pass_time(self.tick_s, self._setpoint)
             return
         for command in bridge.tick(vehicle.now_s, vehicle.told):
@@ -151,7 +151,7 @@ class Flight:
             seed=self.seed,
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,
-            steps_not_reached=bridge.course.steps_not_reached,
+            steps_not_reached=bridge.progress.steps_not_reached,
         )
         if status == self._last:
             return  # as the node does
@@ -200,7 +200,7 @@ class Flight:
         self._say("move", messages.Move(mission=0, step=step, action=ACTION_LABELS[action]))
         if bridge.move(step, action) is None:
             self.executed.append(step)
-            goal = bridge.scenario.grid.centre_m(np.asarray(bridge.course.goal), like=np.zeros(1))
+            goal = bridge.scenario.grid.centre_m(np.asarray(bridge.progress.goal), like=np.zeros(1))
             self._say("target", pose(goal.tolist(), self.now_ns))
 
     def _decided(self, status: messages.Mission, rates: messages.Rates) -> Action:

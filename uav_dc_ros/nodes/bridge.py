@@ -27,7 +27,7 @@ from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
-from uav_dc_ros.offboard.mission.plausibility import Plausibility
+from uav_dc_ros.offboard.mission.plausibility import PlausibilityFilter
 from uav_dc_ros.offboard.mission.progress import Checkpoint
 from uav_dc_ros.offboard.realtime import use_realtime_priority
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Vehicle
@@ -80,7 +80,7 @@ class AutopilotBridge(MissionNode):
         kept = self._restore()
         standing, anchor = (None, "") if kept is None else (kept.standing, kept.anchor)
         # On the ground it is found anew: who was heard first there need not be the one that is meant.
-        system = kept.system if kept is not None and kept.standing.flies else None
+        system = kept.system if kept is not None and kept.standing.airborne else None
         datum = self._datum()
         self.run = self.values["run"] or (self.run if kept is None else kept.run)
         self.bridge = MissionController(self.scenario, self.settings, self._on_change, standing, self.fence)
@@ -88,13 +88,13 @@ class AutopilotBridge(MissionNode):
         self.vehicle: Vehicle = vehicles.make(self, self.values, *way)
         self._ready_peers: set[str] = set()
         self._peers_seen = False
-        self._begun = standing is not None and standing.flies
+        self._begun = standing is not None and standing.airborne
         self._forgets = False  # the journal cannot be written
         self._known = Telemetry(system_id=system)
         self._told: messages.Mission | None = None
         self._news: list[str] = []  # changes since the last diagnostics
         self._changes = 0
-        self._plausible = Plausibility(self.settings.max_speed_mps, self.settings.max_position_jump_m)
+        self._plausible = PlausibilityFilter(self.settings.max_speed_mps, self.settings.max_position_jump_m)
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`
@@ -123,7 +123,7 @@ class AutopilotBridge(MissionNode):
     def _wait_until_it_obeys(self) -> None:
         """Go on as before: to see whether it obeys takes messages, and the timer of `_tick`."""
         deadline_s, failed = time.monotonic() + OBEYS_S, False
-        while not self.bridge.is_done_with(self._known) and time.monotonic() < deadline_s:
+        while not self.bridge.can_be_released(self._known) and time.monotonic() < deadline_s:
             try:
                 self.spin_once(TICK_LEAST_S)
             except Exception as error:  # whatever it was: the vehicle is asked again
@@ -204,7 +204,7 @@ class AutopilotBridge(MissionNode):
         if not self._begun:
             self._begin_if_all_ready()
         if self._begun:
-            self.bridge.policy_is_gone = self._policy.is_lost()
+            self.bridge.policy_lost = self._policy.is_lost()
             for command in self.bridge.tick(time.monotonic(), known):
                 self.vehicle.send_command(command)
         self.vehicle.set_setpoint(self.bridge.setpoint)
@@ -274,7 +274,7 @@ class AutopilotBridge(MissionNode):
             fingerprint=self.scenario.fingerprint,
             seed=self.values["seed"],
             run=self.run,
-            standing=self.bridge.standing,
+            standing=self.bridge.checkpoint,
             anchor=self.vehicle.grid_origin,
             system=self._known.system_id,
         )
@@ -300,7 +300,7 @@ class AutopilotBridge(MissionNode):
             fault=bridge.fault_kind,
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
-            steps_not_reached=bridge.course.steps_not_reached,
+            steps_not_reached=bridge.progress.steps_not_reached,
             seed=self.values["seed"],
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,

@@ -24,19 +24,12 @@ NO_ALTITUDE = "mavros"  # altitude 0 of the datum is the ground under the vehicl
 
 
 class SavedDatum(msgspec.Struct, frozen=True, kw_only=True):
-    """Datum of the last flight in one world.
-
-    Attributes:
-        scenario: its name.
-        datum: as `Geodetic.parse` reads it.
-        vehicle: transport to the autopilot.
-        time: take-off, UTC, ISO 8601.
-    """
+    """Datum of the last flight in one world."""
 
     scenario: str
-    datum: str
-    vehicle: str
-    time: str
+    datum: str  # as `Geodetic.parse` reads it
+    vehicle: str  # transport to the autopilot
+    time: str  # take-off, UTC, ISO 8601
 
     def __str__(self) -> str:
         """Text for errors and log lines."""

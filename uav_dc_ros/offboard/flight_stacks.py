@@ -24,37 +24,20 @@ ARMABLE = FLYABLE | POS_HORIZ_REL | PRED_POS_HORIZ_REL | PRED_POS_HORIZ_ABS  # 0
 
 @dataclass(frozen=True, kw_only=True)
 class FlightStack:
-    """One kind of autopilot.
-
-    Attributes:
-        name: of the autopilot.
-        modes: the bridge's mode by `custom_mode`; all others are `Mode.OTHER`.
-        mode_names: the autopilot's names of its modes.
-        custom_modes: `custom_mode` that requests a mode.
-        estimate_message: name of the message with the state of the position estimate.
-        ready_flags: flags of that message that are required for arming.
-        reports_readiness: whether SYS_STATUS reports readiness to arm. PX4's is for the current mode, not for
-            the one that it is to arm in.
-        takes_off_by_setpoint: whether it takes off by setpoints, and requires a stream to accept the mode.
-            Otherwise it needs a take-off command, which setpoints would interrupt.
-        parameters: names of the parameters that hold its limits.
-        limits: limits by the values of these parameters.
-        parameters_are_bytes: whether PARAM_VALUE holds the bytes of an integer.
-        earth_radius_m: radius of its spherical Earth, see `frames.sphere_scale`.
-    """
+    """One kind of autopilot."""
 
     name: str
-    modes: Mapping[int, Mode]
+    modes: Mapping[int, Mode]  # by `custom_mode`; all others are `Mode.OTHER`
     mode_names: Mapping[int, str]
-    custom_modes: Mapping[Mode, int]
-    estimate_message: str
-    ready_flags: int
-    reports_readiness: bool
-    takes_off_by_setpoint: bool
-    parameters: limits.Names
-    limits: Callable[[Mapping[str, float]], Limits]
-    parameters_are_bytes: bool
-    earth_radius_m: float
+    custom_modes: Mapping[Mode, int]  # to request a mode
+    estimate_message: str  # name of the message with the state of the position estimate
+    ready_flags: int  # flags of that message that are required for arming
+    reports_readiness: bool  # by SYS_STATUS, for the mode that it is to arm in; PX4: for the current mode
+    takes_off_by_setpoint: bool  # and requires a stream; otherwise by a command, which setpoints interrupt
+    parameters: limits.Names  # that hold its limits
+    limits: Callable[[Mapping[str, float]], Limits]  # by the values of these parameters
+    parameters_are_bytes: bool  # PARAM_VALUE holds the bytes of an integer
+    earth_radius_m: float  # of its spherical Earth, see `frames.sphere_scale`
 
     def mode(self, custom_mode: int) -> Mode:
         """The bridge's mode."""

@@ -20,81 +20,50 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Limits that the autopilot enforces by its own parameters. None: not enforced, or not reported.
+    """Limits that the autopilot enforces by its own parameters. None: not enforced, or not reported."""
 
-    Attributes:
-        fence_radius_m: of its circular fence, horizontal distance from home, metres.
-        fence_ceiling_m, fence_floor_m: of its altitude fence, metres above home.
-        polygon_fence: whether it enforces a fence of another shape, which the bridge does not read.
-        speed_mps: horizontal speed towards a position target, m/s.
-        climb_mps, descent_mps: vertical speeds towards a position target, m/s, both positive.
-    """
-
-    fence_radius_m: float | None = None
-    fence_ceiling_m: float | None = None
-    fence_floor_m: float | None = None
-    polygon_fence: bool = False
-    speed_mps: float | None = None
-    climb_mps: float | None = None
-    descent_mps: float | None = None
+    fence_radius_m: float | None = None  # horizontal distance from home
+    fence_ceiling_m: float | None = None  # above home
+    fence_floor_m: float | None = None  # above home
+    polygon_fence: bool = False  # a fence of another shape, which the bridge does not read
+    speed_mps: float | None = None  # horizontal, towards a position target
+    climb_mps: float | None = None  # positive
+    descent_mps: float | None = None  # positive
 
 
 @dataclass(frozen=True, kw_only=True)
 class Telemetry:
-    """Last reported state of the vehicle. Times: the bridge's steady clock, seconds. None: not reported.
+    """Last reported state of the vehicle. None: not reported.
 
-    Attributes:
-        heartbeat_s: arrival of the last heartbeat; None: none received.
-        mode, mode_name: flight mode, and the autopilot's name of it.
-        armed: whether the motors turn, or may turn at any moment.
-        on_ground: whether the vehicle stands on the ground.
-        position, position_s: in the grid's ENU frame, and its arrival.
-        estimate_ok: whether the autopilot trusts its position estimate enough to fly by it.
-        estimate_s: arrival of the last report on the estimate; None: `estimate_ok` is current.
-        battery: remaining charge, 0 to 1.
-        battery_v: battery voltage, volts.
-        battery_fails: whether the autopilot reports the battery as low or broken.
-        vehicle_s: the vehicle's own time, seconds; in simulation it may run faster than the steady clock.
-        missing: what the bridge still needs before it can fly, in words; None: nothing.
-        refusal: last refused command and the reason; None: none, or it was executed since.
-        status_text: the autopilot's own warnings of the last seconds; empty: none.
-        home: where a return leads to, in the grid's ENU frame.
-        target, target_s: the autopilot's position target in the grid's ENU frame, and its arrival.
-        tilt_rad: angle between the vehicle's vertical axis and the vertical, 0 to pi.
-        limits: of the autopilot's own parameters.
-        other_controller: evidence of another system that commands this vehicle; None: none.
-        system: the vehicle's identity on its link, such as `system 1`; empty: not known.
-        system_id: its number on the link, for a transport that is opened again.
-        is_selected: whether the vehicle is identified; False while several are on the link and none is named.
-        discarded: number of ignored messages by reason (late, repeated, impossible, ...).
+    `x_s` is the arrival of `x`, steady clock of the bridge, seconds. Positions are in the grid's ENU frame.
     """
 
-    heartbeat_s: float | None = None
+    heartbeat_s: float | None = None  # None: no heartbeat was received
     mode: Mode = Mode.OTHER
-    mode_name: str = ""
-    armed: bool = False
+    mode_name: str = ""  # the autopilot's name of the mode
+    armed: bool = False  # the motors turn, or may turn at any moment
     on_ground: bool | None = None
     position: Enu | None = None
     position_s: float | None = None
-    estimate_ok: bool = False
-    estimate_s: float | None = None
-    battery: float | None = None
+    estimate_ok: bool = False  # the autopilot trusts its position estimate enough to fly by it
+    estimate_s: float | None = None  # None: `estimate_ok` is current
+    battery: float | None = None  # remaining charge, 0 to 1
     battery_v: float | None = None
-    battery_fails: bool = False
-    vehicle_s: float = 0.0
-    missing: str | None = None
-    refusal: str | None = None
-    status_text: str = ""
-    home: Enu | None = None
-    target: Enu | None = None
+    battery_fails: bool = False  # the autopilot reports the battery as low or broken
+    vehicle_s: float = 0.0  # the vehicle's own time; in simulation it may be faster than the steady clock
+    missing: str | None = None  # what the bridge needs before it can fly; None: nothing
+    refusal: str | None = None  # last refused command and the reason; None: none, or it was executed since
+    status_text: str = ""  # warnings of the autopilot in the last seconds
+    home: Enu | None = None  # where a return leads to
+    target: Enu | None = None  # position target that the autopilot reports
     target_s: float | None = None
-    tilt_rad: float | None = None
+    tilt_rad: float | None = None  # angle between the vehicle's vertical axis and the vertical, 0 to pi
     limits: Limits | None = None
-    other_controller: str | None = None
-    system: str = ""
-    system_id: int | None = None
-    is_selected: bool = True
-    discarded: Mapping[str, int] = field(default_factory=dict)
+    other_controller: str | None = None  # evidence of another system that commands this vehicle
+    system: str = ""  # the vehicle's identity on its link, such as `system 1`
+    system_id: int | None = None  # its number there, for a transport that is opened again
+    is_selected: bool = True  # False: several vehicles are on the link, and none is named
+    discarded: Mapping[str, int] = field(default_factory=dict)  # ignored messages by reason
 
     @property
     def mode_text(self) -> str:

@@ -70,7 +70,7 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "fence": (
         "param FENCE_ENABLE 1; param FENCE_RADIUS 300; param GF_MAX_HOR_DIST 300",
         "",
-        ("circular fence ends 300 m", "does not take its target", "no nearer", "RTL: changed by", ""),
+        ("circular fence ends 300 m", "does not accept the setpoint", "no nearer", "RTL: changed by", ""),
     ),
     "motor": ("motor 600", "", ("too low", "on the ground", "outside the fence", "not at the start", "")),
     "low voltage": ("volts 9.0", "", ("under load", "low or broken", "")),
@@ -80,7 +80,7 @@ FAULTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "second target": (
         "second_bridge_target 100 100 -100",
         "",
-        ("another system commands", "does not take its target", "no nearer", "not at the start", ""),
+        ("another system commands", "does not accept the setpoint", "no nearer", "not at the start", ""),
     ),
 }
 

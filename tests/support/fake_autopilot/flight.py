@@ -156,14 +156,14 @@ class Flight:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
             self.executed.append(bridge.step)
-            self.cells.append(bridge.course.goal)
+            self.cells.append(bridge.progress.goal)
         if bridge.step != self._step:
             self._step = bridge.step
             self._check_step()
         self.log.append((bridge.phase, bridge.step, bridge.reason))
 
     def _check_step(self) -> None:
-        grid, centre = self.bridge.scenario.grid, self.bridge.course.centre(self.bridge.cell)
+        grid, centre = self.bridge.scenario.grid, self.bridge.progress.centre(self.bridge.cell)
         sizes_m = (grid.cell_m, grid.cell_m, grid.altitude_step_m)
         here = self.known.position
         if here is None or any(

@@ -157,7 +157,7 @@ class Flight:
         bridge = self.bridge
         if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
             self.executed.append(bridge.step)
-            self.cells.append(bridge.course.goal)
+            self.cells.append(bridge.progress.goal)
         self.log.append((bridge.phase, bridge.step, bridge.reason))
 
     def tick(self) -> None:

@@ -161,7 +161,7 @@ def towards(position: Enu, target: Enu, seconds: float, speeds_mps: dict[str, fl
 
 def way_home(bridge: MissionController) -> Action:
     """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.course.goal, bridge.scenario.dock_cell
+    (x, y, _), (dock_x, dock_y) = bridge.progress.goal, bridge.scenario.dock_cell
     if x != dock_x:
         return Action.RIGHT if x < dock_x else Action.LEFT
     if y != dock_y:
@@ -203,7 +203,7 @@ class Flight:
         if bridge.step != self._step:
             assert bridge.step == self._step + 1, "one step after the other"
             self._step = bridge.step
-            self.ended_m.append(math.dist(self.vehicle.position, bridge.course.centre(bridge.cell)))
+            self.ended_m.append(math.dist(self.vehicle.position, bridge.progress.centre(bridge.cell)))
 
     def tick(self, tick_s: float = TICK_S, known: Telemetry | None = None) -> None:
         bridge, vehicle = self.bridge, self.vehicle

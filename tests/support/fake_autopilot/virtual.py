@@ -121,10 +121,10 @@ class VirtualFlight:
         Args:
             system: the vehicle that the journal names.
         """
-        standing, old = self.bridge.standing, self.bridge
+        checkpoint, old = self.bridge.checkpoint, self.bridge
         self.telemetry = MavlinkTelemetry(self.telemetry.datum, self.place, system, again=True)
         self.session = Session(load_codec(), self.telemetry, self._write)
-        self.bridge = MissionController(old.scenario, old.settings, self._note, standing)
+        self.bridge = MissionController(old.scenario, old.settings, self._note, checkpoint)
         self.session.keep_alive(self.now_s)
         self.session.on_connected(self.now_s)
 

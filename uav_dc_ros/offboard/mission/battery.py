@@ -1,8 +1,8 @@
-"""Is the battery low: by what the autopilot counts, and by what its voltage and its monitor say against that.
+"""Battery faults, by the counted charge, the voltage and the autopilot's own report.
 
-ArduPilot counts charge down from 100 % at power-on, against a capacity (BATT_CAPACITY) that somebody has to
-have entered. So a count may be too low: its own simulator counts a battery empty within seven minutes of
-flight that never gets weaker. And it may be too high: a battery that was put in half empty counts from 100 %.
+ArduPilot counts the charge down from 100 % at power-on, against a capacity (BATT_CAPACITY) that is entered by
+hand. The count may be too low: its simulator counts to 0 % within seven minutes at a constant voltage. It may
+be too high: a battery that is connected half empty counts from 100 %.
 """
 
 import math
@@ -10,60 +10,62 @@ import math
 from uav_dc_ros.offboard.vehicle import Telemetry
 
 FULL = 0.93  # of the voltage at rest; a lithium cell under load is below it long before it has 20 % left
-EMPTY = 0.8  # of the voltage at rest, under load, whatever is counted: 3.36 V of a cell that was full
-SMOOTH_S = 10.0  # gusts and climbs pull the voltage down for less than that
-FAILS_S = 5.0  # for so long the autopilot has to find it low, or broken: a message may be wrong
+EMPTY = 0.8  # of the voltage at rest, under load: 3.36 V of a cell that was full
+SMOOTH_S = 10.0  # time constant: gusts and climbs lower the voltage for less
+FAILS_S = 5.0  # minimum duration of the autopilot's report: a single message may be wrong
 
 
-class Battery:
-    """Judges one battery.
+class BatteryMonitor:
+    """Monitors one battery.
 
     Args:
-        least: charge at which it is low, 0 to 1.
-        at_rest_v: as below, from before a bridge was killed.
+        min_charge: 0 to 1.
+        at_rest_v: see below, from the checkpoint.
 
     Attributes:
-        at_rest_v: its voltage on the ground, motors off, smoothed; None: it was not seen so.
+        at_rest_v: smoothed voltage on the ground with motors off; None: not measured.
     """
 
-    def __init__(self, least: float, at_rest_v: float | None = None) -> None:
-        self.least, self.at_rest_v = least, at_rest_v
+    def __init__(self, min_charge: float, at_rest_v: float | None = None) -> None:
+        self.min_charge, self.at_rest_v = min_charge, at_rest_v
         self._smooth_v: float | None = None
-        self._seen_s = 0.0  # vehicle time
+        self._updated_s = 0.0  # vehicle time
         self._fails_since_s: float | None = None  # vehicle time
 
-    def low(self, known: Telemetry) -> str | None:
-        """What is wrong with it; None: nothing, or the vehicle does not tell. To be asked often."""
-        self._see(known)
-        volts = "" if known.battery_v is None else f" at {known.battery_v:.1f} V"
-        charge = "battery" if known.battery is None else f"battery {known.battery:.0%}"
+    def fault(self, telemetry: Telemetry) -> str | None:
+        """Why the battery is low or broken; None: it is neither, or not reported. Called in every tick."""
+        self._update(telemetry)
+        volts = "" if telemetry.battery_v is None else f" at {telemetry.battery_v:.1f} V"
+        charge = "battery" if telemetry.battery is None else f"battery {telemetry.battery:.0%}"
         rest = "" if self.at_rest_v is None else f", {self.at_rest_v:.1f} V at rest"
-        if known.battery is not None and known.battery < self.least:
-            if known.armed and not known.battery_fails and self._is_at_least(FULL):
+        if telemetry.battery is not None and telemetry.battery < self.min_charge:
+            if telemetry.armed and not telemetry.battery_fails and self._voltage_is_at_least(FULL):
                 return None
-            return f"{charge}{volts}; expected at least {self.least:.0%}"
-        if self._fails_since_s is not None and known.vehicle_s - self._fails_since_s >= FAILS_S:
-            return f"{charge}{volts}{rest}: the autopilot finds it low or broken"
-        if known.armed and self._smooth_v is not None and self.at_rest_v and not self._is_at_least(EMPTY):
+            return f"{charge}{volts}; expected at least {self.min_charge:.0%}"
+        if self._fails_since_s is not None and telemetry.vehicle_s - self._fails_since_s >= FAILS_S:
+            return f"{charge}{volts}{rest}: the autopilot reports it low or broken"
+        is_measured = self._smooth_v is not None and self.at_rest_v
+        if telemetry.armed and is_measured and not self._voltage_is_at_least(EMPTY):
             return f"{charge} at {self._smooth_v:.1f} V under load{rest}; expected {EMPTY:.0%} of that"
         return None
 
-    def _see(self, known: Telemetry) -> None:
-        if not known.battery_fails:
+    def _update(self, telemetry: Telemetry) -> None:
+        if not telemetry.battery_fails:
             self._fails_since_s = None
         elif self._fails_since_s is None:
-            self._fails_since_s = known.vehicle_s
-        if known.battery_v is None:
+            self._fails_since_s = telemetry.vehicle_s
+        if telemetry.battery_v is None:
             return
-        passed_s = max(0.0, known.vehicle_s - self._seen_s)
-        before_v = known.battery_v if self._smooth_v is None else self._smooth_v
-        self._smooth_v = known.battery_v + (before_v - known.battery_v) * math.exp(-passed_s / SMOOTH_S)
-        self._seen_s = known.vehicle_s
-        if not known.armed:
+        passed_s = max(0.0, telemetry.vehicle_s - self._updated_s)
+        before_v = telemetry.battery_v if self._smooth_v is None else self._smooth_v
+        decay = math.exp(-passed_s / SMOOTH_S)
+        self._smooth_v = telemetry.battery_v + (before_v - telemetry.battery_v) * decay
+        self._updated_s = telemetry.vehicle_s
+        if not telemetry.armed:
             self.at_rest_v = self._smooth_v
 
-    def _is_at_least(self, share: float) -> bool:
-        """Is its voltage this share of that at rest. Nobody knows who never saw it at rest."""
+    def _voltage_is_at_least(self, share: float) -> bool:
+        """Whether the voltage is this share of that at rest; False: the latter was not measured."""
         if self.at_rest_v is None or self._smooth_v is None:
             return False
         return self._smooth_v >= share * self.at_rest_v

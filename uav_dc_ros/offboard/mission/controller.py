@@ -1,13 +1,11 @@
-"""The vehicle between policy and autopilot, from connecting to landing: phases, steps, faults.
+"""State machine of a mission: phases, steps and faults of one vehicle, from connecting to landing.
 
     idle -> connecting -> preflight -> takeoff -> ready <-> moving -> landing -> landed | timeout | aborted
 
-It enters no phase that may not follow by the table `phases.TRANSITIONS`.
-It decides, and does nothing itself: `tick` is called often with what is known of the vehicle, and returns
-commands for the transport; `setpoint` is what the transport streams. Whatever goes wrong leads to *hold* (the
-last good setpoint stays), then to *return* or *land*, and at last to `aborted` with its reason. A pilot who
-changes the mode has the vehicle at once: from then on there are no setpoints and no commands. Where that mode
-brings it down (an autopilot's failsafe does that, too), it is watched until it stands.
+`phases.TRANSITIONS` lists the permitted transitions. A fault holds the vehicle at its last setpoint; when the
+fault timer expires, the bridge requests return or land, and the mission ends as `aborted`. After a takeover
+(a pilot or a failsafe changes the mode) the bridge sends no setpoints and no commands; where the new mode is
+return or land, it monitors the vehicle until it stands.
 """
 
 from collections.abc import Callable
@@ -17,42 +15,37 @@ import msgspec
 
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.errors import PhaseError
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.command_retry import CommandRetry
 from uav_dc_ros.offboard.mission.crash_detector import CrashDetector
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
-from uav_dc_ros.offboard.mission.fault_timer import FaultTimer
 from uav_dc_ros.offboard.mission.geofence import Geofence
-from uav_dc_ros.offboard.mission.landing import DOWN, Landing, Next
-from uav_dc_ros.offboard.mission.policy_timeout import PolicyTimeout
-from uav_dc_ros.offboard.mission.preflight import Preflight, rival
-from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, Dwell, MissionProgress
+from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, Landing
+from uav_dc_ros.offboard.mission.preflight import Preflight, other_controller
+from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, MissionProgress
 from uav_dc_ros.offboard.mission.stall_detector import StallDetector
-from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, TakeOff, Telemetry
+from uav_dc_ros.offboard.mission.steps import StepControl
+from uav_dc_ros.offboard.mission.timers import CommandRetry, FaultTimer, PolicyTimeout, Time
+from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
 from uav_dc_ros.phases import FLYING, GROUND, OFFBOARD, POLICY_CONTROLLED, transition_error
 
-POLICY_IS_GONE = "the policy is gone"
+POLICY_LOST = "policy lost"
 
 
 class MissionController:
-    """One mission of one vehicle.
+    """Controls one mission of one vehicle.
 
     Args:
-        scenario: the world that is flown.
-        settings: how carefully.
-        on_change: called after each change of phase, step or reason, or of what is to be kept.
-        standing: of a mission that is taken up again.
-        fence: around targets and poses; None: the one around the scenario.
+        on_change: called after each change of phase, step, reason or checkpoint.
+        checkpoint: of a mission that is resumed.
+        fence: for setpoints and positions; None: the one around the scenario.
 
     Attributes:
-        phase: where the mission stands.
-        reason: why it is in this phase, in words.
-        course: steps flown, the cell reached last, and the cell that it flies to.
-        setpoint: where the vehicle is sent to, in the grid's ENU frame; None: nowhere. Always in the fence.
-        policy_is_gone: to be set while nobody is there who would decide the next move: the vehicle stops.
-        is_strict: raise PhaseError where a phase cannot follow (in tests); otherwise give up the mission.
+        phase, reason: current phase, and why.
+        progress: steps flown, current cell and goal.
+        setpoint: to be streamed, in the grid's ENU frame, inside the fence; None: none.
+        policy_lost: set by the caller while the policy is not alive: the vehicle stops.
+        is_strict: whether an impossible transition raises PhaseError (in tests) or ends the mission.
     """
 
     is_strict: ClassVar[bool] = False
@@ -62,403 +55,337 @@ class MissionController:
         scenario: Scenario,
         settings: SafetySettings,
         on_change: Callable[[], None] = lambda: None,
-        standing: Checkpoint | None = None,
+        checkpoint: Checkpoint | None = None,
         fence: Geofence | None = None,
     ) -> None:
         self.scenario, self.settings = scenario, settings
         self.fence = fence or Geofence.around(scenario)
         self.phase, self.reason = Phase.IDLE, "not started"
-        self.course = MissionProgress(scenario, standing)
+        self.progress = MissionProgress(scenario, checkpoint)
         self.setpoint: Enu | None = None
-        self.policy_is_gone = False
-        self._entered_step = self.step  # when the phase was entered
+        self.policy_lost = False
         self._on_change = on_change
-        self._asked = CommandRetry(settings)
-        self._since_s = 0.0  # vehicle time of the last change of phase
-        self._dwell = Dwell(settings)
-        self._patience = PolicyTimeout(settings, scenario.mission.step_s)
-        self._now_s = 0.0  # vehicle time
-        self._steady_s = self._since_steady_s = 0.0  # steady clock: last tick, last change of phase
-        self._known = Telemetry()
-        home = self.course.standing.home
-        self._watched = FaultDetector(settings, self.course.standing.at_rest_v, Enu(*home) if home else None)
-        self._descent = Landing(self.course, self._watched, settings.failsafe_action, Phase.ABORTED, "")
-        self._hold = FaultTimer(settings.fault_timeout_s)
+        self._telemetry = Telemetry()
+        self._now = self._entered = Time(0.0, 0.0)  # last tick; begin of the phase
+        self._entered_step = self.step
+        before = self.progress.checkpoint
+        self._released = before.released  # another controller has the vehicle
+        self._other_controller: str | None = None  # as reported
+        home = Enu(*before.home) if before.home else None
+        self._detector = FaultDetector(settings, before.at_rest_v, home)
         self._crash = CrashDetector(settings)
-        self._tracking = StallDetector(self.course, settings)
-        self._finishes = self.course.standing.goal is not None  # the move that an earlier bridge had begun
-        self._reported: str | None = None  # another system that commands the vehicle in flight
-        self._taken = self.course.standing.released  # somebody else has the vehicle
-        self._ground = Preflight(self.course, settings, self.fence, self._watched)
-        self._kept = self._to_keep()
+        self._stall = StallDetector(self.progress, settings)
+        self._steps = StepControl(self.progress, settings, self._stall)
+        self._preflight = Preflight(self.progress, settings, self.fence, self._detector)
+        self._landing = Landing(self.progress, self._detector, settings.failsafe_action, Phase.ABORTED, "")
+        self._fault_timer = FaultTimer(settings.fault_timeout_s)
+        self._policy = PolicyTimeout(settings, scenario.mission.step_s)
+        self._retry = CommandRetry(settings)
+        self._saved = self._to_save()
 
     @property
     def is_over(self) -> bool:
-        """Is there nothing left to do."""
+        """Whether the mission has ended."""
         return self.phase.is_over
 
     @property
     def step(self) -> int:
         """Steps flown."""
-        return self.course.step
+        return self.progress.step
 
     @property
     def cell(self) -> Cell:
-        """The cell that the vehicle reached last."""
-        return self.course.cell
+        """Cell that the vehicle reached last."""
+        return self.progress.cell
 
     @property
     def fault(self) -> str | None:
-        """What keeps it from going on at the moment; None: nothing."""
-        return self._hold.fault.why if self._hold.fault is not None else None
+        """Fault that holds the vehicle, in words; None: none."""
+        return self._fault_timer.fault.text if self._fault_timer.fault is not None else None
 
     @property
     def fault_kind(self) -> FaultKind | None:
-        """The kind of the fault that holds the vehicle; None: nothing holds it."""
+        """Kind of the fault that holds the vehicle; None: none."""
         if self.phase not in OFFBOARD:
             return None
-        if self._hold.fault is not None:
-            return self._hold.fault.kind
-        return FaultKind.POLICY if self._patience.gone_since is not None else None
+        if self._fault_timer.fault is not None:
+            return self._fault_timer.fault.kind
+        return FaultKind.POLICY if self._policy.lost_since is not None else None
 
     @property
     def discarded(self) -> dict[str, int]:
-        """Telemetry that could not be true and was left out, by reason; `Telemetry.discarded` has others."""
-        return self._watched.discarded
+        """Number of impossible values in telemetry by reason; `Telemetry.discarded` has those of messages."""
+        return self._detector.discarded
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should know of the vehicle, though it is no reason not to fly."""
-        return self._ground.warnings(self._known)
+        """Warnings that do not prevent the flight."""
+        return self._preflight.warnings(self._telemetry)
 
     @property
-    def standing(self) -> Checkpoint:
-        """Where the mission stands now."""
-        kept = msgspec.structs.replace(
-            self.course.standing,
-            allowed_mode=self._ground.allowed_mode,
-            is_a_pilots=self._ground.is_a_pilots,
-            at_rest_v=self._watched.battery.at_rest_v,
-            home=self._watched.home,
+    def checkpoint(self) -> Checkpoint:
+        """Current state, for a bridge that is restarted."""
+        saved = msgspec.structs.replace(
+            self.progress.checkpoint,
+            allowed_mode=self._preflight.allowed_mode,
+            pilot_has_control=self._preflight.pilot_has_control,
+            at_rest_v=self._detector.battery.at_rest_v,
+            home=self._detector.home,
         )
         if self.phase in GROUND:
-            return kept
-        over = self.phase is Phase.LANDING or self.is_over
+            return saved
+        lands, landing = self.phase is Phase.LANDING or self.is_over, self._landing
         return msgspec.structs.replace(
-            kept,
+            saved,
             step=self.step,
             cell=self.cell,
-            goal=self.course.goal if self._finishes or self.phase is Phase.MOVING else None,
-            steps_not_reached=self.course.steps_not_reached,
-            flies=True,
-            released=self._taken or (self.is_over and not self._known.armed),
-            outcome=(self.phase if self.is_over else self._descent.outcome) if over else None,
-            reason=self.reason if over else "",
-            down=self._descent.how if over else None,
-            asked=over and self._descent.tries > 0,
-            obeyed=over and self._descent.obeyed,
+            goal=self.progress.goal if self._steps.resumes_move or self.phase is Phase.MOVING else None,
+            steps_not_reached=self.progress.steps_not_reached,
+            airborne=True,
+            released=self._released or (self.is_over and not self._telemetry.armed),
+            outcome=(self.phase if self.is_over else landing.outcome) if lands else None,
+            reason=self.reason if lands else "",
+            landing_mode=landing.mode if lands else None,
+            landing_requested=lands and landing.requests > 0,
+            landing_confirmed=lands and landing.confirmed,
         )
 
+    def _to_save(self) -> tuple[object, ...]:
+        """Parts of the checkpoint that must be saved before a command is sent."""
+        preflight, landing = self._preflight, self._landing
+        return preflight.allowed_mode, preflight.pilot_has_control, landing.requests > 0, landing.confirmed
+
     def move(self, step: int, action: Action) -> str | None:
-        """Fly a move; or why not. A move for another step, or at another time, changes nothing."""
+        """Begin the move of a step; returns why it is refused, or None."""
         if self.phase is not Phase.READY or self.fault is not None:
             return f"the vehicle is {self.phase.value} ({self.fault or self.reason}); expected it to be ready"
         if step != self.step:
             return f"a move for step {step}; expected {self.step}"
-        cell = self.course.beyond(action)
-        target = self.course.centre(cell)
+        cell = self.progress.neighbour(action)
+        target = self.progress.centre(cell)
         if (breach := self.fence.breach(target)) is not None:
             return f"the target is outside the fence: {breach}"
-        self.course.goal, self.setpoint = cell, target
+        self.progress.goal, self.setpoint = cell, target
         self._enter(Phase.MOVING, f"{action.label} to cell {cell}")
         return None
 
-    def stop(self, why: str, known: Telemetry | None = None) -> None:
-        """End the mission, since nobody will set_setpoint any more; a vehicle that flies comes down.
+    def stop(self, reason: str, telemetry: Telemetry | None = None) -> None:
+        """End the mission: a vehicle that flies lands.
 
-        So does one that is armed in the commanded mode before it begins; in another mode it is a pilot's.
+        So does one that is armed in the commanded mode before take-off; in another mode it is a pilot's, and
+        where several vehicles are on the link it may be anyone's.
 
         Args:
-            why: in words.
-            known: of the vehicle, if no tick has told of it yet.
+            telemetry: before the first tick.
         """
-        known = known or self._known
+        telemetry = telemetry or self._telemetry
+        is_ours = telemetry.armed and telemetry.is_selected and telemetry.mode is Mode.COMMANDED
         if self.phase in OFFBOARD:
-            self._give_up(why)
-        elif self.phase in GROUND and self._is_to_come_down(known):
-            self._known = known
-            how = Mode.LAND if known.on_ground else self._watched.way_down(self._steady_s, known)
-            self._descend(how, Phase.ABORTED, why)
+            self._abort(reason)
+        elif self.phase in GROUND and is_ours and not self._released:
+            self._telemetry = telemetry
+            mode = self._detector.landing_mode(self._now.steady_s, telemetry)
+            self._land(Mode.LAND if telemetry.on_ground else mode, Phase.ABORTED, reason)
         elif self.phase is not Phase.LANDING and not self.is_over:
-            self._taken = True  # nothing was requested, and nothing will be
-            self._end(Phase.ABORTED, why)
+            self._released = True  # nothing was requested
+            self._end(Phase.ABORTED, reason)
 
-    def _is_to_come_down(self, known: Telemetry) -> bool:
-        """Is a vehicle before its mission one that nobody would have then. Of several it may be anybody's."""
-        return known.armed and known.is_selected and known.mode is Mode.COMMANDED and not self._taken
+    def can_be_released(self, telemetry: Telemetry) -> bool:
+        """Whether the mission ends without further commands."""
+        return self.is_over or (self.phase is Phase.LANDING and self._landing.confirm(telemetry))
 
-    def is_done_with(self, known: Telemetry) -> bool:
-        """Does the vehicle come to its end without any further word."""
-        return self.is_over or (self.phase is Phase.LANDING and self._descent.obeys(known))
-
-    def tick(self, now_s: float, known: Telemetry) -> list[Command]:
-        """Go on.
+    def tick(self, now_s: float, telemetry: Telemetry) -> list[Command]:
+        """Decide; returns commands to be sent now.
 
         Args:
-            now_s: the steady clock that telemetry's times are of.
-            known: of the vehicle.
-
-        Returns:
-            Commands to be passed on now, at most one of each kind.
+            now_s: steady clock.
         """
         if self.phase.is_over:
             return []
-        self._known = known = self._watched.see(now_s, known)
-        self._now_s, self._steady_s = known.vehicle_s, now_s
-        self._asked.pass_time(known.vehicle_s, now_s, stands=self._watched.clock_stands(now_s))
-        self._tracking.send(self.setpoint, now_s)
+        self._telemetry = telemetry = self._detector.update(now_s, telemetry)
+        self._now = Time(telemetry.vehicle_s, now_s)
+        self._retry.update(self._now, clock_stopped=self._detector.clock_stopped(now_s))
+        self._stall.set_setpoint(self.setpoint, now_s)
         if self.phase is Phase.IDLE:
             self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
         if self.phase in FLYING:
-            if self._taken_over(known):
+            if self._is_taken_over(telemetry):
                 return []
-            self._watch(now_s, known)
-        elif not self.course.standing.flies and (why := self._ground.takeover(now_s, known)) is not None:
-            self._taken = True
-            self._end(Phase.ABORTED, why)
+            if self.phase is not Phase.LANDING:
+                self._check_faults(now_s, telemetry)
+        elif not self.progress.checkpoint.airborne:
+            takeover = self._preflight.takeover(now_s, telemetry)
+            if takeover is not None:
+                self._released = True
+                self._end(Phase.ABORTED, takeover)
+                return []
+        if self._fault_timer.fault is not None and self.phase in OFFBOARD:
+            return []  # holds at the setpoint
+        if self.phase in POLICY_CONTROLLED and not self._check_policy(telemetry):
             return []
-        if self._hold.fault is not None and self.phase in OFFBOARD:
-            return []  # hold: the setpoint stays
-        if self.phase in POLICY_CONTROLLED and not self._policy_lives(known):
-            return []
-        commands = {
-            Phase.CONNECTING: self._connect,
-            Phase.PREFLIGHT: self._prepare,
-            Phase.TAKEOFF: self._take_off,
-            Phase.READY: self._wait,
-            Phase.MOVING: self._fly,
-            Phase.LANDING: self._land,
-        }[self.phase](now_s, known)
-        sent = [command for command in commands if self._asked.may(command)]
-        self._descent.tries += sum(isinstance(command, SetMode) for command in sent)
-        if self._to_keep() != self._kept:
-            self._kept = self._to_keep()
+        command = self._act(now_s, telemetry)
+        commands = [command] if command is not None and self._retry.may_send(command) else []
+        self._landing.requests += any(isinstance(command, SetMode) for command in commands)
+        if self._to_save() != self._saved:
+            self._saved = self._to_save()
             self._on_change()
-        return sent
+        return commands
 
-    def _to_keep(self) -> tuple[object, ...]:
-        """What a bridge that is started anew has to know before it is requested, or as soon as it is seen."""
-        ground, descent = self._ground, self._descent
-        return ground.allowed_mode, ground.is_a_pilots, descent.tries > 0, descent.obeyed
+    # Faults.
 
-    # What goes wrong.
-
-    def _taken_over(self, known: Telemetry) -> bool:
-        """Has somebody else the vehicle now, who changed its mode or disarmed it."""
-        landing = self.phase is Phase.LANDING
-        if landing and not known.armed:
-            return False  # it stands
-        why = self.fault or (self.reason if landing else None) or known.refusal
-        after = "".join(
-            f" ({word}: {what})" for word, what in (("after", why), ("it says", known.status_text)) if what
-        )
-        moved = known.mode is not Mode.COMMANDED if not landing else not self._descent.is_ours(known.mode)
-        self._taken |= moved or not known.armed
-        if not known.armed:
-            who = "disarmed by a pilot or by the autopilot itself"
-            self._end(Phase.ABORTED, f"{who} while it was {self.phase.value}{after}")
-        elif moved:
-            mode = known.mode_name or known.mode.value
-            changed = f"mode {mode}: changed by a pilot or by the autopilot's failsafe{after}"
-            if not landing and known.mode in DOWN:
-                self._descend(known.mode, Phase.ABORTED, changed)
+    def _is_taken_over(self, telemetry: Telemetry) -> bool:
+        """Detect a change of the mode or disarming by others; whether the mission has ended because of it."""
+        lands = self.phase is Phase.LANDING
+        if lands and not telemetry.armed:
+            return False
+        fault = self.fault or (self.reason if lands else None) or telemetry.refusal
+        after = f" (after: {fault})" if fault else ""
+        after += f" (autopilot: {telemetry.status_text})" if telemetry.status_text else ""
+        allowed = self._landing.allows(telemetry.mode) if lands else telemetry.mode is Mode.COMMANDED
+        self._released |= not allowed or not telemetry.armed
+        if not telemetry.armed:
+            event = f"disarmed by a pilot or by the autopilot itself in the phase {self.phase.value}"
+            self._end(Phase.ABORTED, f"{event}{after}")
+        elif not allowed:
+            event = f"mode {telemetry.mode_text}: changed by a pilot or by the autopilot's failsafe"
+            if not lands and telemetry.mode in LANDING_MODES:
+                self._land(telemetry.mode, Phase.ABORTED, f"{event}{after}")
             else:
-                self._end(Phase.ABORTED, changed)
+                self._end(Phase.ABORTED, f"{event}{after}")
         return self.phase.is_over
 
-    def _watch(self, now_s: float, known: Telemetry) -> None:
-        """Find what keeps the vehicle from going on; what lasts too long ends the mission."""
-        if self.phase is Phase.LANDING:
+    def _check_faults(self, now_s: float, telemetry: Telemetry) -> None:
+        """End the mission at once, or when the fault timer expires."""
+        if (low := self._detector.battery_fault(telemetry)) is not None:
+            self._abort(low)
             return
-        if (low := self._watched.battery_is_low(known)) is not None:
-            self._give_up(low)
+        if (other := other_controller(telemetry)) not in (None, self._other_controller):
+            self._other_controller = other
+            self._set_reason(f"{self.reason}; {other}")
+        lost = self._detector.link_lost(now_s, telemetry)
+        if not lost and (crash := self._crash.update(telemetry, self.setpoint)) is not None:
+            self._abort(crash, Mode.LAND)
             return
-        if (other := rival(known)) not in (None, self._reported):
-            self._reported = other
-            self._change(f"{self.reason}; {other}")
-        lost = self._watched.link_is_lost(now_s, known)
-        if not lost and (crash := self._crash.look(known, self.setpoint)) is not None:
-            self._give_up(crash, Mode.LAND)
+        if telemetry.position is not None and (breach := self.fence.breach(telemetry.position)) is not None:
+            self._abort(f"the vehicle is outside the fence: {breach}")
             return
-        if known.position is not None and (breach := self.fence.breach(known.position)) is not None:
-            self._give_up(f"the vehicle is outside the fence: {breach}")
-            return
-        fault = self._watched.fault(now_s, known)
+        fault = self._detector.fault(now_s, telemetry)
         if fault is None and self.phase in POLICY_CONTROLLED:
-            fault = self._tracking.fault(known, self.phase is Phase.MOVING and not self.policy_is_gone)
-        match self._hold.look(now_s, known, fault):
-            case "begins" | "turns":
-                self._change(str(self.fault))
-            case "passes" if self._patience.gone_since is not None:
-                self._change(POLICY_IS_GONE)
-            case "passes":
-                self._change(f"goes on after: {self.reason}")
-            case "ends" if (lasting := self._hold.fault) is not None:
-                blind_since_s = self._hold.since_s[0] if lasting.kind is FaultKind.POSITION else None
-                self._give_up(lasting.why, None, blind_since_s)
+            fault = self._stall.fault(telemetry, self.phase is Phase.MOVING and not self.policy_lost)
+        match self._fault_timer.update(self._now, fault):
+            case "started" | "changed":
+                self._set_reason(str(self.fault))
+            case "cleared" if self._policy.lost_since is not None:
+                self._set_reason(POLICY_LOST)
+            case "cleared":
+                self._set_reason(f"resumed after: {self.reason}")
+            case "expired" if (lasting := self._fault_timer.fault) is not None:
+                since_s = self._fault_timer.since.steady_s
+                self._abort(lasting.text, None, since_s if lasting.kind is FaultKind.POSITION else None)
 
-    def _policy_lives(self, known: Telemetry) -> bool:
-        """Is there somebody who decides; until there is, the vehicle stops, and the step's time with it."""
-        since, now = self._patience.gone_since, (self._now_s, self._steady_s)
-        if self.policy_is_gone and since is None:
-            self._patience.gone_since = now
-            if self.phase is Phase.MOVING and known.position is not None:
-                self.setpoint = known.position
-            self._change(POLICY_IS_GONE)
-        elif self.policy_is_gone and since is not None and self._patience.is_over(since, now):
-            self._give_up(f"the policy has been gone for {self._patience.limit_s:g} s")
-        elif not self.policy_is_gone and since is not None:
-            self._patience.gone_since = None
-            self._since_s += now[0] - since[0]
-            self._tracking.resume()
-            self.setpoint = self.course.target
-            self._change(f"goes on after: {self.reason}")
-        return not self.policy_is_gone
+    def _check_policy(self, telemetry: Telemetry) -> bool:
+        """Stop the vehicle and its step's time while the policy is lost; whether the policy is alive."""
+        since, now = self._policy.lost_since, self._now
+        if self.policy_lost and since is None:
+            self._policy.lost_since = now
+            if self.phase is Phase.MOVING and telemetry.position is not None:
+                self.setpoint = telemetry.position
+            self._set_reason(POLICY_LOST)
+        elif self.policy_lost and since is not None and self._policy.has_expired(since, now):
+            self._abort(f"{POLICY_LOST} for {self._policy.limit_s:g} s")
+        elif not self.policy_lost and since is not None:
+            self._policy.lost_since = None
+            entered_s = self._entered.vehicle_s + now.vehicle_s - since.vehicle_s
+            self._entered = self._entered._replace(vehicle_s=entered_s)
+            self._stall.resume()
+            self.setpoint = self.progress.target
+            self._set_reason(f"resumed after: {self.reason}")
+        return not self.policy_lost
 
-    def _give_up(self, why: str, how: Mode | None = None, blind_since_s: float | None = None) -> None:
-        """End the mission: bring the vehicle down."""
-        self._hold.fault = None
-        why = why if self._reported is None else f"{why}; {self._reported}"  # which may be why
-        how = how or self._watched.way_down(self._steady_s, self._known)
-        self._descend(how, Phase.ABORTED, why, blind_since_s)
+    def _abort(self, reason: str, mode: Mode | None = None, no_position_since_s: float | None = None) -> None:
+        """Land, and end the mission as `aborted`."""
+        self._fault_timer.fault = None
+        reason = reason if self._other_controller is None else f"{reason}; {self._other_controller}"
+        mode = mode or self._detector.landing_mode(self._now.steady_s, self._telemetry)
+        self._land(mode, Phase.ABORTED, reason, no_position_since_s)
 
-    # What is to be done in each phase.
+    # Phases.
 
-    def _connect(self, now_s: float, known: Telemetry) -> list[Command]:
-        return self._follow(self._ground.connect(now_s, known, now_s - self._since_steady_s))
+    def _act(self, now_s: float, telemetry: Telemetry) -> Command | None:
+        """Decide by the current phase; returns a command, also one that was sent before."""
+        takeoff_s, now = self.settings.takeoff_timeout_s, (self.reason, self.setpoint)
+        match self.phase:
+            case Phase.CONNECTING:
+                waited_s = now_s - self._entered.steady_s
+                return self._apply(self._preflight.connect(now_s, telemetry, waited_s))
+            case Phase.PREFLIGHT:
+                return self._apply(self._preflight.prepare(now_s, telemetry))
+            case Phase.TAKEOFF if telemetry.vehicle_s - self._entered.vehicle_s > takeoff_s:
+                self._abort(f"not at the start after {takeoff_s:g} s")
+            case Phase.TAKEOFF:
+                has_flown = self._crash.flies
+                return self._apply(self._steps.take_off(telemetry, *now, has_flown=has_flown))
+            case Phase.READY if self._policy.has_expired(self._entered, self._now):
+                self._abort(f"no move from the policy for {self._policy.limit_s:g} s")
+            case Phase.MOVING:
+                return self._apply(self._steps.fly(telemetry, *now, self._entered.vehicle_s))
+            case Phase.LANDING:
+                since_s = self._retry.waited_s(SetMode(Mode.RETURN))
+                return self._apply(self._landing.update(now_s, telemetry, self.setpoint, since_s))
+        return None
 
-    def _prepare(self, now_s: float, known: Telemetry) -> list[Command]:
-        return self._follow(self._ground.prepare(now_s, known))
-
-    def _follow(self, advice: Next) -> list[Command]:
-        """Do what a look at a vehicle led to that is not steered."""
-        self.setpoint = advice.setpoint
-        if advice.phase.is_over:
-            lost = self._watched.link_is_lost(self._steady_s, self._known)
-            self._taken |= self.phase in GROUND and not lost  # it is left alone
-            self._end(advice.phase, advice.why)
-        elif advice.phase is self.phase:
-            self._change(advice.why)
-        elif advice.phase is Phase.LANDING:
-            self._descend(advice.down, advice.outcome, advice.why)
-            self._descent.tries += advice.asked
-        elif advice.phase is Phase.TAKEOFF and self.course.is_done:
-            self._finish("when the bridge came back")
+    def _apply(self, decision: Decision) -> Command | None:
+        phase, self.setpoint = decision.phase, decision.setpoint
+        if phase.is_over:
+            lost = self._detector.link_lost(self._now.steady_s, self._telemetry)
+            self._released |= self.phase in GROUND and not lost
+            self._end(phase, decision.reason)
+        elif phase is self.phase:
+            self._set_reason(decision.reason)
+        elif phase is Phase.LANDING:
+            self._land(decision.landing_mode, decision.outcome, decision.reason)
+            self._landing.requests += decision.landing_requested
         else:
-            self._enter(advice.phase, advice.why)
-        return [] if advice.command is None else [advice.command]
+            self._enter(phase, decision.reason)
+        return decision.command
 
-    def _take_off(self, now_s: float, known: Telemetry) -> list[Command]:
-        start, position = self.course.target, known.position
-        if known.vehicle_s - self._since_s > self.settings.takeoff_timeout_s:
-            self._give_up(f"not at the start after {self.settings.takeoff_timeout_s:g} s")
-            return []
-        if position is not None and abs(position.up_m - start.up_m) <= self.settings.tolerance_m:
-            self.setpoint = start  # at the altitude to fly across
-        if self._dwell.is_there(start, known):
-            self._arrive_first()
-            return []
-        return [TakeOff(start.up_m)] if known.on_ground is not False and not self._crash.flies else []
+    # Transitions.
 
-    def _arrive_first(self) -> None:
-        """Be at the cell where the mission begins, or at that to which an earlier bridge had begun to fly."""
-        if self._finishes:
-            self._finishes = False
-            self._arrive("there")
-        else:
-            self.course.cell = self.course.goal
-            self._enter(Phase.READY, f"at the start, cell {self.cell}")
+    def _land(
+        self, mode: Mode, outcome: Phase, reason: str, no_position_since_s: float | None = None
+    ) -> None:
+        """Begin a landing; the setpoint is streamed until the vehicle changes its mode."""
+        detector = self._detector
+        self._landing = Landing(self.progress, detector, mode, outcome, reason, no_position_since_s)
+        self._landing.confirm(self._telemetry)  # it may land already
+        self._enter(Phase.LANDING, reason)
 
-    def _wait(self, now_s: float, known: Telemetry) -> list[Command]:
-        if self._patience.is_over((self._since_s, self._since_steady_s), (known.vehicle_s, now_s)):
-            self._give_up(f"no move from the policy for {self._patience.limit_s:g} s")
-        return []
-
-    def _fly(self, now_s: float, known: Telemetry) -> list[Command]:
-        there, step_s = self._dwell.is_there(self.course.target, known), self.scenario.mission.step_s
-        if there:
-            self._arrive("there")
-        elif known.vehicle_s - self._since_s >= step_s and known.position is not None:
-            away_m = self.course.distance_m(known.position)
-            if away_m <= self.settings.tolerance_m:
-                self._arrive("there")
-            elif self.course.may_end_at(known.position, self.settings):
-                self._arrive(f"not there after {step_s:g} s, which a step has, {away_m:.0f} m away", False)
-            elif not self._tracking.is_late:
-                self._tracking.is_late = True
-                self._change(f"{self.reason}: {away_m:.0f} m away after {step_s:g} s, flies on")
-        return []
-
-    def _arrive(self, how: str, reached: bool = True) -> None:
-        """End a step."""
-        self.course.arrive(reached)
-        if self.course.is_done:
-            self._finish(how)
-        else:
-            self._enter(Phase.READY, f"step {self.step}: {how}")
-
-    def _finish(self, how: str) -> None:
-        """Come down after the last step."""
-        if self.course.is_at_dock:
-            self._descend(Mode.LAND, Phase.LANDED, f"step {self.step}: at the dock ({how})")
-        else:
-            why = f"step {self.step}: out of steps away from the dock ({how})"
-            self._descend(self.settings.failsafe_action, Phase.TIMEOUT, why)
-
-    def _land(self, now_s: float, known: Telemetry) -> list[Command]:
-        waited_s = self._asked.waited_s(SetMode(Mode.RETURN))
-        return self._follow(self._descent.look(now_s, known, self.setpoint, waited_s))
-
-    # Small change.
-
-    def _descend(self, how: Mode, outcome: Phase, why: str, blind_since_s: float | None = None) -> None:
-        """Bring it down; until it obeys, the setpoint holds it where it is."""
-        self._descent = Landing(self.course, self._watched, how, outcome, why, blind_since_s)
-        self._descent.obeys(self._known)  # it may come down already
-        self._enter(Phase.LANDING, why)
-
-    def _end(self, phase: Phase, why: str) -> None:
-        before, self.setpoint, self._hold.fault = self.setpoint, None, None
-        self._enter(phase, why)
-        if not self.is_over:
+    def _end(self, phase: Phase, reason: str) -> None:
+        before, self.setpoint, self._fault_timer.fault = self.setpoint, None, None
+        self._enter(phase, reason)
+        if not self.is_over:  # an impossible transition
             self.setpoint = before
 
-    def _enter(self, phase: Phase, why: str) -> None:
+    def _enter(self, phase: Phase, reason: str) -> None:
+        """Enter a phase; an impossible transition ends the mission, unless it lands or is over."""
         if (error := transition_error(self.phase, phase, self.step - self._entered_step)) is not None:
-            self._refuse(error)
+            if self.is_strict:
+                raise error
+            self._entered_step = self.step  # every phase may land or end then
+            if self.phase in OFFBOARD:
+                self._abort(f"an error of the bridge: {error}")
+            elif self.phase in GROUND:
+                self._end(Phase.ABORTED, f"an error of the bridge: {error}")
             return
-        self.phase, self._since_s, self._entered_step = phase, self._now_s, self.step
-        self._dwell.begin()
-        self._tracking.begin()
+        self.phase, self.reason = phase, reason
+        self._entered, self._entered_step = self._now, self.step
+        for part in (self._steps, self._stall, self._retry):
+            part.reset()
         self._crash.begin(flies=phase in POLICY_CONTROLLED)
-        self._patience.gone_since = None
-        self._since_steady_s = self._steady_s
-        self._asked.begin()
-        self.reason = why
+        self._policy.lost_since = None
         self._on_change()
 
-    def _refuse(self, error: PhaseError) -> None:
-        """Give up a mission whose phases went wrong; one that comes down, or is over, stays so."""
-        if self.is_strict:
-            raise error
-        self._entered_step = self.step  # within a step, each phase may come down or end
-        if self.phase in OFFBOARD:
-            self._give_up(f"an error of the bridge: {error}")
-        elif self.phase in GROUND:
-            self._end(Phase.ABORTED, f"an error of the bridge: {error}")
-
-    def _change(self, why: str) -> None:
-        """Tell another reason within a phase."""
-        if why != self.reason:
-            self.reason = why
+    def _set_reason(self, reason: str) -> None:
+        if reason != self.reason:
+            self.reason = reason
             self._on_change()

@@ -1,4 +1,4 @@
-"""Whether an aircraft does not fly any more, though it should: fallen over, falling, or on the ground."""
+"""Crash detection: tilt, loss of altitude, ground contact."""
 
 import math
 
@@ -8,49 +8,47 @@ from uav_dc_ros.offboard.vehicle import Telemetry
 
 
 class CrashDetector:
-    """Looks at one phase of a flight after the other.
-
-    Args:
-        settings: limits, and how long it may be beyond one.
+    """Detects crashes in one phase after the other.
 
     Attributes:
-        flies: was it seen in the air, or does its phase say so?
+        flies: whether the vehicle was in the air since the phase began, or its phase implies it.
     """
 
     def __init__(self, settings: SafetySettings) -> None:
         self._settings = settings
-        self._since_s: dict[str, float] = {}  # vehicle time, by what is wrong
+        self._since_s: dict[str, float] = {}  # vehicle time, by symptom
         self.begin(flies=False)
 
     def begin(self, flies: bool) -> None:
-        """Begin another phase, in which it flies from the beginning, or may not."""
+        """Start another phase; `flies`: the vehicle is in the air in all of it."""
         self.flies = flies
-        self._lowest_m, self._highest_m = math.inf, -math.inf  # setpoint, position
+        self._min_setpoint_m, self._max_position_m = math.inf, -math.inf
         self._since_s.clear()
 
-    def look(self, known: Telemetry, setpoint: Enu | None) -> str | None:
-        """What has gone wrong for `crash_timeout_s`; None: nothing, or it is not reported."""
-        settings, position = self._settings, known.position
-        self.flies |= known.on_ground is False
-        wrong: dict[str, str] = {}
-        if known.tilt_rad is not None and math.degrees(known.tilt_rad) > settings.max_tilt_deg:
-            wrong["tilt"] = (
-                f"tilted by {math.degrees(known.tilt_rad):.0f} degrees; expected at most "
-                f"{settings.max_tilt_deg:g}"
-            )
-        if self.flies and known.on_ground:
-            wrong["ground"] = "on the ground, where it should fly"
+    def update(self, telemetry: Telemetry, setpoint: Enu | None) -> str | None:
+        """The symptom that has lasted for `crash_timeout_s`; None: there is none, or it is not reported."""
+        settings, position = self._settings, telemetry.position
+        self.flies |= telemetry.on_ground is False
+        symptoms: dict[str, str] = {}
+        if telemetry.tilt_rad is not None:
+            tilt_deg = math.degrees(telemetry.tilt_rad)
+            if tilt_deg > settings.max_tilt_deg:
+                symptoms["tilt"] = (
+                    f"tilted by {tilt_deg:.0f} degrees; expected at most {settings.max_tilt_deg:g}"
+                )
+        if self.flies and telemetry.on_ground:
+            symptoms["ground"] = "on the ground while it should fly"
         if self.flies and position is not None and setpoint is not None:
-            self._lowest_m = min(self._lowest_m, setpoint.up_m)
-            self._highest_m = max(self._highest_m, position.up_m)
-            low_m = min(self._lowest_m, self._highest_m) - position.up_m
-            if low_m > settings.max_sink_m:
-                wrong["sinks"] = (
-                    f"at {position.up_m:.0f} m, {low_m:.0f} m too low; expected at most "
+            self._min_setpoint_m = min(self._min_setpoint_m, setpoint.up_m)
+            self._max_position_m = max(self._max_position_m, position.up_m)
+            sink_m = min(self._min_setpoint_m, self._max_position_m) - position.up_m
+            if sink_m > settings.max_sink_m:
+                symptoms["sink"] = (
+                    f"at {position.up_m:.0f} m, {sink_m:.0f} m too low; expected at most "
                     f"{settings.max_sink_m:g} m"
                 )
-        self._since_s = {what: self._since_s.get(what, known.vehicle_s) for what in wrong}
-        for what, why in wrong.items():
-            if known.vehicle_s - self._since_s[what] > settings.crash_timeout_s:
-                return why
+        self._since_s = {name: self._since_s.get(name, telemetry.vehicle_s) for name in symptoms}
+        for name, text in symptoms.items():
+            if telemetry.vehicle_s - self._since_s[name] > settings.crash_timeout_s:
+                return text
         return None

@@ -1,4 +1,4 @@
-"""The geofence: an area and a span of altitude, for every target and every pose."""
+"""The geofence: a box for all setpoints and positions."""
 
 import math
 from dataclasses import dataclass
@@ -12,35 +12,27 @@ MARGIN_M = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class Geofence:
-    """A box in the grid's ENU frame.
+    """A box in the grid's ENU frame, metres."""
 
-    Attributes:
-        least, most: its corners, metres.
-    """
-
-    least: Enu
-    most: Enu
+    lower: Enu
+    upper: Enu
 
     @classmethod
     def around(cls, scenario: Scenario, margin_m: float = MARGIN_M) -> Self:
-        """The box around a scenario's grid and above it, from the ground up: the vehicle starts and lands."""
+        """The box around a scenario's grid and above it, from the ground up."""
         grid = scenario.grid
         top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
+        east_m, north_m = (grid.n_x - 1) * grid.cell_m, (grid.n_y - 1) * grid.cell_m
         return cls(
-            least=Enu(-margin_m, -margin_m, -margin_m),
-            most=Enu(
-                (grid.n_x - 1) * grid.cell_m + margin_m,
-                (grid.n_y - 1) * grid.cell_m + margin_m,
-                top_m + margin_m,
-            ),
+            lower=Enu(-margin_m, -margin_m, -margin_m),
+            upper=Enu(east_m + margin_m, north_m + margin_m, top_m + margin_m),
         )
 
     def breach(self, position: Enu) -> str | None:
-        """What is wrong with a position; None if it lies inside."""
-        for name, value, least, most in zip(
-            ("east", "north", "up"), position, self.least, self.most, strict=True
-        ):
-            if not least <= value <= most:  # also what is no number
-                told = f"{value:.1f}" if math.isfinite(value) else str(value)
-                return f"{told} m {name}; the fence reaches from {least:g} to {most:g} m"
+        """The coordinate that lies outside; None: the position is inside."""
+        axes = zip(("east", "north", "up"), position, self.lower, self.upper, strict=True)
+        for axis, value, lower, upper in axes:
+            if not lower <= value <= upper:  # also true for NaN
+                text = f"{value:.1f}" if math.isfinite(value) else str(value)
+                return f"{text} m {axis}; the fence reaches from {lower:g} to {upper:g} m"
         return None

@@ -1,202 +1,199 @@
-"""What brings a vehicle down: return or land, requested until it obeys, and then watched until it stands."""
+"""Landing by return or land: requested until the mode changes, then monitored until the vehicle disarms."""
 
 import math
 from dataclasses import dataclass
 
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.fault_detector import FaultDetector
+from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
 from uav_dc_ros.offboard.mission.progress import MissionProgress
-from uav_dc_ros.offboard.mission.stall_detector import Approach
+from uav_dc_ros.offboard.mission.timers import ProgressTimer
 from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
 
-DOWN = (Mode.LAND, Mode.RETURN)
-HOMELESS = 10.0  # as many times as long is a return waited for whose home is not known
-NEARER_M, VERTICAL_M, LOWER_M = 10.0, 5.0, 1.0  # what counts as progress: to home; up or down; of a landing
+LANDING_MODES = (Mode.LAND, Mode.RETURN)
+NO_HOME_FACTOR = 10.0  # of the timeout of a return whose home position is not known
+NEARER_M, VERTICAL_M, LOWER_M = 10.0, 5.0, 1.0  # minimum progress: to home; up or down; of a landing
 
 
-@dataclass(frozen=True, kw_only=True)
-class Next:
-    """What to do next.
-
-    Attributes:
-        phase: to be in; `landing` means to descend, and one that is over to end.
-        why: in words.
-        setpoint: to stream from now on, in the grid's ENU frame; None: none.
-        command: to send; None: none.
-        down: how to descend.
-        outcome: of a mission that descends.
-        asked: did an earlier bridge request that way down?
-    """
+@dataclass(frozen=True)
+class Decision:
+    """Result of a tick: the next phase, and what belongs to it."""
 
     phase: Phase
-    why: str
-    setpoint: Enu | None = None
+    reason: str
+    setpoint: Enu | None = None  # to be streamed from now on, in the grid's ENU frame
     command: Command | None = None
-    down: Mode = Mode.LAND
-    outcome: Phase = Phase.ABORTED
-    asked: bool = False
+    landing_mode: Mode = Mode.LAND  # of a landing that begins
+    outcome: Phase = Phase.ABORTED  # of a landing that begins: final phase of the mission
+    landing_requested: bool = False  # an earlier bridge has requested that mode
+
+
+def finish(
+    progress: MissionProgress, settings: SafetySettings, result: str, setpoint: Enu | None
+) -> Decision:
+    """The landing after the last step."""
+    if progress.is_at_dock:
+        reason = f"step {progress.step}: at the dock ({result})"
+        return Decision(Phase.LANDING, reason, setpoint, outcome=Phase.LANDED)
+    reason = f"step {progress.step}: out of steps away from the dock ({result})"
+    mode = settings.failsafe_action
+    return Decision(Phase.LANDING, reason, setpoint, landing_mode=mode, outcome=Phase.TIMEOUT)
 
 
 class Landing:
-    """One way down.
+    """One landing.
 
     Args:
-        course: of the mission, which knows the dock.
-        watch: finds what is wrong.
-        how: the mode that it is to come down in.
-        outcome: of the mission, once the vehicle stands.
-        why: it comes down.
-        blind_since_s: steady time since when no position came, if it comes down because of that.
+        mode: mode to request.
+        outcome: final phase of the mission after the landing.
+        reason: of the landing.
+        no_position_since_s: start of the position fault that caused the landing, steady clock.
 
     Attributes:
-        obeyed: was it seen coming down? From then on it is let alone: who changes the mode now is the pilot.
-        tries: how often it was asked.
+        confirmed: whether the vehicle was in a landing mode; any later change of the mode is a pilot's.
+        requests: number of requests sent.
     """
 
     def __init__(
         self,
-        course: MissionProgress,
-        watch: FaultDetector,
-        how: Mode,
+        progress: MissionProgress,
+        detector: FaultDetector,
+        mode: Mode,
         outcome: Phase,
-        why: str,
-        blind_since_s: float | None = None,
+        reason: str,
+        no_position_since_s: float | None = None,
     ) -> None:
-        self._course, self._watch, self._settings = course, watch, watch.settings
-        self.how, self.outcome, self.why = how, outcome, why
-        self.obeyed, self.tries = False, 0
-        self._blind_since_s = blind_since_s
-        self._instead = False  # it is to land, since its return does not come home
-        self._mode: Mode | None = None
-        self._lost_since_s: float | None = None  # steady time: the link is lost
-        self._seen_s: float | None = None  # steady time since when no new position came
-        self._position_s: float | None = None  # when the newest came
-        self._stood_s: float | None = None  # steady time when it was first seen disarmed
-        self._to_home, self._lower = Approach(NEARER_M), Approach(LOWER_M)
-        self._upward, self._downward = Approach(VERTICAL_M), Approach(VERTICAL_M)
+        self._progress, self._detector, self._settings = progress, detector, detector.settings
+        self.mode, self.outcome, self.reason = mode, outcome, reason
+        self.confirmed, self.requests = False, 0
+        self._no_position_since_s = no_position_since_s
+        self._replaces_return = False  # land is requested because the return makes no progress
+        self._last_mode: Mode | None = None
+        self._link_lost_since_s: float | None = None  # steady clock
+        self._position_s: float | None = None  # arrival of the newest position
+        self._updated_s: float | None = None  # steady time of the last new position
+        self._disarmed_s: float | None = None  # steady time of the first disarmed state
+        self._to_home, self._lower = ProgressTimer(NEARER_M), ProgressTimer(LOWER_M)
+        self._upward, self._downward = ProgressTimer(VERTICAL_M), ProgressTimer(VERTICAL_M)
+        self._timers = self._to_home, self._lower, self._upward, self._downward
 
-    def obeys(self, known: Telemetry) -> bool:
-        """Does it come down, as it was told or as its own failsafe or a pilot knows better."""
-        self.obeyed = self.obeyed or known.mode in DOWN
-        self._instead = self._instead and known.mode is not Mode.LAND  # who returns it then is a pilot
-        return self.obeyed and not (self._instead and known.mode is Mode.RETURN)
+    def confirm(self, telemetry: Telemetry) -> bool:
+        """Whether the vehicle lands: as requested, or by its own failsafe or a pilot."""
+        self.confirmed = self.confirmed or telemetry.mode in LANDING_MODES
+        # A return after the requested land is a pilot's.
+        self._replaces_return = self._replaces_return and telemetry.mode is not Mode.LAND
+        return self.confirmed and not (self._replaces_return and telemetry.mode is Mode.RETURN)
 
-    def is_ours(self, mode: Mode) -> bool:
-        """Is a vehicle that shall come down in a mode that nobody else has chosen for something else."""
-        return mode in DOWN or (mode is Mode.COMMANDED and not self.obeyed)
+    def allows(self, mode: Mode) -> bool:
+        """Whether a mode is no takeover: a landing mode, or COMMANDED before the landing is confirmed."""
+        return mode in LANDING_MODES or (mode is Mode.COMMANDED and not self.confirmed)
 
-    def look(self, now_s: float, known: Telemetry, setpoint: Enu | None, waited_s: float | None) -> Next:
-        """Look at a vehicle that is to come down.
+    def update(
+        self, now_s: float, telemetry: Telemetry, setpoint: Enu | None, waited_s: float | None
+    ) -> Decision:
+        """Decide in one tick.
 
         Args:
             now_s: steady clock.
-            known: of the vehicle.
-            setpoint: that is streamed; until the vehicle obeys, it holds it where it is.
-            waited_s: since it was asked to return last, see `Asked`; None: it was not.
+            setpoint: current setpoint, which is streamed until the landing is confirmed.
+            waited_s: time since return was requested last, see `CommandRetry`; None: it was not.
         """
-        if self._watch.link_is_lost(now_s, known):
-            return self._wait_for_link(now_s, known, setpoint)
-        self._lost_since_s = None
-        if not known.armed:
-            return self._stand(now_s, known)
-        if self._watch.clock_stands_for_s(now_s) > self._settings.link_lost_timeout_s:
-            why = f"{self.why}; its clock has stood still for {self._settings.link_lost_timeout_s:g} s"
-            return Next(phase=Phase.ABORTED, why=why)
-        if (stall := self._stalls(now_s, known)) is not None:
-            returns = known.mode is self.how is Mode.RETURN and self.tries  # as it was asked to
-            if not returns:
-                return Next(phase=Phase.ABORTED, why=f"{self.why}; {stall}")
-            self._land_instead(now_s, f"{stall}: lands")
-        if self.obeys(known):
-            return Next(phase=Phase.LANDING, why=self.why)
-        if self._refuses_to_return(waited_s):
-            self.how = Mode.LAND
-            self.why += f"; it does not return ({known.refusal or 'no answer'}): lands"
-        refused = f"; {known.refusal}" if known.refusal and self.tries else ""
-        return Next(
-            phase=Phase.LANDING, why=f"{self.why}{refused}", setpoint=setpoint, command=SetMode(self.how)
-        )
-
-    def _wait_for_link(self, now_s: float, known: Telemetry, setpoint: Enu | None) -> Next:
-        """Wait, for a while: who knows what mode it is in by now."""
-        settings, heartbeat_s = self._settings, known.heartbeat_s
-        for progress in (self._to_home, self._lower, self._upward, self._downward):
-            progress.pause()
-        self._seen_s = None
-        if self._blind_since_s is not None and (heartbeat_s or 0.0) <= self._blind_since_s:
-            # No position came because nothing came.
-            self.how, self._blind_since_s = settings.failsafe_action, None
-            self.why = f"link lost: no heartbeat for {settings.heartbeat_timeout_s:g} s"
-        if self._lost_since_s is None:
-            self._lost_since_s = now_s if heartbeat_s is None else min(now_s, heartbeat_s)
-        if now_s - self._lost_since_s > settings.link_lost_timeout_s:
-            why = f"{self.why}; not heard of for {settings.link_lost_timeout_s:g} s"
-            return Next(phase=Phase.ABORTED, why=why)
-        return Next(phase=Phase.LANDING, why=self.why, setpoint=setpoint)
-
-    def _stand(self, now_s: float, known: Telemetry) -> Next:
-        """Judge a vehicle that is disarmed: it has landed if its position is that of the dock."""
-        settings, wrong = self._settings, None
-        if self.outcome is not Phase.LANDED:
-            return Next(phase=self.outcome, why=self.why)
-        if self._stood_s is None:
-            self._stood_s = now_s
-        here = self._position(now_s, known)
-        if (here is None or known.on_ground is False) and now_s - self._stood_s <= settings.fault_timeout_s:
-            return Next(phase=Phase.LANDING, why=self.why)  # its other messages come after the heartbeat
-        if known.on_ground is False:
-            wrong = "disarmed in the air"
-        elif here is None:
-            wrong = "disarmed, and no position tells where"
-        elif (off_m := self._course.dock_distance_m(here)) > settings.landing_radius_m:
-            wrong = f"landed {off_m:.0f} m from the dock; expected at most {settings.landing_radius_m:g} m"
-        if wrong is None:
-            return Next(phase=Phase.LANDED, why=self.why)
-        return Next(phase=Phase.ABORTED, why=f"{self.why}; {wrong}")
-
-    def _position(self, now_s: float, known: Telemetry) -> Enu | None:
-        """Where it is; None if the last position is too old to tell."""
-        fresh = known.position_s is not None and now_s - known.position_s <= self._settings.position_timeout_s
-        return known.position if fresh else None
-
-    def _refuses_to_return(self, waited_s: float | None) -> bool:
         settings = self._settings
+        if self._detector.link_lost(now_s, telemetry):
+            return self._wait_for_link(now_s, telemetry, setpoint)
+        self._link_lost_since_s = None
+        if not telemetry.armed:
+            return self._check_disarmed(now_s, telemetry)
+        if self._detector.clock_stopped_for_s(now_s) > settings.link_lost_timeout_s:
+            text = f"the vehicle's time has not advanced for {settings.link_lost_timeout_s:g} s"
+            return Decision(Phase.ABORTED, f"{self.reason}; {text}")
+        if (stall := self._stall(now_s, telemetry)) is not None:
+            if not (telemetry.mode is self.mode is Mode.RETURN and self.requests):
+                return Decision(Phase.ABORTED, f"{self.reason}; {stall}")
+            self.mode, self._replaces_return = Mode.LAND, True
+            self.reason = f"{self.reason}; {stall}: lands"
+            self._lower.reset()
+            self._updated_s = now_s
+        if self.confirm(telemetry):
+            return Decision(Phase.LANDING, self.reason)
         answered = waited_s is None or waited_s >= settings.command_retry_s
-        return self.how is Mode.RETURN and self.tries >= settings.max_return_attempts and answered
-
-    def _land_instead(self, now_s: float, why: str) -> None:
-        self.how, self._instead, self.why = Mode.LAND, True, f"{self.why}; {why}"
-        self._lower.begin()
-        self._seen_s = now_s
-
-    def _stalls(self, now_s: float, known: Telemetry) -> str | None:
-        """Why a vehicle that is armed, and in reach, does not come down; None: it does."""
-        settings, here, home, vehicle_s = self._settings, known.position, known.home, known.vehicle_s
-        if known.mode is not self._mode:
-            self._mode = known.mode
-            for progress in (self._to_home, self._lower, self._upward, self._downward):
-                progress.begin()
-        if here is None or known.position_s == self._position_s:  # nothing new
-            self._seen_s = now_s if self._seen_s is None else self._seen_s
-            blind = now_s - self._seen_s > settings.link_lost_timeout_s
-            return f"no position for {settings.link_lost_timeout_s:g} s" if blind else None
-        self._position_s, self._seen_s = known.position_s, now_s
-        away_m = math.dist(here[:2], home[:2]) if home is not None else 0.0
-        stalled_s = min(
-            self._to_home.stalled_s(away_m, vehicle_s),
-            self._upward.stalled_s(-here.up_m, vehicle_s),
-            self._downward.stalled_s(here.up_m, vehicle_s),
+        if self.mode is Mode.RETURN and self.requests >= settings.max_return_attempts and answered:
+            self.mode = Mode.LAND
+            self.reason += f"; return not executed ({telemetry.refusal or 'no answer'}): lands"
+        refusal = f"; {telemetry.refusal}" if telemetry.refusal and self.requests else ""
+        return Decision(
+            Phase.LANDING,
+            f"{self.reason}{refusal}",
+            setpoint=setpoint,
+            command=SetMode(self.mode),
         )
-        landing_s = self._lower.stalled_s(here.up_m, vehicle_s)
-        if known.mode is Mode.RETURN and not known.on_ground and not self._instead:
-            limit_s = settings.return_progress_timeout_s * (1.0 if home is not None else HOMELESS)
-            if stalled_s <= limit_s:
-                return None
+
+    def _wait_for_link(self, now_s: float, telemetry: Telemetry, setpoint: Enu | None) -> Decision:
+        """Send no request: the current mode is not known."""
+        settings, heartbeat_s = self._settings, telemetry.heartbeat_s
+        for timer in self._timers:
+            timer.pause()
+        self._updated_s = None
+        if self._no_position_since_s is not None and (heartbeat_s or 0.0) <= self._no_position_since_s:
+            # Positions were missing because the link was lost.
+            self.mode, self._no_position_since_s = settings.failsafe_action, None
+            self.reason = f"link lost: no heartbeat for {settings.heartbeat_timeout_s:g} s"
+        if self._link_lost_since_s is None:
+            self._link_lost_since_s = now_s if heartbeat_s is None else min(now_s, heartbeat_s)
+        if now_s - self._link_lost_since_s > settings.link_lost_timeout_s:
+            text = f"no heartbeat for {settings.link_lost_timeout_s:g} s"
+            return Decision(Phase.ABORTED, f"{self.reason}; {text}")
+        return Decision(Phase.LANDING, self.reason, setpoint=setpoint)
+
+    def _check_disarmed(self, now_s: float, telemetry: Telemetry) -> Decision:
+        """Compare the position of a disarmed vehicle with the dock."""
+        settings, fault = self._settings, None
+        if self.outcome is not Phase.LANDED:
+            return Decision(self.outcome, self.reason)
+        if self._disarmed_s is None:
+            self._disarmed_s = now_s
+        here, position_s = telemetry.position, telemetry.position_s
+        if position_s is None or now_s - position_s > settings.position_timeout_s:
+            here = None
+        waits = now_s - self._disarmed_s <= settings.fault_timeout_s
+        if waits and (here is None or telemetry.on_ground is False):
+            # The other messages arrive after the heartbeat.
+            return Decision(Phase.LANDING, self.reason)
+        if telemetry.on_ground is False:
+            fault = "disarmed in the air"
+        elif here is None:
+            fault = "disarmed at an unknown position"
+        elif (off_m := self._progress.dock_distance_m(here)) > settings.landing_radius_m:
+            fault = f"landed {off_m:.0f} m from the dock; expected at most {settings.landing_radius_m:g} m"
+        if fault is None:
+            return Decision(Phase.LANDED, self.reason)
+        return Decision(Phase.ABORTED, f"{self.reason}; {fault}")
+
+    def _stall(self, now_s: float, telemetry: Telemetry) -> str | None:
+        """Missing progress of an armed vehicle with a link; None: it makes progress."""
+        settings, here, home = self._settings, telemetry.position, telemetry.home
+        vehicle_s, is_return = telemetry.vehicle_s, telemetry.mode is Mode.RETURN
+        if telemetry.mode is not self._last_mode:
+            self._last_mode = telemetry.mode
+            for timer in self._timers:
+                timer.reset()
+        if here is None or telemetry.position_s == self._position_s:
+            self._updated_s = now_s if self._updated_s is None else self._updated_s
+            lost = now_s - self._updated_s > settings.link_lost_timeout_s
+            return f"no position for {settings.link_lost_timeout_s:g} s" if lost else None
+        self._position_s, self._updated_s = telemetry.position_s, now_s
+        away_m = math.dist(here[:2], home[:2]) if home is not None else 0.0
+        return_s = min(
+            self._to_home.update(away_m, vehicle_s),
+            self._upward.update(-here.up_m, vehicle_s),
+            self._downward.update(here.up_m, vehicle_s),
+        )
+        landing_s = self._lower.update(here.up_m, vehicle_s)
+        if is_return and not telemetry.on_ground and not self._replaces_return:
+            limit_s = settings.return_progress_timeout_s * (1.0 if home is not None else NO_HOME_FACTOR)
             far = f" ({away_m:.0f} m away)" if home is not None else ""
-            return f"it returns, and has come no nearer to home{far} for {limit_s:g} s"
+            return None if return_s <= limit_s else f"return no nearer to home{far} for {limit_s:g} s"
         if landing_s > settings.landing_progress_timeout_s:
-            what = "it lands" if known.mode is Mode.LAND else f"mode {known.mode_name or known.mode.value}"
             limit_s = settings.landing_progress_timeout_s
-            return f"{what}, and has neither descended nor disarmed for {limit_s:g} s"
+            return f"in mode {telemetry.mode_text} neither descended nor disarmed for {limit_s:g} s"
         return None

@@ -1,4 +1,4 @@
-"""Telemetry that cannot be true is counted and left out; the mission flies by the rest."""
+"""Removes impossible values from telemetry, and counts them."""
 
 import dataclasses
 import math
@@ -6,62 +6,56 @@ import math
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.vehicle import Telemetry
 
-SLACK_S = 1.0  # between times of arrival that are taken in different threads, steady clock
+SLACK_S = 1.0  # between arrival times that are taken in different threads, steady clock
 
 
-def is_finite(position: Enu) -> bool:
-    """Is a position one at all: three numbers."""
-    return all(map(math.isfinite, position))
-
-
-class Plausibility:
+class PlausibilityFilter:
     """Filters the telemetry of one vehicle.
 
     Args:
-        max_speed_mps: no vehicle of this kind flies faster.
-        jump_m: how far its estimate may jump besides.
+        max_speed_mps, max_jump_m: a position that is farther from the last accepted one is a jump.
 
     Attributes:
-        discarded: what was left out, by reason.
-        jump: why the newest position was left out; None: it was not.
-        accepted_s: vehicle time of the last position that was not left out.
+        discarded: number of discarded values by reason.
+        jump: why the newest position was discarded; None: it was accepted.
+        accepted_s: vehicle time of the last accepted position.
     """
 
-    def __init__(self, max_speed_mps: float, jump_m: float) -> None:
-        self._max_speed_mps, self._jump_m = max_speed_mps, jump_m
+    def __init__(self, max_speed_mps: float, max_jump_m: float) -> None:
+        self._max_speed_mps, self._max_jump_m = max_speed_mps, max_jump_m
         self.discarded: dict[str, int] = {}
         self.jump: str | None = None
         self.accepted_s = 0.0
-        self._newest_s = -math.inf  # steady clock: when the newest position came, accepted or not
-        self._accepted: Telemetry | None = None
+        self._accepted: tuple[Enu, float] | None = None  # position, and its arrival
+        self._newest_s = -math.inf  # steady clock: arrival of the newest position, accepted or not
         self._vehicle_s = 0.0
-        self._last: Telemetry | None = None  # as it was returned
+        self._last: Telemetry | None = None  # as returned
 
-    def filter(self, now_s: float, known: Telemetry) -> Telemetry:
-        """The telemetry, with the last position that can be true, and a time that never goes back.
+    def filter(self, now_s: float, telemetry: Telemetry) -> Telemetry:
+        """The telemetry with the last accepted position and a vehicle time that never decreases.
 
-        Where its last heartbeat is older than that of telemetry before, the latter is returned.
+        Telemetry whose last heartbeat is older than before is discarded: the previous one is returned.
         """
-        last, heartbeat_s = self._last, known.heartbeat_s
-        if last is not None and (heartbeat_s or 0.0) < (last.heartbeat_s or 0.0) - SLACK_S:
+        last = self._last
+        if last is not None and (telemetry.heartbeat_s or 0.0) < (last.heartbeat_s or 0.0) - SLACK_S:
             self._discard("out of order")
             return last
-        if math.isfinite(known.vehicle_s):
-            self._vehicle_s = max(self._vehicle_s, known.vehicle_s)
-        if known.position is not None and known.position_s is not None:
-            self._judge(now_s, known, known.position, known.position_s)
-        accepted = self._accepted
+        if math.isfinite(telemetry.vehicle_s):
+            self._vehicle_s = max(self._vehicle_s, telemetry.vehicle_s)
+        if telemetry.position is not None and telemetry.position_s is not None:
+            self._check(now_s, telemetry.position, telemetry.position_s)
+        position, position_s = self._accepted or (None, None)
         self._last = dataclasses.replace(
-            known,
+            telemetry,
             vehicle_s=self._vehicle_s,
-            position=accepted.position if accepted else None,
-            position_s=accepted.position_s if accepted else None,
-            home=known.home if known.home is not None and is_finite(known.home) else None,
-            target=known.target if known.target is not None and is_finite(known.target) else None,
+            position=position,
+            position_s=position_s,
+            home=telemetry.home if _is_finite(telemetry.home) else None,
+            target=telemetry.target if _is_finite(telemetry.target) else None,
         )
         return self._last
 
-    def _judge(self, now_s: float, known: Telemetry, position: Enu, position_s: float) -> None:
+    def _check(self, now_s: float, position: Enu, position_s: float) -> None:
         """Accept a new position, or count why not."""
         if position_s == self._newest_s:
             return
@@ -69,23 +63,25 @@ class Plausibility:
             self._discard("out of order")
             return
         self._newest_s = position_s
-        self.jump = self._jumped(position)
+        self.jump = self._find_jump(position)
         if self.jump is None:
-            self._accepted, self.accepted_s = known, self._vehicle_s
+            self._accepted, self.accepted_s = (position, position_s), self._vehicle_s
         else:
             self._discard("impossible position")
 
-    def _jumped(self, position: Enu) -> str | None:
-        """Is the vehicle where it cannot have flown since the last position that was accepted."""
-        if not is_finite(position):
+    def _find_jump(self, position: Enu) -> str | None:
+        if not _is_finite(position):
             return "the position is not a number"
-        if self._accepted is None or self._accepted.position is None:
+        if self._accepted is None:
             return None
-        moved_m = math.dist(position, self._accepted.position)
-        passed_s = self._vehicle_s - self.accepted_s
-        if moved_m > self._jump_m + self._max_speed_mps * passed_s:
+        moved_m, passed_s = math.dist(position, self._accepted[0]), self._vehicle_s - self.accepted_s
+        if moved_m > self._max_jump_m + self._max_speed_mps * passed_s:
             return f"the position jumped by {moved_m:.0f} m"
         return None
 
     def _discard(self, reason: str) -> None:
         self.discarded[reason] = self.discarded.get(reason, 0) + 1
+
+
+def _is_finite(position: Enu | None) -> bool:
+    return position is not None and all(map(math.isfinite, position))

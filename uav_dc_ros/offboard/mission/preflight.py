@@ -1,225 +1,222 @@
-"""A mission before its first step: what a look at the vehicle leads to, while it is connected and made ready.
-
-Nothing here is done: each look ends in a `Next`, which the bridge carries out.
-"""
+"""Decisions before the first step: while the bridge connects, checks the vehicle and arms it."""
 
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission import field_check
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
-from uav_dc_ros.offboard.mission.landing import DOWN, Next
+from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, finish
 from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, Telemetry
 
-UNPLACED_S = 5.0  # after which a vehicle that flies has no place on the grid, though a link has told of it
+NO_POSITION_S = 5.0  # a vehicle in the air whose grid position is unknown for longer is refused, steady clock
 
 
 class Preflight:
-    """Looks at a vehicle that does not fly the mission yet.
-
-    Args:
-        course: of the mission.
-        settings: how carefully to fly.
-        fence: where it may be.
-        watch: finds what is wrong.
+    """Decides for a vehicle that does not fly the mission yet.
 
     Attributes:
-        allowed_mode: with `Settings.arm`, the one mode besides the commanded one that the vehicle may be in:
-            that in which it was when the commanded mode was requested. The commanded mode's name: the vehicle
-            was in that already. None: neither has happened yet, and every mode is allowed.
-        is_a_pilots: had somebody else it armed, or disarmed it? Then it is not to start again by itself.
+        allowed_mode: with `SafetySettings.arm`, the one mode besides the commanded one that is no takeover:
+            that of the moment when the commanded mode was requested, or the commanded mode itself once the
+            vehicle was in it. None: every mode is allowed.
+        pilot_has_control: whether a pilot has armed or disarmed the vehicle; the bridge does not arm it then.
     """
 
     def __init__(
-        self, course: MissionProgress, settings: SafetySettings, fence: Geofence, watch: FaultDetector
+        self, progress: MissionProgress, settings: SafetySettings, fence: Geofence, detector: FaultDetector
     ) -> None:
-        self.course, self.settings, self.fence, self.watch = course, settings, fence, watch
-        self.allowed_mode = course.standing.allowed_mode
-        self.is_a_pilots = course.standing.is_a_pilots
+        self.progress, self.settings, self.fence, self.detector = progress, settings, fence, detector
+        self.checkpoint = progress.checkpoint
+        self.allowed_mode = self.checkpoint.allowed_mode
+        self.pilot_has_control = self.checkpoint.pilot_has_control
         self._was_armed = False
-        self._unplaced_since_s: float | None = None  # steady clock: it flies, and nobody knows where
+        self._no_position_since_s: float | None = None  # steady clock, of a vehicle in the air
 
-    def takeover(self, now_s: float, known: Telemetry) -> str | None:
-        """Why somebody else has a vehicle that is to be armed here; None: nobody has.
+    def takeover(self, now_s: float, telemetry: Telemetry) -> str | None:
+        """A change of the mode that takes the vehicle over; None: there was none.
 
-        Who chooses another mode after the commanded one was requested, or entered, takes the vehicle back.
-        Without `Settings.arm` nothing is requested, and a pilot is free to change modes until take-off.
+        Without `SafetySettings.arm` the bridge requests no mode, and a pilot may change it until take-off.
         """
-        self.is_a_pilots |= self._was_armed and not known.armed  # by whoever disarmed it
-        self._was_armed = known.armed
-        if not self.settings.arm or self.is_a_pilots or self.watch.link_is_lost(now_s, known):
+        self.pilot_has_control |= self._was_armed and not telemetry.armed
+        self._was_armed = telemetry.armed
+        if not self.settings.arm or self.pilot_has_control or self.detector.link_lost(now_s, telemetry):
             return None
-        mode = _name(known)
-        if known.mode is Mode.COMMANDED:
+        mode = telemetry.mode_text
+        if telemetry.mode is Mode.COMMANDED:
             self.allowed_mode = mode
         elif self.allowed_mode not in (None, mode):
-            after = "" if known.missing is None else f" (after: {known.missing})"
+            after = "" if telemetry.missing is None else f" (after: {telemetry.missing})"
             return f"mode {mode} before take-off: changed by a pilot or by the autopilot's failsafe{after}"
         return None
 
-    def refusal(self, known: Telemetry) -> str | None:
-        """Why the mission cannot be flown with this vehicle as it is; None: it can."""
-        return rival(known) or self._misfit(known)
-
-    def connect(self, now_s: float, known: Telemetry, waited_s: float) -> Next:
-        """Look at a vehicle that nothing is known of yet.
-
-        Args:
-            now_s: steady clock.
-            known: of the vehicle.
-            waited_s: for it, until now, steady clock.
-        """
-        flew, settings = self.course.standing.flies, self.settings
-        self.is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
-        if not flew and (why := self.refusal(known)) is not None:
-            return Next(phase=Phase.ABORTED, why=why)
-        fault = self.watch.fault(now_s, known)
-        if known.missing is not None or fault is not None or known.position is None:
-            why = known.missing or (fault.why if fault is not None else "no position yet")
-            return self._not_yet(now_s, known, why, waited_s)
-        breach = self.fence.breach(known.position)
-        if flew and (otherwise := self._left_alone(known, breach)) is not None:
-            return otherwise
-        flies = known.armed and known.on_ground is False and known.mode is Mode.COMMANDED
+    def connect(self, now_s: float, telemetry: Telemetry, waited_s: float) -> Decision:
+        """Decide in the phase `connecting`, which has lasted for `waited_s`, steady clock."""
+        was_airborne, settings = self.checkpoint.airborne, self.settings
+        self.pilot_has_control |= telemetry.armed and telemetry.mode is not Mode.COMMANDED
+        if not was_airborne and (refusal := self._refusal(telemetry)) is not None:
+            return Decision(Phase.ABORTED, refusal)
+        fault, position = self.detector.fault(now_s, telemetry), telemetry.position
+        if telemetry.missing is not None or fault is not None or position is None:
+            reason = telemetry.missing or (fault.text if fault is not None else "no position yet")
+            return self._wait(now_s, telemetry, reason, waited_s)
+        breach = self.fence.breach(position)
+        if was_airborne and (decision := self._after_restart(telemetry, breach)) is not None:
+            return decision
+        flies = telemetry.in_the_air and telemetry.mode is Mode.COMMANDED
         if breach is not None:
-            why = f"the vehicle is outside the fence: {breach}"
+            reason = f"the vehicle is outside the fence: {breach}"
             if flies:
-                why = f"{why}. It flies, and is left alone; expected it on the field, or another --datum"
-            return Next(phase=Phase.ABORTED if flies else Phase.CONNECTING, why=why)
+                reason += " (it flies: the bridge leaves it alone); expected it inside, or another --datum"
+            return Decision(Phase.ABORTED if flies else Phase.CONNECTING, reason)
+        if flies and settings.flying_at_start == "land":
+            reason, mode = "in the air when the bridge started", settings.failsafe_action
+            return Decision(Phase.LANDING, reason, position, landing_mode=mode)
         if flies:
-            if settings.flying_at_start == "land":
-                why = "it flew already when the bridge came"
-                return Next(
-                    phase=Phase.LANDING, why=why, setpoint=known.position, down=settings.failsafe_action
-                )
-            why = "it flies already: to the cell where the mission stands"
-            return Next(phase=Phase.TAKEOFF, why=why, setpoint=self._above(known))
-        # An autopilot may want to see setpoints before it follows any.
-        why = f"connected to {known.system}" if known.system else "connected"
-        return Next(phase=Phase.PREFLIGHT, why=why, setpoint=known.position)
+            reason = f"in the air when the bridge started: flies to cell {self.progress.goal}"
+            return self._fly_to_start(telemetry, reason)
+        # An autopilot may require a setpoint stream before it accepts the commanded mode.
+        reason = f"connected to {telemetry.system}" if telemetry.system else "connected"
+        return Decision(Phase.PREFLIGHT, reason, setpoint=position)
 
-    def _not_yet(self, now_s: float, known: Telemetry, why: str, waited_s: float) -> Next:
-        """Wait for what is missing; but a vehicle in the air is not waited for without end."""
-        lost = self.watch.link_is_lost(now_s, known)
-        unplaced = not lost and known.armed and known.on_ground is False and known.position is None
-        since_s = self._unplaced_since_s = (self._unplaced_since_s or now_s) if unplaced else None
-        if self.course.standing.flies:
+    def _wait(self, now_s: float, telemetry: Telemetry, reason: str, waited_s: float) -> Decision:
+        """Wait for what is missing; a vehicle in the air for a limited time only."""
+        lost = self.detector.link_lost(now_s, telemetry)
+        no_position = not lost and telemetry.in_the_air and telemetry.position is None
+        since_s = self._no_position_since_s = (self._no_position_since_s or now_s) if no_position else None
+        if self.checkpoint.airborne:
             if waited_s > self.settings.link_lost_timeout_s:
-                why = f"{why}; waited {waited_s:.0f} s"
-                left_alone = lost or not known.armed or self._is_anothers(known)
-                return Next(phase=Phase.ABORTED, why=why) if left_alone else self._down(known, why)
-        elif since_s is not None and now_s - since_s > UNPLACED_S:
-            why = f"the vehicle flies, and its place on the grid is not known ({why})"
-            return Next(phase=Phase.ABORTED, why=f"{why}; expected --datum=LAT,LON,ALT, or it on the ground")
-        return Next(phase=Phase.CONNECTING, why=why)
+                reason = f"{reason}; waited {waited_s:.0f} s"
+                if lost or not telemetry.armed or self._is_taken_over(telemetry):
+                    return Decision(Phase.ABORTED, reason)
+                return self._land(telemetry, reason)
+        elif since_s is not None and now_s - since_s > NO_POSITION_S:
+            reason = f"the vehicle flies, and its position on the grid is not known ({reason})"
+            expected = "expected --datum=LAT,LON,ALT, or the vehicle on the ground"
+            return Decision(Phase.ABORTED, f"{reason}; {expected}")
+        return Decision(Phase.CONNECTING, reason)
 
-    def _is_anothers(self, known: Telemetry) -> bool:
-        """Has somebody else the vehicle of a mission that was in the air, who flies it."""
-        before = self.course.standing
+    def _is_taken_over(self, telemetry: Telemetry) -> bool:
+        """Whether another controller has the vehicle of a mission that was in the air before a restart."""
+        before = self.checkpoint
         if before.released:
-            return known.mode not in DOWN
-        return before.obeyed and known.mode is Mode.COMMANDED  # an earlier bridge saw it coming down
+            return telemetry.mode not in LANDING_MODES
+        return before.landing_confirmed and telemetry.mode is Mode.COMMANDED
 
-    def _down(self, known: Telemetry, why: str, outcome: Phase = Phase.ABORTED) -> Next:
-        """Go on coming down as it did before, or as it is told to."""
-        before = self.course.standing
-        down = known.mode if known.mode in DOWN else before.down or self.settings.failsafe_action
-        asked = before.asked and before.down is known.mode
-        return Next(phase=Phase.LANDING, why=why, down=down, outcome=outcome, asked=asked)
+    def _land(self, telemetry: Telemetry, reason: str, outcome: Phase = Phase.ABORTED) -> Decision:
+        """Continue the landing that an earlier bridge began, or begin one."""
+        before = self.checkpoint
+        mode = before.landing_mode or self.settings.failsafe_action
+        if telemetry.mode in LANDING_MODES:
+            mode = telemetry.mode
+        requested = before.landing_requested and before.landing_mode is telemetry.mode
+        return Decision(
+            Phase.LANDING,
+            reason,
+            landing_mode=mode,
+            outcome=outcome,
+            landing_requested=requested,
+        )
 
-    def _left_alone(self, known: Telemetry, breach: str | None) -> Next | None:
-        """Why a mission that was in the air is not taken up again, or goes on coming down; None: it is."""
-        before = self.course.standing
-        if before.released and not (known.armed and known.mode in DOWN):
-            return Next(phase=before.outcome or Phase.ABORTED, why=before.reason)
-        if known.armed and self._is_anothers(known):
-            why = f"{before.reason}; in mode {_name(known)} when the bridge came back"
-            return Next(phase=Phase.ABORTED, why=why)
-        if before.outcome is not None and (known.armed or before.outcome is Phase.LANDED):
-            return self._down(known, before.reason, before.outcome)
-        if not known.armed:  # it is never armed a second time
-            why = before.reason or "on the ground and disarmed when the bridge came back"
-            return Next(phase=before.outcome or Phase.ABORTED, why=why)
-        if known.mode in DOWN:
-            why = f"in mode {_name(known)} when the bridge came back"
-            return Next(phase=Phase.LANDING, why=why, down=known.mode)
-        if known.mode is not Mode.COMMANDED:
-            return Next(phase=Phase.ABORTED, why=f"in mode {_name(known)} when the bridge came back")
+    def _after_restart(self, telemetry: Telemetry, breach: str | None) -> Decision | None:
+        """Why a mission that was in the air ends, or continues its landing; None: it is resumed."""
+        before, mode = self.checkpoint, telemetry.mode
+        now = f"in mode {telemetry.mode_text} when the bridge restarted"
+        if before.released and not (telemetry.armed and mode in LANDING_MODES):
+            return Decision(before.outcome or Phase.ABORTED, before.reason)
+        if telemetry.armed and self._is_taken_over(telemetry):
+            return Decision(Phase.ABORTED, f"{before.reason}; {now}")
+        if before.outcome is not None and (telemetry.armed or before.outcome is Phase.LANDED):
+            return self._land(telemetry, before.reason, before.outcome)
+        if not telemetry.armed:  # the bridge never arms a second time
+            reason = before.reason or "on the ground and disarmed when the bridge restarted"
+            return Decision(before.outcome or Phase.ABORTED, reason)
+        if mode in LANDING_MODES:
+            return Decision(Phase.LANDING, now, landing_mode=mode)
+        if mode is not Mode.COMMANDED:
+            return Decision(Phase.ABORTED, now)
         if breach is not None:
-            why = f"outside the fence when the bridge came back: {breach}"
-            return Next(phase=Phase.LANDING, why=why, down=self.settings.failsafe_action)
+            reason = f"outside the fence when the bridge restarted: {breach}"
+            return Decision(Phase.LANDING, reason, landing_mode=self.settings.failsafe_action)
         return None
 
-    def prepare(self, now_s: float, known: Telemetry) -> Next:
-        """Look at a vehicle that is connected."""
-        self.is_a_pilots |= known.armed and known.mode is not Mode.COMMANDED
-        here, fault = known.position, self.watch.fault(now_s, known)
-        ours = known.armed and known.mode is Mode.COMMANDED
-        if not ours and self.course.standing.flies and (left := self._left_alone(known, None)) is not None:
-            return left  # it was armed once
-        if not ours and (why := self.refusal(known)) is not None:
-            return Next(phase=Phase.ABORTED, why=why)
-        if known.missing is not None:
-            return Next(phase=Phase.CONNECTING, why=known.missing)
-        if ours:
-            return self._take_it(known)
-        wrong = fault.why if fault is not None else self.fence.breach(here) if here is not None else None
+    def prepare(self, now_s: float, telemetry: Telemetry) -> Decision:
+        """Decide in the phase `preflight`."""
+        is_commanded = telemetry.mode is Mode.COMMANDED
+        self.pilot_has_control |= telemetry.armed and not is_commanded
+        here, fault = telemetry.position, self.detector.fault(now_s, telemetry)
+        may_take_off = telemetry.armed and is_commanded
+        if not may_take_off:
+            if self.checkpoint.airborne and (decision := self._after_restart(telemetry, None)) is not None:
+                return decision  # it was armed before
+            if (refusal := self._refusal(telemetry)) is not None:
+                return Decision(Phase.ABORTED, refusal)
+        if telemetry.missing is not None:
+            return Decision(Phase.CONNECTING, telemetry.missing)
+        if may_take_off:
+            return self._take_off(telemetry)
+        wrong = None if here is None else self.fence.breach(here)
+        if fault is not None:
+            wrong = fault.text
         if wrong is not None:
-            return Next(phase=Phase.CONNECTING, why=wrong)
+            return Decision(Phase.CONNECTING, wrong)
         command: Command | None = None
-        if known.armed:
-            why = f"a pilot flies: mode {_name(known)}"
-        elif (low := self.watch.battery_is_low(known)) is not None:
-            why = low
-        elif self.is_a_pilots:
-            why = "a pilot had it: waiting for a pilot to set the mode and arm"
+        if telemetry.armed:
+            reason = f"a pilot flies: mode {telemetry.mode_text}"
+        elif (low := self.detector.battery_fault(telemetry)) is not None:
+            reason = low
+        elif self.pilot_has_control:
+            reason = "a pilot had control: waiting for a pilot to set the mode and arm"
         elif not self.settings.arm:
-            why = "waiting for a pilot to set the mode and arm (--arm does it here)"
+            reason = "waiting for a pilot to set the mode and arm (with --arm the bridge does it)"
         else:
-            why = known.refusal or "sets the mode and arms"
-            command = Arm() if known.mode is Mode.COMMANDED else SetMode(Mode.COMMANDED)
-            self.allowed_mode = self.allowed_mode or _name(known)
-        why = "; ".join([why, *self.warnings(known)])
-        return Next(phase=Phase.PREFLIGHT, why=why, setpoint=here, command=command)
+            reason = telemetry.refusal or "sets the mode and arms"
+            command = Arm() if is_commanded else SetMode(Mode.COMMANDED)
+            self.allowed_mode = self.allowed_mode or telemetry.mode_text
+        reason = "; ".join([reason, *self.warnings(telemetry)])
+        return Decision(Phase.PREFLIGHT, reason, setpoint=here, command=command)
 
-    def _take_it(self, known: Telemetry) -> Next:
-        """Begin with a vehicle that is armed, in the commanded mode."""
-        above = self._above(known)
-        breach = self.fence.breach(above)
-        why = f"the target is outside the fence: {breach}" if breach is not None else self._misfit(known)
-        if why is not None:
-            down = Mode.LAND if known.on_ground else self.settings.failsafe_action
-            return Next(phase=Phase.LANDING, why=why, down=down)
-        return Next(phase=Phase.TAKEOFF, why="armed, in the commanded mode", setpoint=above)
+    def _take_off(self, telemetry: Telemetry) -> Decision:
+        """Begin with a vehicle that is armed in the commanded mode."""
+        breach, wrong = self.fence.breach(self._above(telemetry)), self._conflict(telemetry)
+        if breach is not None:
+            wrong = f"the target is outside the fence: {breach}"
+        if wrong is not None:
+            mode = Mode.LAND if telemetry.on_ground else self.settings.failsafe_action
+            return Decision(Phase.LANDING, wrong, landing_mode=mode)
+        return self._fly_to_start(telemetry, "armed, in the commanded mode")
 
-    def _above(self, known: Telemetry) -> Enu:
-        """Straight up or down at the goal's altitude: from there, the vehicle flies across."""
-        here, target = known.position, self.course.target
+    def _fly_to_start(self, telemetry: Telemetry, reason: str) -> Decision:
+        setpoint = self._above(telemetry)
+        if self.progress.is_done:
+            return finish(self.progress, self.settings, "when the bridge restarted", setpoint)
+        return Decision(Phase.TAKEOFF, reason, setpoint)
+
+    def _above(self, telemetry: Telemetry) -> Enu:
+        """The vehicle's position at the goal's altitude: it climbs or descends first, then flies across."""
+        here, target = telemetry.position, self.progress.target
         return target if here is None else target._replace(east_m=here.east_m, north_m=here.north_m)
 
-    def warnings(self, known: Telemetry) -> list[str]:
-        """What a user should know, though it is no reason not to fly."""
-        limits, scenario = known.limits, self.course.scenario
+    def warnings(self, telemetry: Telemetry) -> list[str]:
+        """Warnings that do not prevent the flight."""
+        limits, scenario = telemetry.limits, self.progress.scenario
         found = [] if limits is None else field_check.warnings(scenario, self.settings, limits)
-        if (other := rival(known)) is not None:
+        if (other := other_controller(telemetry)) is not None:
             found.append(other)
         return found
 
-    def _misfit(self, known: Telemetry) -> str | None:
-        """Which of the autopilot's own limits the field does not keep. Arming makes home where it stands."""
-        home = known.home if known.armed else known.position or known.home
-        if known.limits is None or home is None:
+    def _refusal(self, telemetry: Telemetry) -> str | None:
+        """Why the mission cannot be flown with this vehicle; None: it can."""
+        return other_controller(telemetry) or self._conflict(telemetry)
+
+    def _conflict(self, telemetry: Telemetry) -> str | None:
+        """The autopilot's limit that excludes a cell. Arming moves home to the vehicle's position."""
+        home = telemetry.home if telemetry.armed else telemetry.position or telemetry.home
+        if telemetry.limits is None or home is None:
             return None
-        return field_check.misfit(self.course.scenario, self.settings, known.limits, home)
+        return field_check.conflict(self.progress.scenario, self.settings, telemetry.limits, home)
 
 
-def rival(known: Telemetry) -> str | None:
-    """Who else commands the vehicle; None: nobody was seen."""
-    who = known.other_controller
-    return None if who is None else f"another system commands this vehicle: {who}"
-
-
-def _name(known: Telemetry) -> str:
-    """The autopilot's name of its mode."""
-    return known.mode_name or known.mode.value
+def other_controller(telemetry: Telemetry) -> str | None:
+    """Text on another system that commands the vehicle; None: there is none."""
+    other = telemetry.other_controller
+    return None if other is None else f"another system commands this vehicle: {other}"
