@@ -36,7 +36,7 @@ from tests.support.bags import (
 from uav_dc_ros.bags import part_writer
 from uav_dc_ros.bags.part_writer import CHUNK_BYTES
 from uav_dc_ros.bags.salvage import repair as salvage_repair
-from uav_dc_ros.bags.salvage.repair import Repaired, repair
+from uav_dc_ros.bags.salvage.repair import repair
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
 
@@ -112,15 +112,16 @@ def test_a_file_cut_at_any_byte_keeps_all_that_is_there_in_full(
     cuts = [*range(0, len(file), each), len(file)]
     bag = folder_of(tmp_path / "bag", *(file[:cut] for cut in cuts))
     repaired = repair(bag)
-    assert len(repaired.parts) == len(cuts)
-    assert repaired.repaired == repaired.parts[:-1]  # all but the last, which is not cut
+    names = [part.name for part in repaired.parts]
+    assert len(names) == len(cuts)
+    assert repaired.rewritten == names[:-1]  # all but the last, which is not cut
     total = 0
-    for cut, name in zip(cuts, repaired.parts, strict=True):
+    for cut, name in zip(cuts, names, strict=True):
         expected = messages[: sum(end <= cut for end in ends)]
         assert in_mcap(bag / name) == expected, f"cut at {cut} of {len(file)}"
         total += len(expected)
-    assert sum(repaired.message_counts.values()) == total == information(bag)["message_count"]
-    assert (bag / repaired.parts[-1]).read_bytes() == file
+    assert repaired.whole.message_count == total == information(bag)["message_count"]
+    assert (bag / names[-1]).read_bytes() == file
 
 
 @pytest.mark.parametrize("cut", [None, -40])
@@ -173,13 +174,10 @@ def test_metadata_yaml_of_a_repaired_bag(tmp_path: Path) -> None:
     assert [(f["path"], f["message_count"]) for f in info["files"]] == [("bag_0.mcap", 30), ("bag_1.mcap", 4)]
     assert [f["duration"]["nanoseconds"] for f in info["files"]] == [29, 3]
     assert (info["starting_time"]["nanoseconds_since_epoch"], info["duration"]["nanoseconds"]) == (1000, 29)
-    assert repaired == Repaired(
-        parts=("bag_0.mcap", "bag_1.mcap"),
-        repaired=("bag_0.mcap",),
-        message_counts={"/a": 17, "/b": 17, "/silent": 0},
-        last_publish_ns={"/a": 928, "/b": 929},
-        lost_bytes=0,
-    )
+    assert [part.name for part in repaired.parts] == ["bag_0.mcap", "bag_1.mcap"]
+    assert repaired.whole.counts == {"/a": 17, "/b": 17, "/silent": 0}
+    assert repaired.whole.published_ns == {"/a": 928, "/b": 929}
+    assert str(repaired) == "repaired bag_0.mcap: 34 messages, 0 bytes lost"
     assert len(in_bag(bag)) == 34
 
 
@@ -192,14 +190,14 @@ def test_a_writer_that_was_killed(tmp_path: Path) -> None:
         for record in StreamReader(file).records:
             torn += isinstance(record, Message)
     repaired = repair(bag)
-    assert repaired.repaired == ("bag_0.mcap",)
-    n = sum(repaired.message_counts.values())
+    assert repaired.rewritten == ["bag_0.mcap"]
+    n = repaired.whole.message_count
     assert n >= torn > 0
     assert (written - n) * 500 <= CHUNK_BYTES
     expected = [text(f"{i:09d}" + 500 * "x") for i in range(n)]
     assert [data for *_, data in in_mcap(bag / "bag_0.mcap")] == expected
     assert [int(data[:9]) for _, _, data in in_bag(bag)] == list(range(n))
-    assert repaired.last_publish_ns == {"/a": (n - 1) // 2 * 2, "/b": n // 2 * 2 - 1}
+    assert repaired.whole.published_ns == {"/a": (n - 1) // 2 * 2, "/b": n // 2 * 2 - 1}
 
 
 def test_repairing_twice_changes_nothing(tmp_path: Path) -> None:
@@ -210,9 +208,9 @@ def test_repairing_twice_changes_nothing(tmp_path: Path) -> None:
     second = repair(bag)
     assert content(bag) == before
     assert {path: path.stat().st_mtime_ns for path in bag.iterdir()} == stamps
-    assert (first.repaired, second.repaired) == (("bag_0.mcap",), ())
+    assert (first.rewritten, second.rewritten) == (["bag_0.mcap"], [])
     assert (first.lost_bytes > 0, second.lost_bytes) == (True, 0)
-    assert first.message_counts == second.message_counts
+    assert first.whole.counts == second.whole.counts
 
 
 def test_a_closed_bag_is_left_alone(tmp_path: Path) -> None:
@@ -221,7 +219,7 @@ def test_a_closed_bag_is_left_alone(tmp_path: Path) -> None:
         writer.add_topic("/a", STRING)
         writer.write("/a", text("x"), log_time_ns=1, publish_time_ns=1)
     before = content(bag)
-    assert repair(bag).repaired == ()
+    assert repair(bag).rewritten == []
     assert content(bag) == before
 
 
@@ -229,13 +227,13 @@ def test_a_closed_bag_is_left_alone(tmp_path: Path) -> None:
 def test_a_wrong_metadata_yaml_is_written_anew(tmp_path: Path, wrong: str) -> None:
     bag = folder_of(tmp_path / "bag", made("zstd"))
     (bag / "metadata.yaml").write_text(wrong)
-    assert repair(bag).repaired == ()
+    assert repair(bag).rewritten == []
     assert len(in_bag(bag)) == 30
 
 
 def test_parts_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     bag = folder_of(tmp_path / "bag", *(made("zstd", n=1) for _ in range(11)))
-    assert repair(bag).parts == tuple(f"bag_{i}.mcap" for i in range(11))
+    assert [part.name for part in repair(bag).parts] == [f"bag_{i}.mcap" for i in range(11)]
     assert information(bag)["relative_file_paths"][-2:] == ["bag_9.mcap", "bag_10.mcap"]
 
 
@@ -243,7 +241,7 @@ def test_hidden_files_are_no_parts(tmp_path: Path) -> None:
     """Such as those that a Mac leaves on a stick."""
     bag = folder_of(tmp_path / "bag", made("zstd"))
     (bag / "._bag_0.mcap").write_bytes(b"Mac OS X")
-    assert repair(bag).parts == ("bag_0.mcap",)
+    assert [part.name for part in repair(bag).parts] == ["bag_0.mcap"]
     assert (bag / "._bag_0.mcap").exists()
 
 
@@ -251,14 +249,14 @@ def test_the_rest_of_an_export_into_the_bag_s_folder_does_not_prevent_a_repair(t
     """Killed, it leaves a folder with the suffix of a repair's file."""
     bag = folder_of(tmp_path / "bag", made("zstd", finished=False))
     (bag / ".tables.123.partial").mkdir()
-    assert repair(bag).repaired
+    assert repair(bag).rewritten
     assert (bag / ".tables.123.partial").is_dir()
 
 
 @pytest.mark.parametrize("left", [b"", b"\x89MCA", b"\x89MCAP0\r\n"])
 def test_a_part_without_anything_becomes_an_empty_part(tmp_path: Path, left: bytes) -> None:
     bag = folder_of(tmp_path / "bag", left)
-    assert repair(bag).message_counts == {}
+    assert repair(bag).whole.counts == {}
     assert (in_mcap(bag / "bag_0.mcap"), in_bag(bag)) == ([], [])
     two = folder_of(tmp_path / "two", made("zstd"), left)
     repair(two)
@@ -271,7 +269,7 @@ def test_zeros_that_a_power_cut_left_are_no_records(tmp_path: Path) -> None:
     bag = folder_of(tmp_path / "bag", file + bytes(4096))
     repaired = repair(bag)
     assert repaired.lost_bytes == 4096
-    assert sum(repaired.message_counts.values()) == len(in_mcap(bag / "bag_0.mcap")) > 20
+    assert repaired.whole.message_count == len(in_mcap(bag / "bag_0.mcap")) > 20
 
 
 def test_a_damaged_chunk_costs_itself_alone(tmp_path: Path) -> None:
@@ -301,7 +299,7 @@ def test_a_summary_that_was_harmed_is_made_anew(tmp_path: Path) -> None:
     file = bytearray(made("zstd"))
     file[-60] ^= 1
     bag = folder_of(tmp_path / "bag", bytes(file))
-    assert repair(bag).repaired == ("bag_0.mcap",)
+    assert repair(bag).rewritten == ["bag_0.mcap"]
     assert len(in_mcap(bag / "bag_0.mcap")) == 30
 
 
@@ -360,7 +358,7 @@ def test_a_full_disk_costs_nothing(tmp_path: Path) -> None:
     )  # fmt: skip
     assert repaired.stdout == f"bag {bag} cannot be repaired: File too large; its contents are kept\n"
     assert content(bag) == before
-    assert repair(bag).repaired == ("bag_0.mcap",)
+    assert repair(bag).rewritten == ["bag_0.mcap"]
 
 
 @pytest.mark.parametrize("step", ["finish", "add_message", "fsync"])
@@ -382,7 +380,7 @@ def test_a_killed_repair_can_be_repeated(tmp_path: Path, step: str) -> None:
     assert left.startswith(".bag_0.mcap.")
     assert left.endswith(".partial")
     (bag / ".metadata.yaml.123.partial").write_text("rosbag2_")  # killed at the very end
-    assert repair(bag).repaired == ("bag_0.mcap", "bag_1.mcap")
+    assert repair(bag).rewritten == ["bag_0.mcap", "bag_1.mcap"]
     assert {path.name for path in bag.iterdir()} == {"bag_0.mcap", "bag_1.mcap", "metadata.yaml"}
     assert len(in_bag(bag)) == 60
 

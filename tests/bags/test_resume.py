@@ -13,7 +13,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 
 from tests.support.bags import ROOT, STRING, TYPES, content, in_bag, in_mcap, information, killed_writer, text
 from uav_dc_ros.bags import write
-from uav_dc_ros.bags.part_writer import FolderLock, PartWriter
+from uav_dc_ros.bags.part_writer import PartWriter, folder_lock
 from uav_dc_ros.bags.salvage.repair import repair
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
@@ -47,16 +47,16 @@ def test_killed_twice_and_then_closed(tmp_path: Path) -> None:
     for resume in (False, True):
         killed_writer(bag, first=first, n=900, resume=resume)
         assert not (bag / "metadata.yaml").exists()
-        with FolderLock(bag):
+        with folder_lock(bag):
             pass  # a killed writer holds no lock
         # What a second writer would be told, without making a part.
         shadow = tmp_path / f"shadow_{resume}"
         shadow.mkdir()
         for name, data in content(bag).items():
             (shadow / name).write_bytes(data)
-        first = max(repair(shadow).last_publish_ns.values()) + 1
+        first = max(repair(shadow).whole.published_ns.values()) + 1
     with BagWriter(bag, {"seed": "3"}, resume=True) as writer:
-        assert dict(writer.already_written) == repair(shadow).last_publish_ns
+        assert dict(writer.already_written) == repair(shadow).whole.published_ns
         assert sorted(writer.already_written.values()) == [first - 2, first - 1]
         assert writer.message_count == first
         for topic in ("/a", "/b"):
@@ -86,7 +86,7 @@ def test_killed_twice_and_then_closed(tmp_path: Path) -> None:
     sequences = [sequence for part in in_parts for topic, sequence, *_ in part if topic == "/a"]
     assert sequences == list(range(1, len(sequences) + 1))
     before = content(bag)
-    assert repair(bag).repaired == ()
+    assert repair(bag).rewritten == []
     assert content(bag) == before
 
 

@@ -94,7 +94,7 @@ class Part:
         elif name == DROPPED_RECORD:
             self.dropped = (self.dropped or {}) | _counts(content)
 
-    def add_message(self, topic: str, *, log_time_ns: int, publish_time_ns: int) -> None:
+    def add_message(self, topic: str, log_time_ns: int, publish_time_ns: int) -> None:
         """Count a message of a known topic."""
         self.counts[topic] += 1
         self.published_ns[topic] = max(publish_time_ns, self.published_ns.get(topic, publish_time_ns))
@@ -134,9 +134,8 @@ def merged(parts: Sequence[Part]) -> Part:
         whole.latest |= part.latest
         for topic, published_ns in part.published_ns.items():
             whole.published_ns[topic] = max(published_ns, whole.published_ns.get(topic, published_ns))
-        if part.first_ns is not None:
-            whole.first_ns = part.first_ns if whole.first_ns is None else min(whole.first_ns, part.first_ns)
-            whole.last_ns = max(whole.last_ns, part.last_ns)
+    whole.first_ns = min((part.first_ns for part in parts if part.first_ns is not None), default=None)
+    whole.last_ns = max((part.last_ns for part in parts), default=0)
     return whole
 
 

@@ -4,10 +4,10 @@ import contextlib
 import fcntl
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Self
 
+from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
 from uav_dc_ros import __version__
@@ -37,41 +37,30 @@ def part_paths(folder: Path, suffix: str = ".mcap") -> list[Path]:
     return sorted(paths, key=lambda path: (part_number(path.name), path.name))
 
 
-class FolderLock:
-    """Held while a bag is written or repaired; the kernel releases it when the process ends.
+@contextlib.contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Lock a bag's folder, so that no repair replaces a file that is still written.
 
-    It keeps a repair from replacing a file that a recorder still writes.
+    The kernel releases the lock of a process that ends.
 
     Raises:
-        BagError: another process holds it, or there is no such folder.
+        BagError: the bag is being written or repaired, or there is no such folder.
     """
-
-    def __init__(self, folder: Path) -> None:
-        try:
-            self._descriptor: int | None = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        except OSError as error:
-            raise BagError(f"bag {folder}: {error.strerror}; expected the folder of a bag") from None
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.release()
-            raise BagError(f"bag {folder} is being written or repaired; expected one at rest") from None
-        except OSError:
-            pass  # some network file systems have no locks
-
-    def release(self) -> None:
-        """Release the lock; a second call does nothing."""
-        descriptor, self._descriptor = self._descriptor, None
-        if descriptor is not None:
-            os.close(descriptor)
-
-    def __enter__(self) -> Self:
-        """The lock."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Release the lock."""
-        self.release()
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise BagError(f"bag {folder}: {error.strerror}; expected the folder of a bag") from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise BagError(f"bag {folder} is being written or repaired; expected one at rest") from None
+    except OSError:
+        pass  # some network file systems have no locks
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 class PartWriter:
@@ -123,11 +112,11 @@ class PartWriter:
         self._mcap.add_metadata(name, dict(content))
         self._file.flush()
 
-    def add_attachment(
-        self, *, name: str, media_type: str, data: bytes, log_time_ns: int, create_time_ns: int
-    ) -> None:
-        """Append an attachment."""
-        self._mcap.add_attachment(create_time_ns, log_time_ns, name, media_type, data)
+    def add_attachment(self, record: Attachment) -> None:
+        """Append a copy of an attachment."""
+        self._mcap.add_attachment(
+            record.create_time, record.log_time, record.name, record.media_type, record.data
+        )
 
     def add_schema(self, type: str, encoding: str, definition: bytes) -> int:
         """Append a message type; returns its schema id."""
@@ -143,12 +132,12 @@ class PartWriter:
         return channel
 
     def add_message(
-        self, channel: int, data: bytes, *, log_time_ns: int, publish_time_ns: int, sequence: int
+        self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int
     ) -> None:
         """Append a message."""
         self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
         self._file.flush()  # a finished chunk survives a kill
-        self.part.add_message(self._topics[channel], log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+        self.part.add_message(self._topics[channel], log_time_ns, publish_time_ns)
 
     def flush(self) -> None:
         """Finish the current chunk, and write it to the operating system."""

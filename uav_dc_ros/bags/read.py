@@ -80,11 +80,9 @@ class BagReader:
         self.last_ns = max((part.last_ns for part in with_messages), default=0)
 
     def __enter__(self) -> Self:
-        """The reader."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the files."""
         self._closing.close()
 
     @property

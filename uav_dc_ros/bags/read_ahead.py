@@ -29,6 +29,9 @@ class ReadAhead:
         topics: full names.
         start_ns: earliest log time.
         end_ns: end of the log times (excluded); None: the bag's end.
+
+    Raises:
+        BagError: (iteration) the bag is damaged there.
     """
 
     def __init__(self, path: Path, topics: Collection[str], *, start_ns: int, end_ns: int | None) -> None:
@@ -47,16 +50,10 @@ class ReadAhead:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop reading."""
         self._closed = True
         self._thread.join()
 
     def __iter__(self) -> Iterator[BagMessage]:
-        """The messages.
-
-        Raises:
-            BagError: the bag is damaged there.
-        """
         while (batch := self._batches.get()) is not None:
             if isinstance(batch, Exception):
                 raise batch

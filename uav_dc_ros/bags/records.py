@@ -15,21 +15,10 @@ from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
+from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, UnsupportedCompressionError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER = struct.Struct("<BQ")  # of a record: opcode, length of the content
@@ -47,15 +36,15 @@ _BLOCK = 2**20  # bytes searched at a time
 _SMALL = 2**20  # a larger record is read only if another record follows it
 _FIXED_BYTES = {Opcode.DATA_END: 4, Opcode.SUMMARY_OFFSET: 17}
 _READERS = {
-    Opcode.HEADER: Header.read,
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.METADATA: Metadata.read,
-    Opcode.ATTACHMENT: Attachment.read,
-    Opcode.CHUNK_INDEX: ChunkIndex.read,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
-    Opcode.METADATA_INDEX: MetadataIndex.read,
-    Opcode.STATISTICS: Statistics.read,
+    Opcode.HEADER: records.Header.read,
+    Opcode.SCHEMA: records.Schema.read,
+    Opcode.CHANNEL: records.Channel.read,
+    Opcode.METADATA: records.Metadata.read,
+    Opcode.ATTACHMENT: records.Attachment.read,
+    Opcode.CHUNK_INDEX: records.ChunkIndex.read,
+    Opcode.ATTACHMENT_INDEX: records.AttachmentIndex.read,
+    Opcode.METADATA_INDEX: records.MetadataIndex.read,
+    Opcode.STATISTICS: records.Statistics.read,
 }
 # Starts of chunks below 2^40 bytes; the lookahead also finds one that begins inside of another match.
 _CHUNK_START = re.compile(rb"\x06(?=.{5}\x00{3}.{28}(?:\x04\x00{3}zstd|\x03\x00{3}lz4|\x00{4}))", re.DOTALL)
@@ -72,7 +61,7 @@ class _StrictStream(ReadDataStream):
         return data
 
 
-def parse(opcode: int, content: bytes, *, exact: bool = False) -> McapRecord | None:
+def parse(opcode: int, content: bytes, *, exact: bool = False) -> records.McapRecord | None:
     """A record of a kind in `_READERS`; None for other kinds and for an invalid record.
 
     Args:
@@ -90,7 +79,7 @@ def parse(opcode: int, content: bytes, *, exact: bool = False) -> McapRecord | N
         return None
     if exact and stream.count != len(content):
         return None
-    if isinstance(record, Attachment):
+    if isinstance(record, records.Attachment):
         crc = int.from_bytes(content[stream.count - 4 : stream.count], "little")
         if crc not in (0, zlib.crc32(content[: stream.count - 4])):
             return None

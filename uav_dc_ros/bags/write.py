@@ -10,9 +10,9 @@ the sequence 0, and are counted in a metadata record.
 
 import os
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -20,19 +20,9 @@ from typing import TYPE_CHECKING, Self
 
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from uav_dc_ros.bags import message_definitions
-from uav_dc_ros.bags.metadata import (
-    ABOUT_RECORD,
-    DROPPED_RECORD,
-    METADATA_FILE,
-    REPEATED_RECORD,
-    Part,
-    is_latched,
-    merged,
-    to_yaml,
-    write_metadata,
-)
-from uav_dc_ros.bags.part_writer import CHUNK_BYTES, FolderLock, PartWriter, part_number, part_paths
+from uav_dc_ros.bags import message_definitions, metadata
+from uav_dc_ros.bags.metadata import Part, is_latched, merged
+from uav_dc_ros.bags.part_writer import CHUNK_BYTES, PartWriter, folder_lock, part_number, part_paths
 from uav_dc_ros.bags.salvage.repair import repair_parts
 from uav_dc_ros.errors import BagError
 
@@ -76,7 +66,7 @@ class BagWriter:
 
     Raises:
         BagError: the folder exists, or cannot be made. When resuming: there is no such folder, the bag was
-            closed, is still being written, or cannot be repaired.
+            closed, is still being written, or cannot be repaired. Of all methods: the disk is full or gone.
     """
 
     def __init__(
@@ -95,6 +85,7 @@ class BagWriter:
         self._split_bytes, self._split_ns = split_bytes, round(split_s * 1e9)
         chunk_bytes = max(split_bytes // MIN_CHUNKS_PER_PART, MIN_CHUNK_BYTES)
         self._chunk_bytes = min(CHUNK_BYTES, chunk_bytes) if split_bytes else CHUNK_BYTES
+        self._splits = bool(split_bytes or self._split_ns)
         self._writer: PartWriter
         self._begun_ns: int | None  # log time of the part's first message
         self._topics: dict[str, _WrittenTopic] = {}
@@ -108,17 +99,16 @@ class BagWriter:
                 folder.mkdir(parents=True)
             except OSError as error:
                 raise BagError(f"bag folder {folder} cannot be made: {error.strerror}") from None
-        self._lock = FolderLock(folder)
-        try:
-            self._finished = _earlier_parts(folder) if resume else []
-            self._resumed = merged(self._finished)
-            self._begin_part()
-        except OSError as error:
-            self._lock.release()
-            raise BagError(f"bag {folder} cannot be written: {error.strerror}") from None
-        except BaseException:
-            self._lock.release()
-            raise
+        with ExitStack() as closing:
+            closing.enter_context(folder_lock(folder))
+            closing.callback(self._sync_thread.shutdown)
+            try:
+                self._finished = _earlier_parts(folder) if resume else []
+                self._resumed = merged(self._finished)
+                self._begin_part()
+            except OSError as error:
+                raise BagError(f"bag {folder} cannot be written: {error.strerror}") from None
+            self._closing = closing.pop_all()
 
     @property
     def message_count(self) -> int:
@@ -174,7 +164,7 @@ class BagWriter:
             type_hash: of such a type (REP-2011).
 
         Raises:
-            BagError: ROS 2 has no such type, earlier parts have another one, or the disk is full.
+            BagError: ROS 2 has no such type, or earlier parts have another one.
         """
         qos = dump_qos_v9(list(offered_qos))
         earlier = self._resumed.topics.get(name)
@@ -194,14 +184,16 @@ class BagWriter:
         topic = _WrittenTopic(
             type=type,
             definition=definition,
-            metadata={"offered_qos_profiles": to_yaml(qos), "topic_type_hash": type_hash},
+            metadata={"offered_qos_profiles": metadata.to_yaml(qos), "topic_type_hash": type_hash},
             latest=deque(maxlen=len(qos)) if is_latched({"offered_qos_profiles": qos}) else None,
             sequence=self._resumed.counts.get(name, 0) - self._resumed.repeated.get(name, 0),
         )
         if topic.latest is not None and name in self._resumed.latest:
             topic.latest.append(self._resumed.latest[name])
-        with self._abandoned_on_error():  # a definition can fill the chunk
+        try:
             self._add_channel(name, topic)
+        except OSError as error:  # a definition can fill the chunk
+            raise self._abandoned(error) from None
         self._topics[name] = topic
 
     def keep_latched(self, topic: str, n: int) -> None:
@@ -215,97 +207,78 @@ class BagWriter:
 
         Args:
             topic: full name of a topic that was added.
-            data: the message, serialised (CDR).
+            data: serialised (CDR).
             log_time_ns: receive time, nanoseconds since the epoch.
             publish_time_ns: publish time.
-
-        Raises:
-            BagError: the disk is full or gone.
         """
         written = self._topics[topic]
-        with self._abandoned_on_error():
+        try:
             if self._begun_ns is None:
                 self._begun_ns = log_time_ns
-            elif self._is_full(self._begun_ns, log_time_ns, len(data)):
+            elif self._splits and self._is_full(self._begun_ns, log_time_ns, len(data)):
                 self._split()
                 self._begun_ns = log_time_ns
             if self._to_repeat:
                 self._repeat_latched(log_time_ns)
             written.sequence += 1
-            self._writer.add_message(
-                written.channel,
-                data,
-                log_time_ns=log_time_ns,
-                publish_time_ns=publish_time_ns,
-                sequence=written.sequence,
-            )
+            self._writer.add_message(written.channel, data, log_time_ns, publish_time_ns, written.sequence)
+        except OSError as error:
+            raise self._abandoned(error) from None
         if written.latest is not None:
             written.latest.append((data, publish_time_ns))
 
     def add_about(self, about: Mapping[str, str]) -> None:
-        """Add to the description of the bag.
-
-        Raises:
-            BagError: the disk is full or gone.
-        """
+        """Add to the description of the bag."""
         self._about |= about
-        with self._abandoned_on_error():
-            self._writer.add_metadata(ABOUT_RECORD, about)
+        try:
+            self._writer.add_metadata(metadata.ABOUT_RECORD, about)
+        except OSError as error:
+            raise self._abandoned(error) from None
 
     def set_dropped(self, dropped: Mapping[str, int]) -> None:
-        """Record how many messages of each topic were lost since this writer began.
-
-        Raises:
-            BagError: the disk is full or gone.
-        """
+        """Record how many messages of each topic were lost since this writer began."""
         recorded = self._writer.part.dropped
         in_part = {topic: n - self._dropped_before[topic] for topic, n in dropped.items()}
         changes = {topic: str(n) for topic, n in in_part.items() if n != (recorded or {}).get(topic, 0)}
         if changes or recorded is None:
-            with self._abandoned_on_error():
-                self._writer.add_metadata(DROPPED_RECORD, changes)
+            try:
+                self._writer.add_metadata(metadata.DROPPED_RECORD, changes)
+            except OSError as error:
+                raise self._abandoned(error) from None
 
     def sync(self) -> None:
         """Write everything to the operating system, and start a sync to disk in a thread.
 
         A kill then loses only what follows this call; a power cut, what follows the call before it, if the
         disk keeps up: no sync starts while another one runs.
-
-        Raises:
-            BagError: the disk is full or gone.
         """
-        with self._abandoned_on_error():
+        try:
             self._writer.flush()
             if self._last_sync is None or self._last_sync.done():
                 self._finish_sync()
                 folder = os.open(self.folder, os.O_RDONLY)  # for the names of new parts
                 descriptors = (self._writer.descriptor(), folder)
                 self._last_sync = self._sync_thread.submit(_fsync_and_close, descriptors)
+        except OSError as error:
+            raise self._abandoned(error) from None
 
     def close(self) -> None:
-        """Finish the part and write metadata.yaml over all parts; a second call does nothing.
-
-        Raises:
-            BagError: the disk is full or gone.
-        """
+        """Finish the part and write metadata.yaml over all parts; a second call does nothing."""
         if self.closed:
             return
-        try:
-            with self._abandoned_on_error():
+        with self._closing:
+            try:
                 self._finish_sync()
                 self._writer.finish()
-                write_metadata(self.folder, self._parts)
-        finally:
-            self._sync_thread.shutdown()
-            self._lock.release()
+                metadata.write_metadata(self.folder, self._parts)
+            except OSError as error:
+                raise self._abandoned(error) from None
 
     def __enter__(self) -> Self:
-        """The writer."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the bag, also after an error: its messages stay readable."""
-        self.close()
+        self.close()  # also after an error: the messages stay readable
 
     def _finish_sync(self) -> None:
         """Wait for the last sync; OSError if it failed."""
@@ -323,7 +296,7 @@ class BagWriter:
             compression=self._compression,
             chunk_bytes=self._chunk_bytes,
         )
-        self._writer.add_metadata(ABOUT_RECORD, self._about)
+        self._writer.add_metadata(metadata.ABOUT_RECORD, self._about)
 
     def _add_channel(self, name: str, topic: _WrittenTopic) -> None:
         if topic.type not in self._schemas:
@@ -354,7 +327,7 @@ class BagWriter:
         self._dropped_before.update(dropped or {})
         self._begin_part()
         if dropped is not None:
-            self._writer.add_metadata(DROPPED_RECORD, {})
+            self._writer.add_metadata(metadata.DROPPED_RECORD, {})
         for name, topic in self._topics.items():
             self._add_channel(name, topic)
 
@@ -363,42 +336,30 @@ class BagWriter:
         repeated = {name: self._topics[name] for name in self._to_repeat}
         self._to_repeat.clear()
         counts = {name: str(len(topic.latest or ())) for name, topic in repeated.items()}
-        self._writer.add_metadata(REPEATED_RECORD, counts)
+        self._writer.add_metadata(metadata.REPEATED_RECORD, counts)
         for topic in repeated.values():
             for data, publish_time_ns in topic.latest or ():
-                self._writer.add_message(
-                    topic.channel,
-                    data,
-                    log_time_ns=log_time_ns,
-                    publish_time_ns=publish_time_ns,
-                    sequence=0,
-                )
+                self._writer.add_message(topic.channel, data, log_time_ns, publish_time_ns, sequence=0)
 
-    @contextmanager
-    def _abandoned_on_error(self) -> Iterator[None]:
-        """Abandon the bag when the disk fails: what was written stays."""
-        try:
-            yield
-        except OSError as error:
-            self._writer.abandon()
-            self._sync_thread.shutdown()
-            self._lock.release()
-            raise BagError(
-                f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no "
-                "index, and holds what was written so far"
-            ) from None
+    def _abandoned(self, error: OSError) -> BagError:
+        """Abandon the bag after an error of the disk: what was written stays."""
+        self._writer.abandon()
+        self._closing.close()
+        return BagError(
+            f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no index, "
+            "and holds what was written so far"
+        )
 
 
 def _earlier_parts(folder: Path) -> list[Part]:
     """The repaired parts of a bag whose writer was killed; none if it was killed before the first one."""
-    if (folder / METADATA_FILE).exists():
+    if (folder / metadata.METADATA_FILE).exists():
         raise BagError(
-            f"bag {folder} was closed: it has a {METADATA_FILE}; expected one whose writer was killed"
+            f"bag {folder} was closed: it has a metadata.yaml; expected one whose writer was killed"
         )
     if not part_paths(folder) and any(folder.iterdir()):
         raise BagError(f"folder {folder} holds files, but no MCAP file; expected a bag to resume")
-    parts, _ = repair_parts(folder)
-    return parts
+    return repair_parts(folder).parts
 
 
 def _fsync_and_close(descriptors: Sequence[int]) -> None:

@@ -5,7 +5,6 @@ needs room for one more part. A killed repair can be repeated. A part without co
 """
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,28 +13,33 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from uav_dc_ros import files
 from uav_dc_ros.bags import metadata
 from uav_dc_ros.bags.metadata import Part, matches_metadata, merged, write_metadata
-from uav_dc_ros.bags.part_writer import FolderLock, PartWriter, part_paths
+from uav_dc_ros.bags.part_writer import PartWriter, folder_lock, part_paths
 from uav_dc_ros.bags.salvage.scan import Scan, has_end
 from uav_dc_ros.errors import BagError
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Repaired:
-    """The contents of a repaired bag.
+    """A repaired bag.
 
     Attributes:
-        parts: file names of all parts, in their order.
-        repaired: those that were rewritten.
-        message_counts: messages by topic.
-        last_publish_ns: latest publish time by topic with messages.
+        parts: contents of all parts, in their order.
+        rewritten: file names of those that lacked their end.
         lost_bytes: bytes at the torn ends that could not be used.
     """
 
-    parts: tuple[str, ...]
-    repaired: tuple[str, ...]
-    message_counts: Mapping[str, int]
-    last_publish_ns: Mapping[str, int]
+    parts: list[Part]
+    rewritten: list[str]
     lost_bytes: int
+
+    @property
+    def whole(self) -> Part:
+        """All parts as one."""
+        return merged(self.parts)
+
+    def __str__(self) -> str:
+        names = ", ".join(self.rewritten) or "no part"
+        return f"repaired {names}: {self.whole.message_count:,} messages, {self.lost_bytes:,} bytes lost"
 
 
 def repair(folder: Path) -> Repaired:
@@ -45,16 +49,16 @@ def repair(folder: Path) -> Repaired:
         BagError: no such folder, no MCAP file in it, a file that is not one, damage that is not a torn end, a
             full disk, or another process that writes or repairs it. Each part is then whole or unchanged.
     """
-    with FolderLock(folder):
+    with folder_lock(folder):
         if not part_paths(folder):
             raise BagError(f"bag {folder} holds no MCAP file; expected at least one (*.mcap)")
-        parts, repaired = repair_parts(folder)
-        if not matches_metadata(folder, parts):
-            write_metadata(folder, parts)
+        repaired = repair_parts(folder)
+        if not matches_metadata(folder, repaired.parts):
+            write_metadata(folder, repaired.parts)
     return repaired
 
 
-def repair_parts(folder: Path) -> tuple[list[Part], Repaired]:
+def repair_parts(folder: Path) -> Repaired:
     """Repair the parts of a bag, but not metadata.yaml; the caller holds the folder's lock.
 
     Raises:
@@ -78,14 +82,7 @@ def repair_parts(folder: Path) -> tuple[list[Part], Repaired]:
             lost_bytes += scan.lost_bytes
     except OSError as error:
         raise BagError(f"bag {folder} cannot be repaired: {error.strerror}; its contents are kept") from None
-    whole = merged(parts)
-    return parts, Repaired(
-        parts=tuple(part.name for part in parts),
-        repaired=tuple(rewritten),
-        message_counts=whole.counts,
-        last_publish_ns=whole.published_ns,
-        lost_bytes=lost_bytes,
-    )
+    return Repaired(parts, rewritten, lost_bytes)
 
 
 def _read(scan: Scan) -> Part:
@@ -123,12 +120,9 @@ def copy(scan: Scan, writer: PartWriter) -> None:
             case Message():
                 if record.sequence == 0 and topics[record.channel_id] in scan.part.repeated:
                     repeated[topics[record.channel_id]] += 1
+                channel = channels[record.channel_id]
                 writer.add_message(
-                    channels[record.channel_id],
-                    record.data,
-                    log_time_ns=record.log_time,
-                    publish_time_ns=record.publish_time,
-                    sequence=record.sequence,
+                    channel, record.data, record.log_time, record.publish_time, record.sequence
                 )
             case Schema():
                 schemas[record.id] = writer.add_schema(record.name, record.encoding, record.data)
@@ -142,12 +136,6 @@ def copy(scan: Scan, writer: PartWriter) -> None:
             case Metadata():
                 writer.add_metadata(record.name, record.metadata)
             case Attachment():
-                writer.add_attachment(
-                    name=record.name,
-                    media_type=record.media_type,
-                    data=record.data,
-                    log_time_ns=record.log_time,
-                    create_time_ns=record.create_time,
-                )
+                writer.add_attachment(record)
     if repeated:
         writer.add_metadata(metadata.REPEATED_RECORD, {topic: str(n) for topic, n in repeated.items()})

@@ -307,7 +307,7 @@ class Scan:
             return
         topic = self._channels[channel]
         log_time_ns, publish_time_ns = min(log_time_ns, TIME_MAX_NS), min(publish_time_ns, TIME_MAX_NS)
-        self.part.add_message(topic, log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)
+        self.part.add_message(topic, log_time_ns, publish_time_ns)
         self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
         self.goes_back_ns = max(self.goes_back_ns, self._times_ns.get(topic, 0) - log_time_ns)
         self._last_ns = self._times_ns[topic] = log_time_ns
