@@ -10,7 +10,7 @@ import pytest
 from tests.conftest import ROOT, Ros, finish
 from uav_dc_ros import scenarios, uav_dc
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.experiments.evaluate.evaluation import judge
+from uav_dc_ros.experiments.evaluate.evaluation import evaluate_act
 from uav_dc_ros.planners import PLANNERS
 
 EXAMPLES = ROOT / "examples"
@@ -36,7 +36,7 @@ def test_one_episode(ros: Ros) -> None:
 
 def test_own_scenario_can_be_flown() -> None:
     scenario = scenarios.load(EXAMPLES / "own_scenario.toml")
-    flown = judge("tour", None, PLANNERS["tour"](scenario), scenario, range(5)).evaluation
+    flown = evaluate_act("tour", None, PLANNERS["tour"](scenario), scenario, range(5)).evaluation
     assert flown.landing_rate.mean == 1.0
     assert flown.users_collected.mean is not None
     assert flown.users_collected.mean > 5

@@ -6,8 +6,9 @@ from pathlib import Path
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, steer
-from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, roll_out
+from uav_dc_ros.core.world import Act
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act
+from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.recorded_step import RecordedStep
 
@@ -26,7 +27,7 @@ def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_S
     Raises:
         PolicyError: the policy does not fit the scenario.
     """
-    return roll_out(scenario, steer(act, scenario) if isinstance(act, Policy) else act, seeds)
+    return roll_out(scenario, greedy_act(act, scenario) if isinstance(act, Policy) else act, seeds)
 
 
 def read_steps(bag: str | Path, namespace: str | None = None) -> Iterator[RecordedStep]:

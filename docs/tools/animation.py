@@ -12,9 +12,10 @@ import numpy as np
 from PIL import Image
 
 from uav_dc_ros.agents.policy import load
-from uav_dc_ros.env.render import Track, picture
-from uav_dc_ros.experiments.evaluate.evaluation import steer
-from uav_dc_ros.experiments.evaluate.rollout import flight
+from uav_dc_ros.env.render import picture
+from uav_dc_ros.env.trajectory import Trajectory
+from uav_dc_ros.experiments.evaluate.evaluation import greedy_act
+from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
 
 OUT = Path(__file__).parents[1] / "mission.gif"
 POLICY, SEED = "five_clusters_dueling", 0
@@ -25,8 +26,8 @@ def frames() -> list[Image.Image]:
     """A picture after each step, the start first."""
     policy = load(POLICY)
     scenario = policy.scenario
-    track, images = Track(scenario), []
-    for state, outcome in flight(scenario, steer(policy, scenario), [SEED]):
+    track, images = Trajectory(scenario), []
+    for state, outcome in rollout_steps(scenario, greedy_act(policy, scenario), [SEED]):
         track.add(*(alone(part) for part in (state, outcome and outcome.link)))
         image = Image.fromarray(picture(track))
         height_px = round(image.height * WIDTH_PX / image.width)

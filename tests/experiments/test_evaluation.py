@@ -23,11 +23,11 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     Figure,
     compare,
     evaluate,
-    judge,
+    evaluate_act,
+    greedy_act,
     rows,
-    steer,
 )
-from uav_dc_ros.experiments.evaluate.rollout import flight, roll_out
+from uav_dc_ros.experiments.evaluate.rollout import roll_out, rollout_steps
 
 
 def command(*arguments):
@@ -58,8 +58,8 @@ def test_seed_s_is_the_mission_of_the_environment_with_seed_s(tmp_path, end):
     scenario = changed("five_clusters", mission={"episode_end": end, "max_steps": 30})
     made = policy.load(saved(tmp_path / "made", scenario))
     seeds = [3, 0, 11, 12, 13, 14, 15]
-    missions = roll_out(scenario, steer(made, scenario), seeds)
-    states = [state for state, _ in flight(scenario, steer(made, scenario), seeds)]
+    missions = roll_out(scenario, greedy_act(made, scenario), seeds)
+    states = [state for state, _ in rollout_steps(scenario, greedy_act(made, scenario), seeds)]
     for i, seed in enumerate(seeds):
         course, rewards = by_hand(DataCollectionEnv(scenario), made.act, seed)
         for state, told in zip(states, course, strict=False):
@@ -101,7 +101,7 @@ def plan(*actions):
 
 def test_a_figure_is_over_the_missions_that_have_it():
     scenario = tiny()
-    flown = judge("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, range(20))
+    flown = evaluate_act("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, range(20))
     figures, missions = flown.evaluation, roll_out(scenario, plan(1, 1, 2, 2, 6, 6, 6, 6), range(20))
     assert figures.landing_rate == Figure(n=20, mean=1.0, low=1.0, high=1.0, min=1.0, max=1.0)
     assert figures.arrival_step.mean == 4.0
@@ -111,18 +111,18 @@ def test_a_figure_is_over_the_missions_that_have_it():
     assert (data.min, data.max) == (missions.data_bits.min(), missions.data_bits.max())
     assert data.min < data.low < data.mean < data.high < data.max
 
-    lost = judge("hover", None, plan(*[6] * 8), scenario, range(20)).evaluation
+    lost = evaluate_act("hover", None, plan(*[6] * 8), scenario, range(20)).evaluation
     assert lost.landing_rate.mean == 0.0
     assert lost.arrival_step == Figure(n=0)
-    once = judge("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, [7]).evaluation
+    once = evaluate_act("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, [7]).evaluation
     assert (once.data_bits.low, once.data_bits.high) == (None, None), "one mission has no interval"
     assert ("arrival step", "4.0", "-", "4.0", "4.0") in rows(once)
 
 
 def test_policies_are_compared_mission_by_mission():
     scenario = tiny()
-    late = judge("late", None, plan(6, 6, 1, 1, 2, 2, 6, 6), scenario, range(20))
-    soon = judge("soon", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, range(20))
+    late = evaluate_act("late", None, plan(6, 6, 1, 1, 2, 2, 6, 6), scenario, range(20))
+    soon = evaluate_act("soon", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, range(20))
     comparison = compare(late, soon)
     assert (comparison.policy, comparison.baseline) == ("late", "soon")
     differences = comparison.differences
@@ -134,7 +134,7 @@ def test_policies_are_compared_mission_by_mission():
     figures = {name for name, kind in get_type_hints(Evaluation).items() if kind is Figure}
     assert set(differences) == figures, "no figure is left out"
 
-    lost = judge("hover", None, plan(*[6] * 8), scenario, range(20))
+    lost = evaluate_act("hover", None, plan(*[6] * 8), scenario, range(20))
     assert compare(lost, soon).differences["arrival_step"].n == 0, "only one of the two landed"
     assert compare(lost, soon).differences["landing_rate"].mean == -1.0
 
@@ -179,7 +179,7 @@ def test_scenarios_of_one_name_are_refused(tmp_path, capsys):
 
 def test_nothing_is_flown_before_all_is_known_to_fit(tmp_path, capsys, monkeypatch):
     made = str(saved(tmp_path / "made", scenarios.load("three_clusters")))
-    monkeypatch.setattr(cli, "judge", None)
+    monkeypatch.setattr(cli, "evaluate_act", None)
     monkeypatch.setattr(cli, "save_mission_picture", None)
     scenario = ["--scenario", "three_clusters", "five_clusters"]
     for arguments, complaint in (

@@ -11,7 +11,7 @@ from tests.experiments.paper_sweeps import realistic
 from uav_dc_ros import scenarios
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.rollout import flight
+from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
 from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.setting import FULL, SMOKE
@@ -33,7 +33,7 @@ def tracks():
     made = []
     for seed in range(2):
         track = Trajectory(scenario)
-        for state, outcome in flight(scenario, PLANNERS["tour"](scenario), [seed]):
+        for state, outcome in rollout_steps(scenario, PLANNERS["tour"](scenario), [seed]):
             track.add(first(state), first(outcome.link) if outcome else None)
         made.append(track)
     return made

@@ -9,7 +9,7 @@ from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.experiments.evaluate.cli import main
-from uav_dc_ros.experiments.evaluate.rollout import flight, roll_out
+from uav_dc_ros.experiments.evaluate.rollout import roll_out, rollout_steps
 from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.planners.plans import ENOUGH, EXACT_TOUR_MAX
 
@@ -36,7 +36,7 @@ def test_the_tour_is_flown_in_the_shortest_order():
     scenario = scenarios.load("five_clusters")
     goals = np.rint(np.asarray(scenario.users.cluster_centres_m) / 100).astype(int)
     visited = []
-    for state, _ in flight(scenario, PLANNERS["tour"](scenario), [0]):
+    for state, _ in rollout_steps(scenario, PLANNERS["tour"](scenario), [0]):
         over = np.flatnonzero((goals == state.cell[0, :2]).all(axis=-1))
         if over.size and over[0] not in visited:
             visited.append(over[0])
@@ -59,11 +59,12 @@ def test_a_cluster_off_the_grid_is_approached_from_its_edge():
 def test_random_takes_every_action_and_repeats_itself():
     scenario = scenarios.load("three_clusters")
     cells = [
-        [state.cell for state, _ in flight(scenario, PLANNERS["random"](scenario), SEEDS)] for _ in range(2)
+        [state.cell for state, _ in rollout_steps(scenario, PLANNERS["random"](scenario), SEEDS)]
+        for _ in range(2)
     ]
     np.testing.assert_array_equal(cells[0], cells[1])
     act = PLANNERS["random"](scenario)
-    state = next(flight(scenario, act, SEEDS))[0]
+    state = next(rollout_steps(scenario, act, SEEDS))[0]
     assert set(np.concatenate([act(state) for _ in range(20)])) == set(Action)
 
 

@@ -4,7 +4,9 @@ Within a step, in this order: the UAV moves, the users walk, then rates hold for
 collected. The ROS nodes compose the same functions, split over processes.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import TypeAlias
 
 from uav_dc_ros.core import mission, mobility, observations, radio, reward
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
@@ -68,6 +70,10 @@ class Outcome:
     truncated: Array
     landed: Array
     link: Link
+
+
+# An action (its value) for each world, integers `[...]`, from their state `[...]`.
+Act: TypeAlias = Callable[[State], Array]
 
 
 def initial(scenario: Scenario, draws: Array) -> State:

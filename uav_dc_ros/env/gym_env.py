@@ -11,7 +11,7 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from uav_dc_ros import scenarios
 from uav_dc_ros.core import observations, world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.grid import ACTION_LABELS, Action
+from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import observe
@@ -30,8 +30,8 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
 
     Observation:
         `Box`, float32. `observation="position"`: the UAV's cell, each index scaled to [0, 1].
-        `"mission"` (default): also the remaining steps and how far each cluster is collected. `"map"`:
-        also the way to each cluster and to the dock. The exact layout is in `core.observations`.
+        `"mission"` (default): also the remaining steps and the progress in each cluster. `"map"`: also the
+        vector to each cluster and to the dock. The exact layout is in `core.observations`.
 
     Reward:
         From r^t = beta * (data collected so far, mean over users, scaled) + zeta * R_plus (eq. 7):
@@ -46,7 +46,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         dock then. `"on_arrival"`: terminates over the dock, truncates after `max_steps`.
 
     Randomness:
-        `reset` draws `np_random.random((U, 2))`, then every `step` the same, and nothing else does.
+        `reset` draws `np_random.random((U, 2))`, and every `step` the same; nothing else draws.
 
     Info:
         step, cell `[3]`, users_m `[U, 2]`, data_bits `[U]`, collected `[U]`, landed, dock_distance_m
@@ -59,11 +59,12 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         render_mode: None, or `rgb_array`: a picture of the mission so far, `[H, W, 3]` uint8.
 
     Raises:
-        ScenarioError: a scenario that cannot be used.
-        InvalidAction, ResetNeeded: of `step`, for an action outside the space, or outside an episode.
+        ScenarioError: an invalid scenario.
+        ValueError: an unknown observation or render mode.
+        InvalidAction, ResetNeeded: by `step`, for an action outside the space, or outside an episode.
     """
 
-    # Gymnasium declares it as a variable of the instance.
+    # Gymnasium declares it as an instance variable.
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 6}  # noqa: RUF012
 
     def __init__(
@@ -72,75 +73,65 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         observation: Observation = "mission",
         render_mode: str | None = None,
     ) -> None:
-        self.scenario, self.observation, self.render_mode = checked(scenario, observation, render_mode)
-        self.observation_space, self.action_space = spaces_of(self.scenario, self.observation)
+        self.observation, self.render_mode = observation, render_mode
+        self.scenario, self.observation_space, self.action_space = prepare(scenario, observation, render_mode)
         self._state: world.State | None = None
-        self._track = Trajectory(self.scenario)
+        self._trajectory = Trajectory(self.scenario)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Starts a mission; `options` are not used."""
+        """Start a mission; `options` are not used."""
         super().reset(seed=seed)
         self._state = world.initial(self.scenario, self._draws())
-        self._track = Trajectory(self.scenario)
-        self._track.add(self._state)
+        self._trajectory = Trajectory(self.scenario)
+        self._trajectory.add(self._state)
         return observe(self.observation, self.scenario, self._state), info(self.scenario, self._state)
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Flies one step; see the class."""
+        """Fly one step; see the class."""
         if self._state is None:
             raise ResetNeeded("step() outside an episode; expected a call of reset() first")
         if not self.action_space.contains(action):
             raise InvalidAction(f"action is {action!r}; expected an integer: {ACTIONS_TEXT}")
         state, outcome = world.step(self.scenario, self._state, np.asarray(action), self._draws())
-        self._track.add(state, outcome.link)
+        self._trajectory.add(state, outcome.link)
         terminated, truncated = bool(outcome.terminated), bool(outcome.truncated)
         self._state = None if terminated or truncated else state
-        seen = observe(self.observation, self.scenario, state)
-        return seen, float(outcome.reward), terminated, truncated, info(self.scenario, state, outcome)
+        observation = observe(self.observation, self.scenario, state)
+        return observation, float(outcome.reward), terminated, truncated, info(self.scenario, state, outcome)
 
     def render(self) -> Array | None:
         """The mission so far as a picture `[H, W, 3]`, uint8; None without a render mode."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() without a render mode; expected render_mode='rgb_array'")
             return None
-        if not self._track.cells:
+        if not self._trajectory.cells:
             raise ResetNeeded("render() before the first mission; expected a call of reset() first")
         from uav_dc_ros.env.render import picture  # brings matplotlib
 
-        return picture(self._track)
+        return picture(self._trajectory)
 
     def _draws(self) -> Array:
         return self.np_random.random((self.scenario.n_users, 2))
 
 
-def checked(
+def prepare(
     scenario: str | Path | Scenario, observation: Observation, render_mode: str | None
-) -> tuple[Scenario, Observation, str | None]:
-    """The arguments of an environment, with the scenario loaded.
-
-    Raises:
-        ScenarioError: a scenario that cannot be used.
-        ValueError: an unknown observation or render mode.
-    """
+) -> tuple[Scenario, spaces.Box, spaces.Discrete]:
+    """The scenario and the spaces of one environment, from its arguments; raises its errors."""
     if observation not in get_args(Observation):
         raise ValueError(f"observation is {observation!r}; expected {', '.join(get_args(Observation))}")
     if render_mode not in (None, *RENDER_MODES):
         raise ValueError(f"render_mode is {render_mode!r}; expected None or {', '.join(RENDER_MODES)}")
     loaded = scenario if isinstance(scenario, Scenario) else scenarios.load(scenario)
-    return loaded, observation, render_mode
-
-
-def spaces_of(scenario: Scenario, observation: Observation) -> tuple[spaces.Box, spaces.Discrete]:
-    """Observation and action space of one environment."""
-    low, high = observations.bounds(observation, scenario)
-    return spaces.Box(low, high, dtype=np.float32), spaces.Discrete(len(ACTION_LABELS))
+    low, high = observations.bounds(observation, loaded)
+    return loaded, spaces.Box(low, high, dtype=np.float32), spaces.Discrete(len(Action))
 
 
 def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None = None) -> dict[str, Any]:
-    """What `reset` and `step` tell beside the observation, with the batch dimensions of `state`."""
-    nothing, nobody = np.zeros_like(state.data_bits), np.zeros_like(state.collected)
+    """The `info` of `reset` and `step`, with the batch dimensions of `state`."""
+    zeros, no_users = np.zeros_like(state.data_bits), np.zeros_like(state.collected)
     link = outcome.link if outcome else None
     return {
         "step": state.step,
@@ -148,10 +139,10 @@ def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None =
         "users_m": state.users_m,
         "data_bits": state.data_bits,
         "collected": state.collected,
-        "landed": outcome.landed if outcome else nobody[..., 0],
+        "landed": outcome.landed if outcome else no_users[..., 0],
         "dock_distance_m": world.dock_distance_m(scenario, state.cell, like=state.data_bits),
-        "served": link.served if link else nobody,
-        "sinr": link.sinr if link else nothing,
-        "rate_bps": link.rate_bps if link else nothing,
-        "sum_rate_bps": link.sum_rate_bps if link else nothing[..., 0],
+        "served": link.served if link else no_users,
+        "sinr": link.sinr if link else zeros,
+        "rate_bps": link.rate_bps if link else zeros,
+        "sum_rate_bps": link.sum_rate_bps if link else zeros[..., 0],
     }

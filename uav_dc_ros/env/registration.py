@@ -1,7 +1,8 @@
-"""Makes `uav_dc_ros/DataCollection-v0` known to Gymnasium.
+"""Registers `uav_dc_ros/DataCollection-v0` and its vector form with Gymnasium, which finds no
+plug-ins itself.
 
-Gymnasium looks for no plug-ins since its 1.0, so one import is needed: `import gymnasium, uav_dc_ros`, this
-module, or what stands before the colon in `gymnasium.make("uav_dc_ros:uav_dc_ros/DataCollection-v0")`.
+Any of these works: `import gymnasium, uav_dc_ros`, an import of this module, or
+`gymnasium.make("uav_dc_ros:uav_dc_ros/DataCollection-v0")`.
 """
 
 import gymnasium
@@ -10,7 +11,7 @@ ENV_ID = "uav_dc_ros/DataCollection-v0"
 
 
 def register() -> None:
-    """Registers the environment and its vector form; a second call changes nothing."""
+    """Register the environment, once."""
     if ENV_ID not in gymnasium.registry:
         gymnasium.register(
             id=ENV_ID,

@@ -1,4 +1,4 @@
-"""A picture of a mission: the field from above, and its course over the steps."""
+"""A picture of a mission: the field from above, and altitude and users collected over the steps."""
 
 from pathlib import Path
 
@@ -17,46 +17,44 @@ from uav_dc_ros.env.trajectory import Trajectory
 
 INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
 WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
-# From the start of a mission to its end.
 PATH_COLOURS = LinearSegmentedColormap.from_list("path", ["#2b3f7e", "#8c5aa6", "#f0a83a"])
 
 
-def picture(track: Trajectory) -> Array:
+def picture(trajectory: Trajectory) -> Array:
     """The mission so far, `[H, W, 3]` uint8."""
-    canvas = FigureCanvasAgg(_figure(track, dpi=100))
+    canvas = FigureCanvasAgg(_figure(trajectory, dpi=100))
     canvas.draw()  # type: ignore[no-untyped-call]
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
-def save_picture(track: Trajectory, path: Path) -> None:
-    """Writes the mission so far as an image; the path's ending names the kind, PNG without one."""
+def save_picture(trajectory: Trajectory, path: Path) -> None:
+    """Write the mission so far as an image; the path's suffix is the format, PNG without one."""
     with files.replacing(path) as partial:
-        kind = path.suffix.removeprefix(".") or "png"
-        FigureCanvasAgg(_figure(track, dpi=150)).figure.savefig(partial, format=kind)
+        format = path.suffix.removeprefix(".") or "png"
+        FigureCanvasAgg(_figure(trajectory, dpi=150)).figure.savefig(partial, format=format)
 
 
-def _figure(track: Trajectory, dpi: int) -> Figure:
+def _figure(trajectory: Trajectory, dpi: int) -> Figure:
     figure = Figure(figsize=(7.2, 8.7), dpi=dpi, facecolor=PAPER)
-    field, course = figure.add_axes((0.1, 0.235, 0.81, 0.67)), figure.add_axes((0.1, 0.06, 0.81, 0.115))
-    _draw_field(field, track)
-    _draw_course(course, track)
-    step, n_steps = len(track.cells) - 1, track.scenario.mission.max_steps
-    docked = bool(mission.at_dock(track.cells[-1], track.scenario.dock_cell))
-    where = "over the dock" if docked else f"sum-rate {track.sum_rate_bps[-1] / 1e6:.2f} Mbit/s"
-    title = f"{track.n_collected[-1]} of {track.scenario.n_users} users collected"
-    facts = f"{track.scenario.name}   ·   step {step} of {n_steps}   ·   {where}"
+    field, steps = figure.add_axes((0.1, 0.235, 0.81, 0.67)), figure.add_axes((0.1, 0.06, 0.81, 0.115))
+    _draw_field(field, trajectory)
+    _draw_steps(steps, trajectory)
+    step, n_steps = len(trajectory.cells) - 1, trajectory.scenario.mission.max_steps
+    docked = bool(mission.at_dock(trajectory.cells[-1], trajectory.scenario.dock_cell))
+    status = "over the dock" if docked else f"sum-rate {trajectory.sum_rate_bps[-1] / 1e6:.2f} Mbit/s"
+    title = f"{trajectory.n_collected[-1]} of {trajectory.scenario.n_users} users collected"
+    facts = f"{trajectory.scenario.name}   ·   step {step} of {n_steps}   ·   {status}"
     figure.text(0.1, 0.952, title, color=INK, size=15, weight="bold")
     figure.text(0.1, 0.926, facts, color=INK, size=9.5)
     return figure
 
 
-def _draw_field(axes: Axes, track: Trajectory) -> None:
+def _draw_field(axes: Axes, trajectory: Trajectory) -> None:
     """The field from above; the path is coloured by step, and a dot grows with the time spent at it."""
-    scenario, state = track.scenario, track.state
-    assert state is not None, "a picture is made of a mission that has started"
+    scenario, state = trajectory.scenario, trajectory.state
+    assert state is not None, "only a started mission is drawn"
     cell_m = scenario.grid.cell_m
-    path_m = np.stack(track.cells)[:, :2] * cell_m
-    when = np.arange(len(path_m))
+    path_m = np.stack(trajectory.cells)[:, :2] * cell_m
     limits = (0, scenario.mission.max_steps)
 
     for centre_m in scenario.users.cluster_centres_m:
@@ -69,7 +67,7 @@ def _draw_field(axes: Axes, track: Trajectory) -> None:
     axes.plot(path_m[:, 0], path_m[:, 1], color=PAPER, lw=5, solid_capstyle="round", zorder=4)
     pieces = np.stack([path_m[:-1], path_m[1:]], axis=1)
     line = LineCollection(list(pieces), cmap=PATH_COLOURS, lw=2.6, capstyle="round", zorder=5)
-    line.set_array(when[1:])
+    line.set_array(np.arange(1, len(path_m)))
     line.set_clim(*limits)
     axes.add_collection(line)
     spots, first, stays = np.unique(path_m, axis=0, return_index=True, return_counts=True)
@@ -87,7 +85,7 @@ def _draw_field(axes: Axes, track: Trajectory) -> None:
     for text, x_m, y_m, lift in (("start", start_x_m, start_y_m, -20), ("dock", dock_x_m, dock_y_m, 13)):
         axes.annotate(text, (x_m, y_m), (0, lift), textcoords="offset points", color=INK, size=9, ha="center")
 
-    altitude_m = float(scenario.grid.centre_m(track.cells[-1], like=state.users_m)[2])
+    altitude_m = float(scenario.grid.centre_m(trajectory.cells[-1], like=state.users_m)[2])
     reach_m = radio.ground_reach_m(scenario.mission.d_cons_m, altitude_m)
     x_m, y_m = path_m[-1]
     axes.add_patch(Circle((x_m, y_m), reach_m, fill=False, ec=INK, lw=0.9, ls=(0, (5, 4)), zorder=2))
@@ -101,29 +99,31 @@ def _draw_field(axes: Axes, track: Trajectory) -> None:
     axes.set_xlabel("east, m", color=INK, size=9)
     axes.set_ylabel("north, m", color=INK, size=9)
     axes.legend(loc="upper left", frameon=False, fontsize=9, labelcolor=INK, handletextpad=0.2)
-    _dress(axes)
+    _style(axes)
 
 
-def _draw_course(axes: Axes, track: Trajectory) -> None:
+def _draw_steps(axes: Axes, trajectory: Trajectory) -> None:
     """Altitude and users collected over the steps."""
-    scenario = track.scenario
-    steps = np.arange(len(track.cells))
-    axes.fill_between(steps, track.n_collected, color=COLLECTED, alpha=0.25, lw=0, step="post")
-    axes.step(steps, track.n_collected, color=COLLECTED, lw=1.6, where="post")
+    scenario = trajectory.scenario
+    steps = np.arange(len(trajectory.cells))
+    axes.fill_between(steps, trajectory.n_collected, color=COLLECTED, alpha=0.25, lw=0, step="post")
+    axes.step(steps, trajectory.n_collected, color=COLLECTED, lw=1.6, where="post")
     axes.set(xlim=(0, scenario.mission.max_steps), ylim=(0, scenario.n_users * 1.08))
     axes.set_xlabel("step", color=INK, size=9)
     axes.set_ylabel("users\ncollected", color=COLLECTED, size=9)
-    _dress(axes)
+    _style(axes)
     height = axes.twinx()
-    altitudes_m = scenario.grid.altitude_min_m + np.stack(track.cells)[:, 2] * scenario.grid.altitude_step_m
+    altitudes_m = (
+        scenario.grid.altitude_min_m + np.stack(trajectory.cells)[:, 2] * scenario.grid.altitude_step_m
+    )
     top_m = scenario.grid.altitude_min_m + (scenario.grid.n_z - 1) * scenario.grid.altitude_step_m
     height.step(steps, altitudes_m, color=INK, lw=1.3, where="post")
     height.set_ylim(0, top_m * 1.2)
     height.set_ylabel("altitude, m", color=INK, size=9)
-    _dress(height)
+    _style(height)
 
 
-def _dress(axes: Axes) -> None:
+def _style(axes: Axes) -> None:
     axes.set_facecolor("none")
     axes.tick_params(colors=INK, labelsize=8, length=0)
     axes.grid(color=FAINT, lw=0.5, alpha=0.6)

@@ -1,4 +1,4 @@
-"""A single mission, step by step, as pictures need it. Needs numpy only."""
+"""The trajectory of a single mission, as pictures need it. Needs numpy only."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ from uav_dc_ros.core.scenario import Scenario
 
 
 class Trajectory:
-    """What a picture needs of one mission, step by step.
+    """One mission, step by step; every list begins with the start.
 
     Attributes:
         scenario: the world's values.
-        cells: the UAV's cell after each step, the start first.
+        cells: the UAV's cell after each step.
         n_collected: users collected after each step.
         sum_rate_bps: sum-rate of each step, 0 for the start.
-        state: the world now.
+        state: the latest state.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -26,7 +26,7 @@ class Trajectory:
         self.state: world.State | None = None
 
     def add(self, state: world.State, link: world.Link | None = None) -> None:
-        """Appends the start, or the next step, of one mission without batch dimensions."""
+        """Append the start, or the next step, of one mission without batch dimensions."""
         self.cells.append(state.cell)
         self.n_collected.append(int(np.sum(state.collected)))
         self.sum_rate_bps.append(float(link.sum_rate_bps) if link else 0.0)

@@ -15,19 +15,19 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import BatchWorld
-from uav_dc_ros.env.gym_env import ACTIONS_TEXT, checked, info, spaces_of
+from uav_dc_ros.env.gym_env import ACTIONS_TEXT, info, prepare
 
 
 class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
     """`num_envs` environments like `DataCollectionEnv`, stepped as arrays.
 
-    A mission that has ended starts afresh at the next step (`AutoresetMode.NEXT_STEP`), whose action for
-    it is ignored and whose reward is 0. Environment i draws from its own generator exactly as a single
-    one does: `reset(seed=s)` gives it seed s + i. Keys of `info` are those of the single environment,
-    `[num_envs, ...]`, each with its mask `_key`.
+    A mission that has ended restarts at the next step (`AutoresetMode.NEXT_STEP`), which ignores its action
+    and gives reward 0. Environment i draws from its own generator exactly as a single one does:
+    `reset(seed=s)` gives it seed s + i. Keys of `info` are those of the single environment, `[num_envs,
+    ...]`, each with its mask `_key`.
     """
 
-    # Gymnasium declares it as a variable of the instance.
+    # Gymnasium declares it as an instance variable.
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
@@ -39,9 +39,10 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
     ) -> None:
         if render_mode is not None:
             raise ValueError(f"render_mode is {render_mode!r}; expected None: only a single one renders")
-        self.num_envs = num_envs
-        self.scenario, self.observation, self.render_mode = checked(scenario, observation, render_mode)
-        self.single_observation_space, self.single_action_space = spaces_of(self.scenario, self.observation)
+        self.num_envs, self.observation, self.render_mode = num_envs, observation, render_mode
+        self.scenario, self.single_observation_space, self.single_action_space = prepare(
+            scenario, observation, render_mode
+        )
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rngs = [seeding.np_random()[0] for _ in range(num_envs)]
@@ -51,7 +52,7 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Starts every mission; a list holds a seed for each, None goes on with what it has."""
+        """Start every mission; of a list of seeds, None keeps that environment's generator."""
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         if seeds is not None:
             if len(seeds) != self.num_envs:
@@ -64,7 +65,7 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
         return self._batch.observe(self.observation), self._masked(info(self.scenario, self._batch.state))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Flies one step of every mission, or starts it afresh; see the class."""
+        """Fly one step of every mission, or restart it; see the class."""
         if self._batch is None:
             raise ResetNeeded("step() before the first episode; expected a call of reset() first")
         actions = np.asarray(actions)
@@ -72,21 +73,21 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
             raise InvalidAction(
                 f"actions are {actions!r}; expected {self.num_envs} integers, each one of {ACTIONS_TEXT}"
             )
-        fresh, draws = self._over, self._draws()
-        outcome = self._batch.step(np.where(fresh, Action.HOVER, actions), draws)
-        told = info(self.scenario, self._batch.state, outcome)
-        if fresh.any():
-            self._batch.restart(fresh, draws)
-            started = info(self.scenario, self._batch.state)
-            for key, values in told.items():
-                values[fresh] = started[key][fresh]
-        terminated, truncated = outcome.terminated & ~fresh, outcome.truncated & ~fresh
+        restarted, draws = self._over, self._draws()
+        outcome = self._batch.step(np.where(restarted, Action.HOVER, actions), draws)
+        infos = info(self.scenario, self._batch.state, outcome)
+        if restarted.any():
+            self._batch.restart(restarted, draws)
+            initial = info(self.scenario, self._batch.state)
+            for key, values in infos.items():
+                values[restarted] = initial[key][restarted]
+        terminated, truncated = outcome.terminated & ~restarted, outcome.truncated & ~restarted
         self._over = terminated | truncated
-        reward = np.where(fresh, 0.0, outcome.reward)
-        return self._batch.observe(self.observation), reward, terminated, truncated, self._masked(told)
+        reward = np.where(restarted, 0.0, outcome.reward)
+        return self._batch.observe(self.observation), reward, terminated, truncated, self._masked(infos)
 
     def _draws(self) -> Array:
         return np.stack([rng.random((self.scenario.n_users, 2)) for rng in self._rngs])
 
-    def _masked(self, told: dict[str, Any]) -> dict[str, Any]:
-        return told | {f"_{key}": np.ones(self.num_envs, bool) for key in told}
+    def _masked(self, infos: dict[str, Any]) -> dict[str, Any]:
+        return infos | {f"_{key}": np.ones(self.num_envs, bool) for key in infos}

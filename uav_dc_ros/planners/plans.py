@@ -1,16 +1,13 @@
 """Random moves, the nearest cluster first, and a fixed tour of all clusters."""
 
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.world import State
-
-Act = Callable[[State], Array]
+from uav_dc_ros.core.world import Act, State
 
 # Share of its users after which a cluster counts as served: the last tenth may have walked far away.
 ENOUGH = 0.9

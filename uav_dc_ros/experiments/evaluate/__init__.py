@@ -1,1 +1,1 @@
-"""Evaluation: missions flown with a policy, and figures over many of them."""
+"""Evaluation of policies over many missions."""

@@ -15,6 +15,7 @@ from rich.table import Table
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import Act
 from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.evaluate.evaluation import (
     COLUMNS,
@@ -24,48 +25,47 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     EvaluationReport,
     Figure,
     compare,
-    judge,
+    evaluate_act,
+    greedy_act,
     mean_and_interval,
     rows,
     save_mission_picture,
-    steer,
 )
-from uav_dc_ros.experiments.evaluate.rollout import Act
 from uav_dc_ros.planners import PLANNERS
 
 PROG = "python -m uav_dc_ros.evaluate"
 
-# The figures by which policies are compared at a glance.
-_AT_A_GLANCE = ("landing_rate", "users_collected", "arrival_step", "sum_rate_bps")
+# Figures of the overview.
+_MAIN_FIGURES = ("landing_rate", "users_collected", "arrival_step", "sum_rate_bps")
 
 
-class Pilot(NamedTuple):
-    """Who can fly: a policy, or a planner.
+class Candidate(NamedTuple):
+    """A policy or a planner to evaluate.
 
     Attributes:
-        name: what the results call it.
-        sha256: of a policy's config and model.
-        home: name of the scenario that a policy learnt in.
-        steer: how it flies in a scenario; raises PolicyError where it does not fit.
+        name: name in the results.
+        sha256: hash of a policy's config and model.
+        home: name of the scenario that a policy was trained in.
+        act_in: its actions in a scenario; raises PolicyError where it does not fit.
     """
 
     name: str
     sha256: str | None
     home: str | None
-    steer: Callable[[Scenario], Act]
+    act_in: Callable[[Scenario], Act]
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Runs the command line, and exits."""
+    """Run the command, and exit."""
     parser = cli.Parser(
-        prog=PROG, description="Fly policies over many missions, and show and compare how they do."
+        prog=PROG, description="Fly policies over many missions, and show and compare their performance."
     )
     parser.add_argument(
         "--policy",
         nargs="+",
         required=True,
         metavar="NAME|DIR",
-        help=f"shipped: {', '.join(policies.names())}; to compare with: {', '.join(PLANNERS)}; "
+        help=f"shipped: {', '.join(policies.names())}; baselines: {', '.join(PLANNERS)}; "
         "all are compared with the first",
     )
     parser.add_argument(
@@ -82,27 +82,27 @@ def main(argv: list[str] | None = None) -> None:
 
     def command() -> int:
         options = parser.parse_args(argv)
-        flights = _flights(options.policy, options.scenario)
-        acts = [pilot.steer(scenario) for pilot, scenario in flights]
-        if options.picture and len(flights) > 1:
-            raise UavDcError(f"--picture of {len(flights)} flights; expected one policy in one scenario")
+        pairs = _pairs(options.policy, options.scenario)
+        acts = [candidate.act_in(scenario) for candidate, scenario in pairs]
+        if options.picture and len(pairs) > 1:
+            raise UavDcError(f"--picture of {len(pairs)} evaluations; expected one policy in one scenario")
         for path in filter(None, (options.json, options.picture)):
             files.check_writable(path)
         if options.picture:
-            pilot, scenario = flights[0]
-            save_mission_picture(pilot.steer(scenario), scenario, 0, options.picture)
+            candidate, scenario = pairs[0]
+            save_mission_picture(candidate.act_in(scenario), scenario, 0, options.picture)
 
-        flown = [
-            judge(pilot.name, pilot.sha256, act, scenario, range(options.seeds))
-            for (pilot, scenario), act in zip(flights, acts, strict=True)
+        evaluated = [
+            evaluate_act(candidate.name, candidate.sha256, act, scenario, range(options.seeds))
+            for (candidate, scenario), act in zip(pairs, acts, strict=True)
         ]
         first: dict[str, EvaluatedMissions] = {}  # in each scenario
         comparisons = []
-        for one in flown:
+        for one in evaluated:
             baseline = first.setdefault(one.evaluation.fingerprint, one)
             if one is not baseline:
                 comparisons.append(compare(one, baseline))
-        report = EvaluationReport(evaluations=[one.evaluation for one in flown], comparisons=comparisons)
+        report = EvaluationReport(evaluations=[one.evaluation for one in evaluated], comparisons=comparisons)
         if options.json:
             files.write(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
         show(report)
@@ -111,46 +111,47 @@ def main(argv: list[str] | None = None) -> None:
     cli.run(command, PROG)
 
 
-def _flights(wanted: Sequence[str], where: Sequence[str]) -> list[tuple[Pilot, Scenario]]:
-    """Who flies where, in the order of the results: every policy in each scenario, or in its own."""
-    for option, given in (("--policy", wanted), ("--scenario", where)):
-        for one in given:
-            if given.count(one) > 1:
-                raise UavDcError(f"{option} {one} is given {given.count(one)} times; expected once")
-    pilots = [_pilot(one) for one in wanted]
-    names = [pilot.name for pilot in pilots]
-    pilots = [  # a table must tell them apart
-        pilot._replace(name=one) if names.count(pilot.name) > 1 else pilot
-        for pilot, one in zip(pilots, wanted, strict=True)
+def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[tuple[Candidate, Scenario]]:
+    """Candidates and scenarios in the order of the results: every policy in each scenario, or in its own."""
+    for option, values in (("--policy", policy_names), ("--scenario", scenario_names)):
+        for value in values:
+            if values.count(value) > 1:
+                raise UavDcError(f"{option} {value} is given {values.count(value)} times; expected once")
+    candidates = [_candidate(value) for value in policy_names]
+    names = [candidate.name for candidate in candidates]
+    candidates = [  # equal names are replaced by the arguments, which differ
+        candidate._replace(name=value) if names.count(candidate.name) > 1 else candidate
+        for candidate, value in zip(candidates, policy_names, strict=True)
     ]
-    if where:
-        worlds = [scenarios.load(one) for one in where]
+    if scenario_names:
+        worlds = [scenarios.load(value) for value in scenario_names]
         names = [world.name for world in worlds]
         if len(set(names)) < len(names):
             raise UavDcError(
-                f"--scenario {' '.join(where)}: their names are {', '.join(names)}; expected different ones"
+                f"--scenario {' '.join(scenario_names)}: their names are {', '.join(names)}; "
+                "expected different ones"
             )
-        return [(pilot, world) for world in worlds for pilot in pilots]
-    flights = []
-    for pilot in pilots:
-        if pilot.home is None:
+        return [(candidate, world) for world in worlds for candidate in candidates]
+    pairs = []
+    for candidate in candidates:
+        if candidate.home is None:
             raise UavDcError(
-                f"--policy {pilot.name}: a planner has no scenario of its own; expected --scenario"
+                f"--policy {candidate.name}: a planner has no scenario of its own; expected --scenario"
             )
-        flights.append((pilot, scenarios.load(pilot.home)))
-    return flights
+        pairs.append((candidate, scenarios.load(candidate.home)))
+    return pairs
 
 
-def _pilot(given: str) -> Pilot:
-    if given in PLANNERS:
-        return Pilot(given, None, None, PLANNERS[given])
-    policy = policies.load(given)
-    return Pilot(policy.name, policy.sha256, policy.scenario.name, partial(steer, policy))
+def _candidate(value: str) -> Candidate:
+    if value in PLANNERS:
+        return Candidate(value, None, None, PLANNERS[value])
+    policy = policies.load(value)
+    return Candidate(policy.name, policy.sha256, policy.scenario.name, partial(greedy_act, policy))
 
 
 def show(report: EvaluationReport) -> None:
-    """Prints a table for each evaluation, and one of all when there are more."""
-    # A file or a pipe has no width of its own; rich would wrap at 80.
+    """Print a table for each evaluation, and an overview of several."""
+    # A file or a pipe has no width; rich wraps at 80 by default.
     console = Console(width=None if sys.stdout.isatty() else 100, highlight=False)
     for evaluation in report.evaluations:
         where = f"{evaluation.scenario}, {evaluation.users_total} users"
@@ -175,18 +176,18 @@ def _details(evaluation: Evaluation) -> Table:
 
 
 def _overview(report: EvaluationReport) -> Table:
-    """The figures that matter most, of all policies, and how much they differ from the first's."""
+    """The main figures of all policies, and their differences from the first policy's."""
     table = _table()
     table.add_column("", overflow="fold")
-    for name in _AT_A_GLANCE:
+    for name in _MAIN_FIGURES:
         table.add_column(TITLES[name].replace(" ", "\n", 1), justify="right", no_wrap=True)
     for scenario in dict.fromkeys(evaluation.scenario for evaluation in report.evaluations):
-        here = [evaluation for evaluation in report.evaluations if evaluation.scenario == scenario]
         differences = [comparison for comparison in report.comparisons if comparison.scenario == scenario]
         table.add_section()
         table.add_row(f"[bold]in {escape(scenario)}")
-        for evaluation in here:
-            _add(table, evaluation.policy, {name: getattr(evaluation, name) for name in _AT_A_GLANCE})
+        for evaluation in report.evaluations:
+            if evaluation.scenario == scenario:
+                _add(table, evaluation.policy, {name: getattr(evaluation, name) for name in _MAIN_FIGURES})
         if differences:
             table.add_row(f"[bold]less {escape(differences[0].baseline)}")
         for comparison in differences:
@@ -200,7 +201,7 @@ def _table() -> Table:
 
 def _add(table: Table, policy: str, figures: Mapping[str, Figure], sign: Literal["", "+"] = "") -> None:
     cells = []
-    for name in _AT_A_GLANCE:
+    for name in _MAIN_FIGURES:
         mean, interval = mean_and_interval(name, figures[name], sign)
         cells.append(f"{mean}\n[dim]{interval.replace(' to ', '..')}[/dim]")  # four of them in 80 columns
     table.add_row(f" {escape(policy)}", *cells)

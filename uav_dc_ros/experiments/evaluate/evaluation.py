@@ -1,4 +1,4 @@
-"""Evaluation of policies over many missions. Needs numpy only, but for the picture."""
+"""Evaluation of policies over many missions. Needs numpy only, except for the picture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -13,24 +13,23 @@ from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.stats import interval
-from uav_dc_ros.core.world import observe
+from uav_dc_ros.core.world import Act, observe
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments.evaluate.rollout import Act, Missions, roll_out
+from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out, roll_out_trajectory
 
-# The missions on every card: seeds 0 to 99. Nothing is tuned or chosen on them.
+# The missions on every policy card. Nothing is tuned or selected on them.
 TEST_SEEDS = range(100)
 
 
 class Figure(msgspec.Struct, frozen=True, kw_only=True):
-    """One quantity over missions; null where it cannot be known.
+    """Statistics of one quantity over missions; null where unknown.
 
     Attributes:
-        n: missions that have it.
+        n: missions that have the quantity.
         mean: over these missions.
-        low, high: ends of the 95% bootstrap interval of the mean; of two missions or more. Where all
-            missions are alike it has no width: after 100 landings of 100 it says nothing of the odds of
-            a rare failure.
-        min, max: least and greatest.
+        low, high: ends of the 95% bootstrap interval of the mean, for two missions or more. It has no width
+            where all missions are alike: 100 landings of 100 do not exclude a rare failure.
+        min, max: extremes.
     """
 
     n: int
@@ -42,12 +41,12 @@ class Figure(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
-    """How a policy does in a scenario.
+    """The performance of a policy in a scenario.
 
     Attributes:
-        policy, sha256: which policy, and the hash of its config and model; none for a planner.
-        scenario, fingerprint: which world, and the hash of its values.
-        version: of the package that flew.
+        policy, sha256: name, and hash of config and model; no hash for a planner.
+        scenario, fingerprint: name, and hash of the world's values.
+        version: of the package.
         seeds: first seed and number of seeds.
         users_total: users in the field.
         landing_rate: 1 for a mission that landed, else 0.
@@ -56,7 +55,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
         sum_rate_bps: mean over the steps of a mission, bit/s.
         data_bits: data collected in a mission, bit.
         reward: r^t at the end of a mission (eq. 7), with the weights of this scenario.
-        episode_return: undiscounted sum of what the agent was paid.
+        episode_return: undiscounted sum of the agent's rewards.
     """
 
     policy: str
@@ -80,10 +79,10 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     """Two policies in the same missions, mission by mission.
 
     Attributes:
-        policy, baseline: who is compared with whom.
+        policy, baseline: names.
         scenario, fingerprint, seeds: as in `Evaluation`.
-        differences: `policy` less `baseline`, by the name of the figure in `Evaluation`, over the
-            missions in which both have it.
+        differences: `policy` minus `baseline`, by the name of the figure in `Evaluation`, over the missions
+            in which both have it.
     """
 
     policy: str
@@ -95,11 +94,11 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EvaluationReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What `python -m uav_dc_ros.evaluate --json` writes.
+    """The content of a file of `python -m uav_dc_ros.evaluate --json`.
 
     Attributes:
         evaluations: one for each policy in each scenario.
-        comparisons: in each scenario, every further policy against the first.
+        comparisons: in each scenario, every further policy with the first.
     """
 
     evaluations: list[Evaluation]
@@ -108,31 +107,27 @@ class EvaluationReport(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedMissions:
-    """An evaluation, and each of its figures mission by mission: `[S]`, NaN where a mission has none."""
+    """An evaluation, and the values of each figure by mission: `[S]`, NaN where a mission has none."""
 
     evaluation: Evaluation
     values: dict[str, Array]
 
 
-def steer(policy: Policy, scenario: Scenario) -> Act:
-    """The policy as whoever steers missions in `scenario`.
-
-    Raises:
-        PolicyError: it does not fit the scenario.
-    """
+def greedy_act(policy: Policy, scenario: Scenario) -> Act:
+    """The policy's greedy actions in a scenario; raises PolicyError when it does not fit."""
     policy.check(scenario)
     return lambda state: policy.act(observe(policy.config.observation, scenario, state))
 
 
 def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Evaluation:
-    """Flies one mission per seed, greedily; raises PolicyError when the policy does not fit."""
-    return judge(policy.name, policy.sha256, steer(policy, scenario), scenario, seeds).evaluation
+    """Fly one mission per seed with greedy actions; raises PolicyError when the policy does not fit."""
+    return evaluate_act(policy.name, policy.sha256, greedy_act(policy, scenario), scenario, seeds).evaluation
 
 
-def judge(
+def evaluate_act(
     name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Sequence[int]
 ) -> EvaluatedMissions:
-    """Flies one mission per seed with whoever steers by `act`."""
+    """Fly one mission per seed with the actions of a policy or a planner."""
     missions = roll_out(scenario, act, seeds)
     values = {f.name: np.asarray(getattr(missions, f.name), np.float64) for f in fields(Missions)}
     values["landing_rate"] = values.pop("landed")
@@ -149,16 +144,16 @@ def judge(
     return EvaluatedMissions(evaluation=evaluation, values=values)
 
 
-def compare(flown: EvaluatedMissions, baseline: EvaluatedMissions) -> Comparison:
-    """`flown` less `baseline`, which has flown the same seeds in the same scenario."""
-    mine, other = flown.evaluation, baseline.evaluation
+def compare(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> Comparison:
+    """`evaluated` minus `baseline`, of the same seeds in the same scenario."""
+    evaluation = evaluated.evaluation
     return Comparison(
-        policy=mine.policy,
-        baseline=other.policy,
-        scenario=mine.scenario,
-        fingerprint=mine.fingerprint,
-        seeds=mine.seeds,
-        differences={name: _figure(flown.values[name] - baseline.values[name]) for name in TITLES},
+        policy=evaluation.policy,
+        baseline=baseline.evaluation.policy,
+        scenario=evaluation.scenario,
+        fingerprint=evaluation.fingerprint,
+        seeds=evaluation.seeds,
+        differences={name: _figure(evaluated.values[name] - baseline.values[name]) for name in TITLES},
     )
 
 
@@ -182,22 +177,22 @@ _SHOWN = {
     "episode_return": ("return", 1.0, 3),
 }
 TITLES = {name: title for name, (title, _, _) in _SHOWN.items()}
-COLUMNS = ("", "mean", "95% interval", "least", "greatest")
+COLUMNS = ("", "mean", "95% interval", "min", "max")
 
 
 def rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
-    """What stands in the `COLUMNS` of every figure, as text."""
+    """The texts of `COLUMNS` for every figure."""
     table: list[tuple[str, ...]] = []
     for name, title in TITLES.items():
         figure: Figure = getattr(evaluation, name)
-        # Of landings, which are 0 or 1, the least and the greatest say nothing.
+        # Extremes of landings, which are 0 or 1, carry no information.
         extremes = ("", "") if name == "landing_rate" else (_text(name, figure.min), _text(name, figure.max))
         table.append((title, *mean_and_interval(name, figure), *extremes))
     return table
 
 
 def mean_and_interval(name: str, figure: Figure, sign: Literal["", "+"] = "") -> tuple[str, str]:
-    """A figure's mean, and the ends of its interval, as text; with `+` also positive numbers have a sign."""
+    """A figure's mean and interval as text; with `+`, positive numbers have a sign."""
     low, high = _text(name, figure.low, sign), _text(name, figure.high, sign)
     return _text(name, figure.mean, sign), "-" if figure.low is None else f"{low} to {high}"
 
@@ -208,15 +203,13 @@ def _text(name: str, value: float | None, sign: str = "") -> str:
 
 
 def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) -> None:
-    """Flies the mission with this seed, and writes its picture.
+    """Fly the mission of a seed and write its picture.
 
     Raises:
         UavDcError: matplotlib is not installed, or the picture cannot be written.
     """
     try:
-        # Slow to import, and not always there.
-        from uav_dc_ros.env.render import save_picture
-        from uav_dc_ros.experiments.evaluate.trajectory import roll_out_trajectory
+        from uav_dc_ros.env.render import save_picture  # slow to import, and optional
     except ModuleNotFoundError:
         raise UavDcError(
             'matplotlib is not installed; expected it from: pip install "uav_dc_ros[train]"'

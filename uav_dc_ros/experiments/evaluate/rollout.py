@@ -1,11 +1,13 @@
-"""Missions flown side by side, one per seed, in numpy: the judge of every policy.
+"""Missions flown side by side, one per seed, in numpy: the evaluation of every policy.
 
-Seed s draws from `numpy.random.default_rng(s)`: `(U, 2)` numbers for the start, then `(U, 2)` for each
-step. The environment and the ROS nodes do the same, so seed s is the same mission everywhere.
+Seed s draws from `numpy.random.default_rng(s)`: `(U, 2)` numbers for the start, then `(U, 2)` for each step.
+The
+environment and the ROS nodes do the same: seed s is the same mission everywhere.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -13,15 +15,13 @@ from uav_dc_ros.core import mission, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.world import select
-
-# Greedy or not: from the state of the missions, `[..., S]`, an action for each, integers `[..., S]`.
-Act = Callable[[world.State], Array]
+from uav_dc_ros.core.world import Act
+from uav_dc_ros.env.trajectory import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
 class Missions:
-    """How missions went, one entry per seed, each `[..., S]`.
+    """Results of missions, one entry per seed, each `[..., S]`.
 
     Attributes:
         users_collected: users collected.
@@ -31,7 +31,7 @@ class Missions:
         sum_rate_bps: sum-rate of the served users, mean over the steps, bit/s.
         data_bits: data collected from all users, bit.
         reward: r^t at the end (eq. 7).
-        episode_return: sum of what the agent was paid, undiscounted.
+        episode_return: undiscounted sum of the agent's rewards.
     """
 
     users_collected: Array
@@ -44,7 +44,7 @@ class Missions:
     episode_return: Array
 
 
-def flight(
+def rollout_steps(
     scenario: Scenario,
     act: Act,
     seeds: Sequence[int],
@@ -55,11 +55,11 @@ def flight(
 
     Args:
         scenario: the world's values.
-        act: who steers.
+        act: the policy or planner.
         seeds: the S missions.
-        layouts: when several runs fly all S missions each, `[R, S]`: for each the draws for where
-            users start, `[U, 2]`, or None for the seed's own.
-        rewards: how each run is paid, `[R, 1]`; as the scenario says unless told.
+        layouts: for R runs that fly all S missions each, `[R, S]`: for each run the draws of the users' start
+            positions, `[U, 2]`, or None for the seed's own.
+        rewards: reward settings of each run, `[R, 1]`; default: the scenario's.
     """
     runs = () if layouts is None else (len(layouts),)
     rngs = [np.random.default_rng(seed) for seed in seeds]
@@ -86,19 +86,19 @@ def roll_out(
     layouts: Sequence[Array | None] | None = None,
     rewards: Rewards | None = None,
 ) -> Missions:
-    """Flies every mission to its end; arguments as in `flight`, results `[S]` or `[R, S]`."""
-    steps = flight(scenario, act, seeds, layouts, rewards)
+    """Fly every mission to its end; arguments as in `rollout_steps`, results `[S]` or `[R, S]`."""
+    steps = rollout_steps(scenario, act, seeds, layouts, rewards)
     final, _ = next(steps)
     over = final.step < 0
     landed, arrival = over, np.full(over.shape, np.nan)
-    rate_sum, paid = np.zeros(over.shape), np.zeros(over.shape)
+    rate_sum, episode_return = np.zeros(over.shape), np.zeros(over.shape)
     for state, outcome in steps:
         assert outcome is not None, "every step but the start has one"
-        final = select(over, final, state)
+        final = world.select(over, final, state)
         docked = mission.at_dock(final.cell, scenario.dock_cell)
         arrival = np.where(docked, np.where(np.isnan(arrival), final.step, arrival), np.nan)
         rate_sum += np.where(over, 0.0, outcome.link.sum_rate_bps)
-        paid += np.where(over, 0.0, outcome.reward)
+        episode_return += np.where(over, 0.0, outcome.reward)
         landed = landed | (outcome.landed & ~over)
         over = over | outcome.terminated | outcome.truncated
         if over.all():
@@ -111,5 +111,19 @@ def roll_out(
         sum_rate_bps=rate_sum / final.step,
         data_bits=np.sum(final.data_bits, axis=-1),
         reward=final.total_reward,
-        episode_return=paid,
+        episode_return=episode_return,
     )
+
+
+def roll_out_trajectory(scenario: Scenario, act: Act, seed: int, layout: Array | None = None) -> Trajectory:
+    """Fly the mission of a seed, step by step; `layout` as one of `rollout_steps`, `[U, 2]`."""
+
+    def unbatched(batch: Any) -> Any:
+        return type(batch)(**{f.name: getattr(batch, f.name)[0, 0] for f in fields(batch)})
+
+    trajectory = Trajectory(scenario)
+    for state, outcome in rollout_steps(scenario, act, [seed], layouts=[layout]):
+        trajectory.add(unbatched(state), unbatched(outcome.link) if outcome else None)
+        if outcome and (outcome.terminated | outcome.truncated).all():
+            break
+    return trajectory

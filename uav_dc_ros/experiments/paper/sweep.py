@@ -17,7 +17,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import observe
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.trajectory import roll_out_trajectory
+from uav_dc_ros.experiments.evaluate.rollout import roll_out_trajectory
 from uav_dc_ros.experiments.paper import shards
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results

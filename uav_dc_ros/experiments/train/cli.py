@@ -20,7 +20,7 @@ from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture, steer
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act, save_mission_picture
 from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run
 from uav_dc_ros.experiments.train.progress import ProgressDisplay
@@ -245,7 +245,7 @@ def _draw(folder: Path, made: policy.Policy, scenario: Scenario, training: "Trai
         return
     chosen = made.config.seed - training.population.runs[0].seed
     save_learning_curve(training, chosen, folder / LEARNING_CURVE)
-    save_mission_picture(steer(made, scenario), scenario, TEST_SEEDS[0], folder / TRAJECTORY)
+    save_mission_picture(greedy_act(made, scenario), scenario, TEST_SEEDS[0], folder / TRAJECTORY)
 
 
 def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
