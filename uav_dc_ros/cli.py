@@ -13,7 +13,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TextIO, cast
 
 from uav_dc_ros import __version__
@@ -288,9 +287,7 @@ class LiveDisplay:
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Restore the terminal, and wait until everything is written."""
         self._bar.stop()
         self._output.drain()

@@ -33,10 +33,7 @@ if TYPE_CHECKING:
 
 STEP_TIMEOUT_S = 30.0  # for the discovery of the nodes, and for a due step
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be restarting
-FINAL_S, FINAL_QUIET_S = (
-    2.0,
-    0.2,
-)  # longest wait for the nodes' last messages, and time without one that ends it
+FINAL_S, FINAL_QUIET_S = 2.0, 0.2  # longest wait for the nodes' last messages, and for the next one
 TICK_S = 0.02  # period of checks of the nodes
 BRING_UP_TICK_S = 0.004  # until all are active: each transition takes a check
 SHUTDOWN_S = 3.0  # for the middleware
@@ -183,11 +180,7 @@ class MissionRunner:
             )
 
     def _follow(self, supervisor: Supervisor, node: MissionMonitor, executor: DirectExecutor) -> None:
-        """Spin until all missions are over, or interrupted.
-
-        Raises:
-            NodeError: a required node failed, a step timed out, or another mission is flown here.
-        """
+        """Spin until all missions are over, or the run is interrupted."""
         self._step_s = time.monotonic()
         check_s = 0.0
         while not (self.interrupted or (node.is_alone and len(self.summaries) >= self.config.missions)):
@@ -206,11 +199,7 @@ class MissionRunner:
             time.sleep(min(node.pause_s, tick_s))
 
     def _check_timeout(self, node: MissionMonitor, now_s: float) -> None:
-        """Check the time since the last step; nodes of another run_all have no timeout.
-
-        Raises:
-            NodeError: a step timed out, or the nodes of this run_all were not discovered.
-        """
+        """Check the time since the last step; nodes of another run_all have no timeout."""
         if not self.is_simulated and self._status is not None:
             return  # the bridge has its own timeouts, and a pilot none
         timeout_s = STEP_TIMEOUT_S + pace.period_s(self.scenario, self.config.factor)

@@ -4,7 +4,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from uav_dc_ros.errors import NodeError
@@ -109,9 +108,7 @@ class Supervisor:
                 self._start(nodes)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Stop all processes."""
         self.stop()
 
@@ -210,11 +207,7 @@ class Supervisor:
         self._on_note(f"{reason}; it is restarted ({exits} of {maximum} within {RESTART_WINDOW_S:.0f} s)")
 
     def _drop(self, node: SupervisedNode, reason: str) -> None:
-        """Continue without a node.
-
-        Raises:
-            NodeError: the mission requires it.
-        """
+        """Continue without a node; raises NodeError if the mission requires it."""
         if node.row.needed or (node.row.on_request and not self.brought_up):
             raise NodeError(reason)
         self._on_note(f"{reason}; the mission goes on without it")

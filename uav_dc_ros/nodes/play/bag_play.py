@@ -107,12 +107,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _playback_options(reader: BagReader, options: argparse.Namespace) -> "PlaybackOptions":
-    """Check the options against the bag.
-
-    Raises:
-        ParameterError: an option does not fit the bag, or the terminal.
-        BagError: the bag is empty.
-    """
+    """Check the options against the bag."""
     from uav_dc_ros.nodes.play.player import PlaybackOptions
 
     if not reader.message_count:
@@ -137,11 +132,7 @@ def _playback_options(reader: BagReader, options: argparse.Namespace) -> "Playba
 
 
 def _names(reader: BagReader, options: argparse.Namespace) -> dict[str, str]:
-    """Full name of the topic to publish, by recorded topic.
-
-    Raises:
-        ParameterError: an unknown topic, an invalid name, or two types on one topic.
-    """
+    """Full name of the topic to publish, by recorded topic."""
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.validate_full_topic_name import validate_full_topic_name
 
@@ -184,11 +175,6 @@ def _check_known(reader: BagReader, option: str, topics: Iterable[str]) -> None:
 
 
 def _play(reader: BagReader, options: "PlaybackOptions") -> None:
-    """Play with a new node.
-
-    Raises:
-        UavDcError, KeyboardInterrupt: as `run`.
-    """
     import rclpy
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions

@@ -8,22 +8,12 @@ import termios
 import time
 import tty
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, Self
 
-# Terminals send arrows in one of two modes.
-KEYS = {
-    "\x1b[A": "faster",
-    "\x1bOA": "faster",
-    "\x1b[B": "slower",
-    "\x1bOB": "slower",
-    "\x1b[C": "step",
-    "\x1bOC": "step",
-    "+": "faster",
-    "=": "faster",
-    "-": "slower",
-    "s": "step",
-    "n": "step",
+KEYS = {  # terminals send arrows in one of two modes
+    **dict.fromkeys(("\x1b[A", "\x1bOA", "+", "="), "faster"),
+    **dict.fromkeys(("\x1b[B", "\x1bOB", "-"), "slower"),
+    **dict.fromkeys(("\x1b[C", "\x1bOC", "s", "n"), "step"),
     " ": "pause",
     "q": "quit",
 }
@@ -65,9 +55,7 @@ class Keyboard:
             self._activate()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Restore the terminal."""
         if self._settings:
             signal.signal(signal.SIGTSTP, signal.SIG_DFL)

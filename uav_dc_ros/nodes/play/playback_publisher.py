@@ -110,11 +110,7 @@ class PlaybackPublisher:
 
 
 def _check_definition(node: Node, name: str, topic: RecordedTopic) -> None:
-    """Compare the recorded definition of a type, if there is one, with the installed one.
-
-    Raises:
-        NodeError: they differ.
-    """
+    """Raise NodeError if the recorded definition of a type differs from the installed one."""
     if not topic.definition or topic.encoding != ENCODING:
         return
     try:

@@ -26,25 +26,6 @@ def common_qos(ends: Sequence[TopicEndpointInfo]) -> QoSProfile:
     )
 
 
-class _CountedSubscription:
-    """A subscription, and the middleware's count of its lost messages."""
-
-    def __init__(self, subscription: Any) -> None:
-        self.subscription = subscription
-        self._losses = EventCount(subscription, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST)
-        self.close = self._losses.close
-
-    def lost(self) -> int:
-        """Number of lost messages; 0 with a middleware that does not count."""
-        count = self._losses.take()
-        return 0 if count is None else int(count.total_count)
-
-    def take(self) -> Any:
-        """The next message and its info, or None."""
-        with self.subscription.handle:
-            return self.subscription.handle.take_message(self.subscription.msg_type, True)
-
-
 class AdaptiveSubscription:
     """Subscribes to a recorded topic.
 
@@ -63,8 +44,7 @@ class AdaptiveSubscription:
         self.callback = callback
         self.publishers = 0
         self._node = node
-        self._current: _CountedSubscription
-        self._previous: _CountedSubscription | None = None  # until the current one has matched as many
+        self._losses: dict[Any, EventCount] = {}  # by subscription; two while a new one takes over
         self._class: Any = None  # of the messages; None: the subscription does not adapt
         self._profile: QoSProfile
         self._received: set[tuple[int, int]] = set()  # messages, while there are two subscriptions
@@ -72,48 +52,53 @@ class AdaptiveSubscription:
 
     @property
     def subscription(self) -> Any:
-        """The current subscription."""
-        return self._current.subscription
+        """The newest subscription."""
+        return list(self._losses)[-1]
 
     def use(self, subscription: Any, *, adapts: bool) -> None:
         """Use an existing subscription."""
-        self._current = _CountedSubscription(subscription)
         self._class = subscription.msg_type if adapts else None
         self._profile = subscription.qos_profile
+        self._add(subscription)
 
     def subscribe(self, message_class: Any, ends: Sequence[TopicEndpointInfo]) -> None:
         """Create a subscription that matches all these publishers."""
         self._class = message_class
         self._profile = common_qos(ends)
-        self._current = self._create(self.callback)
+        self._create(self.callback)
 
-    def _create(self, callback: Callback) -> _CountedSubscription:
+    def _create(self, callback: Callback) -> None:
         handler: Any = callback  # rclpy detects a second parameter, which its types lack
-        return _CountedSubscription(
-            self._node.create_subscription(
-                self._class,
-                self.name,
-                handler,
-                self._profile,
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-                raw=True,
-            )
+        subscription = self._node.create_subscription(
+            self._class,
+            self.name,
+            handler,
+            self._profile,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            raw=True,
         )
+        self._add(subscription)
+
+    def _add(self, subscription: Any) -> None:
+        event = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST
+        self._losses[subscription] = EventCount(subscription, event)
+
+    def _remove(self, subscription: Any) -> None:
+        self._losses.pop(subscription).close()
+        self._node.destroy_subscription(subscription)
 
     def adapt(self, ends: Sequence[TopicEndpointInfo]) -> None:
         """Match new publishers, too, with a second subscription if they offer less than the first requests.
 
         While there are two subscriptions, each message is handled once.
         """
-        if self._class is None or self._previous is not None:
+        if self._class is None or len(self._losses) > 1:
             return
         profile = common_qos(ends)
-        if not _requests_less(profile, self._profile):
-            return
-        self._profile = profile
-        self._previous = self._current
-        self._previous.subscription.callback = self._once
-        self._current = self._create(self._once)
+        if _requests_less(profile, self._profile):
+            self._profile = profile
+            self.subscription.callback = self._once
+            self._create(self._once)
 
     def _once(self, data: bytes, info: Any) -> None:
         key = (info["publication_sequence_number"], info["source_timestamp"])
@@ -122,30 +107,23 @@ class AdaptiveSubscription:
             self.callback(data, info)
 
     def settle(self) -> None:
-        """Close the previous subscription, once the current one has matched all its publishers."""
-        previous = self._previous
-        if (
-            previous is None
-            or self.subscription.get_publisher_count() < previous.subscription.get_publisher_count()
-        ):
+        """Close the first of two subscriptions, once the second one has matched all its publishers."""
+        if len(self._losses) < 2:
             return
-        for each in self._all:
-            while (taken := each.take()) is not None:
+        first, second = self._losses
+        if second.get_publisher_count() < first.get_publisher_count():
+            return
+        for subscription in self._losses:
+            while (taken := _take(subscription)) is not None:
                 self._once(*taken)
-        self._lost += previous.lost()
-        previous.close()
-        self._node.destroy_subscription(previous.subscription)
-        self._previous = None
-        self.subscription.callback = self.callback
+        self._lost += _count(self._losses[first])
+        self._remove(first)
+        second.callback = self.callback
         self._received.clear()
 
     def lost(self) -> int:
-        """Number of published messages that did not arrive."""
-        return self._lost + sum(each.lost() for each in self._all)
-
-    @property
-    def _all(self) -> list[_CountedSubscription]:
-        return [self._current] if self._previous is None else [self._previous, self._current]
+        """Number of published messages that did not arrive; 0 with a middleware that does not count."""
+        return self._lost + sum(map(_count, self._losses.values()))
 
     def drain(self, until_ns: int, deadline_s: float) -> int:
         """Handle messages that have arrived; returns the number of unhandled ones at the deadline.
@@ -155,20 +133,29 @@ class AdaptiveSubscription:
             deadline_s: on the monotonic clock.
         """
         unhandled = 0
-        for each in self._all:
-            while (taken := each.take()) is not None and taken[1]["source_timestamp"] <= until_ns:
+        for subscription in self._losses:
+            while (taken := _take(subscription)) is not None and taken[1]["source_timestamp"] <= until_ns:
                 if time.monotonic() < deadline_s:
-                    each.subscription.callback(*taken)
+                    subscription.callback(*taken)
                 else:
                     unhandled += 1
         return unhandled
 
     def close(self) -> None:
         """Destroy the subscriptions."""
-        for each in self._all:
-            each.close()
-            self._node.destroy_subscription(each.subscription)
-        self._previous = None
+        for subscription in list(self._losses):
+            self._remove(subscription)
+
+
+def _take(subscription: Any) -> Any:
+    """The next message and its info, or None."""
+    with subscription.handle:
+        return subscription.handle.take_message(subscription.msg_type, True)
+
+
+def _count(losses: EventCount) -> int:
+    count = losses.take()
+    return 0 if count is None else int(count.total_count)
 
 
 def _requests_less(new: QoSProfile, old: QoSProfile) -> bool:

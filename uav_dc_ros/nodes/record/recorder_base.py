@@ -187,12 +187,7 @@ class RecorderBase(MissionNode):
             self._announce(name, topic.type, topic)
 
     def _announce(self, name: str, type: str, topic: Topic | None) -> None:
-        """Add a topic to the bag.
-
-        Raises:
-            BagError: earlier parts of the bag have it with another type; or the disk is full, or gone.
-            LookupError: a nested type is not installed.
-        """
+        """Add a topic to the bag; raises BagError, or LookupError for a nested type that is not installed."""
         from uav_dc_ros.nodes.ros import recorded_qos
 
         ends = [end for end in self.get_publishers_info_by_topic(name) if end.topic_type == type]
@@ -291,22 +286,12 @@ class RecorderBase(MissionNode):
     # The bag.
 
     def _sync(self) -> None:
-        """Write the bag to disk, and check the free space.
-
-        Raises:
-            NodeError: the disk is nearly full.
-            BagError: the disk is full, or gone.
-        """
         assert self.writer is not None, "timers end with the bag"
         self.writer.sync()
         self._check_space(self.writer.folder)
 
     def _check_space(self, folder: Path) -> None:
-        """Stop before the disk is full, since closing the bag needs space.
-
-        Raises:
-            NodeError: less space than `min_free_bytes`.
-        """
+        """Raise NodeError before the disk is full, since closing the bag needs space."""
         existing = next((one for one in (folder, *folder.absolute().parents) if one.exists()), Path("/"))
         free, minimum = shutil.disk_usage(existing).free, self.values["min_free_bytes"]
         if free < minimum:
