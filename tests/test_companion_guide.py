@@ -175,7 +175,7 @@ def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert "The fence is the grid with 20 m around it and above its top layer" in GUIDE
     assert SafetySettings().max_return_attempts == 3
     assert "refuses to return three times" in GUIDE.replace("\n", " ")
-    assert NODES["policy"].restarts == 3
+    assert NODES["policy"].max_restarts == 3
     assert supervisor.RESTART_WINDOW_S == 60
     assert "three times within a minute" in GUIDE
     assert liveliness.MISSED_S + liveliness.CONFIRMED_S < 2.0

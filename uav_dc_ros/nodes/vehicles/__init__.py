@@ -25,34 +25,24 @@ def make(
     system: int | None = None,
     restarted: bool = False,
 ) -> Vehicle:
-    """The vehicle that a bridge's parameters name; not opened yet.
+    """The vehicle that a bridge's parameters name; not opened yet. Call `check` before.
 
     Args:
         node: the bridge.
         values: its parameters.
-        scenario: the vehicle stands below its start, unless there is a datum.
-        datum: of the grid; None: see `scenario`.
-        grid_origin: of the vehicle before the bridge was restarted; empty: not known.
-        system: MAVLink system of the vehicle then, unless the parameter names one; None: not known.
+        scenario: its start is where the vehicle stands when its first position comes (ENU of the grid).
+        datum: of the grid; it replaces the start. Through MAVROS, the start gives the height all the same.
+        grid_origin: `grid_origin` of an earlier bridge in the same flight, which replaces both; empty: none.
+        system: MAVLink system of the vehicle then, unless the parameter names one.
         restarted: whether an earlier bridge was killed, which the ROS graph may still list.
-
-    Raises:
-        VehicleError: the transport is not available on this machine.
-        ParameterError: the parameters contradict each other.
     """
-    east_m, north_m, _ = scenario.mission.start_m
-    start = Enu(east_m, north_m, 0.0)
-    kind, connect = values["vehicle"], values["connect"]
-    check(kind, connect, values["system"], values["arm"])
-    if kind == "mavlink":
-        named = values["system"] or system
-        return MavlinkVehicle(connect, datum=datum, start=start, grid_origin=grid_origin, system=named)
-    if kind == "mavros":
-        arms = values["arm"]
-        return MavrosVehicle(
-            node, start=start, grid_origin=grid_origin, datum=datum, arms=arms, restarted=restarted
-        )
-    return Px4Vehicle(node, start=start, grid_origin=grid_origin, datum=datum, restarted=restarted)
+    start = Enu(*scenario.mission.start_m)._replace(up_m=0.0)
+    grid: dict[str, Any] = {"start": start, "datum": datum, "grid_origin": grid_origin}
+    if values["vehicle"] == "mavlink":
+        return MavlinkVehicle(values["connect"], **grid, system=values["system"] or system)
+    if values["vehicle"] == "mavros":
+        return MavrosVehicle(node, **grid, arms=values["arm"], restarted=restarted)
+    return Px4Vehicle(node, **grid, restarted=restarted)
 
 
 def check(kind: str, connect: str, system: int, arm: bool) -> None:

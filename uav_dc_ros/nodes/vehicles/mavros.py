@@ -67,13 +67,7 @@ class Target(NamedTuple):
 class MavrosVehicle:
     """One vehicle behind MAVROS, see `Vehicle`; its methods are called by the node's executor.
 
-    Args:
-        node: owns the topics; their names are relative, and can be remapped.
-        start: where the vehicle stands when its first position comes, in the grid's ENU frame.
-        grid_origin: `grid_origin` of an earlier process in the same flight.
-        datum: of the grid; it replaces `start`, except for its height.
-        arms: whether the mission arms the vehicle.
-        restarted: whether an earlier bridge was killed, with or without a grid origin.
+    Arguments: see `vehicles.make`. The names of the topics are relative, and can be remapped.
 
     Raises:
         VehicleError: the grid origin is invalid; or the mission arms, and mavros_msgs is not installed.

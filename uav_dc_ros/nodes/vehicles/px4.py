@@ -31,22 +31,12 @@ NOT_CONTROLLED = [math.nan] * 3
 RETURN, LAND, SET_MODE, ARM = 20, 21, 176, 400  # VEHICLE_CMD
 CUSTOM_MODE = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
-SUBSCRIBED = {  # in fmu/out
-    "vehicle_status": "VehicleStatus",
-    "vehicle_local_position": "VehicleLocalPosition",
-    "vehicle_land_detected": "VehicleLandDetected",
-    "battery_status": "BatteryStatus",
-    "failsafe_flags": "FailsafeFlags",
-    "vehicle_command_ack": "VehicleCommandAck",
-    "vehicle_attitude": "VehicleAttitude",
-    "home_position": "HomePosition",
-}
+SUBSCRIBED = (  # in fmu/out
+    *("vehicle_status", "vehicle_local_position", "vehicle_land_detected", "battery_status"),
+    *("failsafe_flags", "vehicle_command_ack", "vehicle_attitude", "home_position"),
+)
 REQUIRED = ("vehicle_status", "vehicle_local_position")  # PX4 1.15 does not send all of the others
-PUBLISHED = {  # in fmu/in
-    "trajectory_setpoint": "TrajectorySetpoint",
-    "offboard_control_mode": "OffboardControlMode",
-    "vehicle_command": "VehicleCommand",
-}
+PUBLISHED = ("trajectory_setpoint", "offboard_control_mode", "vehicle_command")  # in fmu/in
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
 
 
@@ -63,11 +53,16 @@ def load_messages() -> Any:
             f"a vehicle on PX4's topics needs the ROS package px4_msgs ({error}); expected it built from the "
             "branch of PX4's release, and its workspace sourced: https://github.com/PX4/px4_msgs"
         ) from None
-    kinds = (*SUBSCRIBED.values(), *PUBLISHED.values())
+    kinds = map(class_name, (*SUBSCRIBED, *PUBLISHED))
     lacking = [kind for kind in kinds if not hasattr(messages, kind)]
     if lacking:
         raise VehicleError(f"px4_msgs has no {', '.join(lacking)}; expected that of PX4 1.15 or later")
     return messages
+
+
+def class_name(topic: str) -> str:
+    """Name of the message class of a topic: `VehicleStatus` of `vehicle_status`."""
+    return topic.title().replace("_", "")
 
 
 def versioned(name: str, kind: Any) -> str:
@@ -79,12 +74,7 @@ def versioned(name: str, kind: Any) -> str:
 class Px4Vehicle:
     """One vehicle on the topics `fmu/in/...` and `fmu/out/...` of a node's namespace, see `Vehicle`.
 
-    Args:
-        node: owns the topics; the caller spins it.
-        start: where the vehicle stands when its first position comes, in the grid's ENU frame.
-        grid_origin: `grid_origin` of an earlier process in the same flight; replaces `datum`.
-        datum: of the grid, for a PX4 with a global position; None: see `start`.
-        restarted: whether an earlier bridge was killed, with or without a grid origin.
+    Arguments: see `vehicles.make`. The caller spins the node.
 
     Raises:
         VehicleError: px4_msgs is missing, or the grid origin is invalid.
@@ -117,10 +107,8 @@ class Px4Vehicle:
     def open(self) -> None:
         """Create subscriptions and publishers, and start the stream."""
         for name in SUBSCRIBED:
-            callback = partial(self._on_message, name)
-            self._subscriptions.append(
-                self._node.create_subscription(self._class(name), self._topic(name), callback, QOS)
-            )
+            interface = self._class(name), self._topic(name), partial(self._on_message, name), QOS
+            self._subscriptions.append(self._node.create_subscription(*interface))
         for name in PUBLISHED:
             self._publishers[name] = self._node.create_publisher(self._class(name), self._topic(name), QOS)
         topic = self._publishers["trajectory_setpoint"].topic_name
@@ -174,8 +162,9 @@ class Px4Vehicle:
             case SetMode(Mode.RETURN):
                 self._publish_command(RETURN)
             case SetMode(Mode.LAND):  # NaN: at the current position and heading
-                at_here = dict.fromkeys(("param4", "param5", "param6", "param7"), math.nan)
-                self._publish_command(LAND, **at_here)
+                self._publish_command(
+                    LAND, **dict.fromkeys(("param4", "param5", "param6", "param7"), math.nan)
+                )
             case SetMode(mode):
                 main, sub = flight_stacks.PX4.mode_parameters(mode)
                 self._publish_command(SET_MODE, param1=CUSTOM_MODE, param2=main, param3=sub)
@@ -183,7 +172,7 @@ class Px4Vehicle:
                 self._publish_command(ARM, param1=1.0)
 
     def _class(self, name: str) -> Any:
-        return getattr(self._messages, SUBSCRIBED.get(name) or PUBLISHED[name])
+        return getattr(self._messages, class_name(name))
 
     def _topic(self, name: str) -> str:
         return versioned(f"fmu/{'out' if name in SUBSCRIBED else 'in'}/{name}", self._class(name))

@@ -57,22 +57,10 @@ IS_POSSIBLE: dict[str, Callable[[Any], bool]] = {
 
 
 class MavlinkTelemetry:
-    """State of one vehicle.
-
-    Args:
-        datum: of the grid. None: the vehicle stands at `start` when its first position comes.
-        start: in the grid's ENU frame, see `datum`.
-        system: MAVLink system of the vehicle; None: the only autopilot on the link.
-        again: whether this mission already flew the vehicle.
+    """State of one vehicle. Arguments: see `MavlinkVehicle`.
 
     Attributes:
-        systems: the vehicle among those on the link.
-        other_controllers: evidence of another controller.
-        rejections: rejected commands, and status texts.
-        parameters: of the vehicle.
-        discarded: number of the vehicle's messages that were discarded, by reason.
-        datum: of the grid, once it is known.
-        frame: of the vehicle's local position, once it is known.
+        datum, frame: of the grid, and of the vehicle's local position in it; None until known.
         position: of the vehicle, in the grid's ENU frame.
         landed_state: MAV_LANDED_STATE.
         received_s: when a message of each name was received last, steady clock, seconds.

@@ -76,22 +76,14 @@ class VehicleTime:
 
 
 class MavrosTelemetry:
-    """State of one vehicle. Times are of the steady clock, seconds; positions metres.
-
-    Args:
-        start: where the vehicle stands when its first position comes, in the grid's ENU frame.
-        datum: of the grid; with a fix on the ground it replaces `start`, except for its height.
-        grid_origin: `origin` as text, of an earlier process in the same flight; replaces both.
-        has_msgs: whether mavros_msgs is installed.
+    """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`.
 
     Attributes:
+        has_msgs: whether mavros_msgs is installed.
         origin: of MAVROS's local frame (its EKF's origin), in the grid's frame; None: not known yet.
         yaw_rad: of the vehicle, counter-clockwise from the east.
         received_s: when a message came last, by topic.
-        diagnostics: state in MAVROS's diagnostics.
-        rejections: rejected commands, and status texts.
         corner: of the grid on the Earth, its altitude only known from a datum; None: not known yet.
-        discarded: number of messages that were discarded, by reason.
 
     Raises:
         VehicleError: the grid origin is invalid.

@@ -22,14 +22,8 @@ ACCEPTED, IN_PROGRESS = 0, 5  # VEHICLE_CMD_RESULT
 RESULTS = {1: "temporarily rejected", 2: "denied", 3: "unsupported", 4: "failed", 6: "cancelled"}
 ARM = 400
 COMMANDS = {20: "returning", 21: "landing", 176: "the change of mode", ARM: "arming"}  # VEHICLE_CMD
-MODES = {  # by NAVIGATION_STATE
-    14: Mode.COMMANDED,
-    4: Mode.HOLD,
-    5: Mode.RETURN,
-    12: Mode.LAND,  # DESCEND: lands without a position
-    18: Mode.LAND,
-    20: Mode.LAND,
-}
+# By NAVIGATION_STATE; 12 is DESCEND, which lands without a position.
+MODES = {14: Mode.COMMANDED, 4: Mode.HOLD, 5: Mode.RETURN, 12: Mode.LAND, 18: Mode.LAND, 20: Mode.LAND}
 MODE_NAMES = {
     0: "MANUAL",
     1: "ALTCTL",
@@ -51,34 +45,22 @@ MODE_NAMES = {
 }
 ORDERED = {"vehicle_status", "vehicle_local_position", "vehicle_land_detected", "vehicle_attitude"}
 REASONS = (  # of failsafe_flags: what keeps PX4 from OFFBOARD, or from arming
-    "angular_velocity_invalid",
-    "attitude_invalid",
-    "local_position_invalid",
-    "global_position_invalid",
-    "home_position_invalid",
-    "offboard_control_signal_lost",
-    "battery_unhealthy",
+    *("angular_velocity_invalid", "attitude_invalid", "local_position_invalid", "global_position_invalid"),
+    *("home_position_invalid", "offboard_control_signal_lost", "battery_unhealthy"),
 )
 
 
 class Px4Telemetry:
-    """State of one vehicle. Times are of the steady clock, seconds.
-
-    Args:
-        start: where the vehicle stands when its first position comes, in the grid's ENU frame.
-        grid_origin: `grid_origin` of an earlier process in the same flight; replaces `datum`.
-        datum: of the grid; None: see `start`.
-
-    Raises:
-        VehicleError: the grid origin is invalid.
+    """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`.
 
     Attributes:
-        datum: of the grid, once it is known.
-        frame: of PX4's local position, once it is known.
+        datum, frame: of the grid, and of PX4's local position in it; None until known.
         status: the last VehicleStatus; None: none came yet.
         position_s: when the last position came that PX4 trusts.
         vehicle_s: the vehicle's own time, seconds.
-        discarded: number of messages that were discarded, by reason.
+
+    Raises:
+        VehicleError: the grid origin is invalid.
     """
 
     def __init__(self, *, start: Enu, grid_origin: str = "", datum: Geodetic | None = None) -> None:
@@ -98,7 +80,7 @@ class Px4Telemetry:
         self._estimate_s: float | None = None
         self._status_s: float | None = None
         self._landed: bool | None = None
-        self._batteries: dict[int, tuple[float, float, bool]] = {}  # by number: charge, volts, failing
+        self._batteries: dict[int, tuple[float, float, bool]] = {}  # charge, volts, failing
         self._tilt_rad: float | None = None
         self._home: Ned | None = None
         self._orders = {name: StampOrder() for name in ORDERED}
@@ -151,12 +133,8 @@ class Px4Telemetry:
 
     def update(self, topic: str, message: Any, now_s: float) -> None:
         """Process a message, unless it is another vehicle's or out of order."""
-        why = None
-        if (
-            topic == "vehicle_status"
-            and self.status is not None
-            and message.system_id != self.status.system_id
-        ):
+        why, status = None, self.status
+        if topic == "vehicle_status" and status is not None and message.system_id != status.system_id:
             why = "of another system"
         elif (order := self._orders.get(topic)) is not None:
             why = order.refusal(message.timestamp / 1e6, now_s)
