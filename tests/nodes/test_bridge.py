@@ -312,7 +312,7 @@ def test_a_journal_that_cannot_be_written_stops_no_flight(ros: Ros, low: tuple[o
         shutil.rmtree(folder)
         status, output = finish(process)
     assert status == 0, output
-    assert output.count("a bridge that is killed now will not know where it was: journal") == 1
+    assert output.count("a bridge that is restarted now cannot resume the mission: journal") == 1
     check_steps(ros.folder / "bag")
 
 

@@ -120,7 +120,7 @@ def test_the_vehicle_is_seen_obeying_while_the_bridge_stops(made: Made) -> None:
     node, vehicle = made.node, made.vehicle
     vehicle.datum = DATUM
     activate(made)
-    made.until(lambda: node._begun)
+    made.until(lambda: node._started)
     node.bridge.phase = Phase.READY
     publisher = node.create_publisher(String, "mode", 1)
 
@@ -131,15 +131,15 @@ def test_the_vehicle_is_seen_obeying_while_the_bridge_stops(made: Made) -> None:
     made.until(lambda: publisher.get_subscription_count() == 1)
     made.vehicle.send_command = lambda command: publisher.publish(String(data=command.mode))  # type: ignore[method-assign]
     node.trigger_deactivate()
-    assert node._known.mode is Mode.RETURN
-    assert node.bridge.can_be_released(node._known)
+    assert node._telemetry.mode is Mode.RETURN
+    assert node.bridge.can_be_released(node._telemetry)
     assert vehicle.closed == 1
 
 
 @pytest.mark.parametrize("broken", ["", "telemetry"])
 def test_what_was_opened_is_closed_once(made: Made, broken: str) -> None:
     activate(made)
-    made.until(lambda: made.node._begun)
+    made.until(lambda: made.node._started)
     made.vehicle.broken = broken
     made.node.trigger_deactivate()
     assert (made.node.state, made.vehicle.opened, made.vehicle.closed) == ("inactive", 1, 1)
@@ -185,7 +185,7 @@ def test_who_else_is_there_and_what_was_ignored_is_in_the_diagnostics(made: Made
 def test_where_the_grid_lies_is_logged_and_kept_when_the_vehicle_takes_off(made: Made) -> None:
     activate(made)
     made.vehicle.known = Telemetry()
-    made.until(lambda: made.node._begun)
+    made.until(lambda: made.node._started)
     assert made.values["grid"] == ""
     made.vehicle.datum = DATUM
     made.until(lambda: made.values["grid"] == str(DATUM))
@@ -214,10 +214,10 @@ def test_the_journal_keeps_which_vehicle_flies(
     node.trigger_configure()
     node.journal = Journal(str(tmp_path / "journal"))
     node.trigger_activate()
-    made.until(lambda: node._begun)
+    made.until(lambda: node._started)
     node.bridge.phase = Phase.READY if flies else Phase.PREFLIGHT
     node._on_change()
-    node._open.close()  # it is killed
+    node._until_inactive.close()  # it is killed
     node.bridge.phase = Phase.ABORTED
     node.trigger_deactivate()
     node.trigger_activate()
@@ -241,10 +241,10 @@ def test_a_bridge_that_was_killed_before_it_knew_where_the_grid_lies_goes_by_the
     node.trigger_configure()
     node.journal, node.values["datum"] = Journal(str(tmp_path / "journal")), str(DATUM)
     node.trigger_activate()
-    made.until(lambda: node._begun)
+    made.until(lambda: node._started)
     assert made.values["phase"] == "connecting"
     for _ in range(2):
-        node._open.close()  # it is killed
+        node._until_inactive.close()  # it is killed
         node.bridge.phase = Phase.ABORTED
         node.trigger_deactivate()
         node.trigger_activate()
@@ -277,9 +277,9 @@ def test_a_position_that_cannot_be_true_is_not_published(made: Made, monkeypatch
 def test_steps_that_were_not_reached_are_told(made: Made) -> None:
     activate(made)
     made.node.bridge.progress.steps_not_reached = 3
-    made.node._tell()
-    assert isinstance(made.node._told, messages.Mission)
-    assert made.node._told.steps_not_reached == 3
+    made.node._publish_mission()
+    assert isinstance(made.node._status, messages.Mission)
+    assert made.node._status.steps_not_reached == 3
 
 
 def open_files() -> set[str]:
