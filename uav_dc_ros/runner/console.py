@@ -21,12 +21,7 @@ PLAIN_LINES = 6  # per mission, without a terminal
 
 
 class MissionConsole(LiveDisplay):
-    """Shows running missions.
-
-    Args:
-        missions: number of missions in the run.
-        show: whether anything is printed.
-    """
+    """Shows the missions of a run; prints nothing if not `show`."""
 
     def __init__(self, scenario: Scenario, missions: int, *, show: bool = True) -> None:
         super().__init__(

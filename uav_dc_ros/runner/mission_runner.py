@@ -61,17 +61,14 @@ class Network:
 
 
 class MissionRunner:
-    """A run of missions.
-
-    Args:
-        show: whether progress and summary are printed.
+    """A run of missions; prints progress and summary if `show`.
 
     Raises:
         UavDcError: the run cannot be flown; nothing was started or written.
 
     Attributes:
-        summaries: one for each mission that is over.
-        errors: messages.
+        summaries: of the missions that are over.
+        errors: printed messages.
         interrupted: whether `interrupt` was called.
     """
 

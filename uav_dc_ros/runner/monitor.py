@@ -33,8 +33,7 @@ class MonitoredMission(MissionTotals):
 
     Attributes:
         index: of the mission in its run.
-        cell: of the UAV.
-        rates: of the last step.
+        cell, rates: of the last step.
         distance_m: length of the path from cell to cell, metres.
         sum_of_sum_rates_bps: sum over the measured steps, bit/s.
         unmeasured_steps: number of flown steps without rates.
@@ -79,10 +78,6 @@ class MissionMonitor(MissionNode):
         run: identity of the run; empty: that of the vehicle, which is started elsewhere.
         peers: nodes of the mission.
         local_nodes: those that this run_all starts; they publish only after `is_alone`.
-        on_status: called with each message on `mission`.
-        on_step: called after each step.
-        on_end: called at the end of each mission.
-        on_note: called with notes for the user.
 
     Attributes:
         is_alone: whether this mission may begin: no other one was found for long enough.

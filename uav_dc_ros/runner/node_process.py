@@ -29,7 +29,6 @@ class NodeProcess:
 
     Args:
         parameters: ROS parameters by node name.
-        namespace: of the nodes and their clock.
         restarts: number of earlier processes of these nodes.
         folder: for the parameter file.
         on_line: called from a thread with the name of the process and each line of its output.

@@ -72,13 +72,11 @@ class Supervisor:
     """The nodes of a mission on this host; a context manager that stops all processes.
 
     Args:
-        namespace: of the mission.
         parameters: ROS parameters by node name.
         composed: names of nodes that share a process. After its end each gets its own, which isolates a
             faulty node.
         folder: for parameter files.
-        on_line: called from threads with each line that a process prints.
-        on_note: called with notes for the user.
+        on_line: called from threads with the name of a process and a line of its output.
 
     Attributes:
         brought_up: whether all nodes have been active at once.

@@ -43,15 +43,7 @@ class PlaybackDisplay(LiveDisplay):
         self._lines = 0
 
     def progress(self, state: str, position_s: float, rate: float, messages: int, idle_s: float) -> None:
-        """Show the progress.
-
-        Args:
-            state: waiting, paused or playing.
-            position_s: seconds from the bag's beginning.
-            rate: seconds of the bag per second.
-            messages: number published.
-            idle_s: time until the next message.
-        """
+        """Show the position, seconds from the bag's beginning; `idle_s`: time until the next message."""
         text = f"{position_s:.1f}/{self._end_s:.1f} s, rate {rate_text(rate)}, {messages} messages"
         done_s = position_s - self._begin_s
         if self._bar.disable:

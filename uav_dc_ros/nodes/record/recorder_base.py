@@ -34,7 +34,6 @@ class RecorderBase(MissionNode):
     """Records the topics of its row, and other topics that it discovers.
 
     Attributes:
-        writer: the bag; None without one.
         delays_new_topics: whether a topic is recorded only from the second scan on that finds it.
         selected: full names of the topics to record; empty: all in the node's namespace.
     """
@@ -166,7 +165,7 @@ class RecorderBase(MissionNode):
             return lambda data, info: None  # the peers of a mission wait for the subscription
         already_ns = writer.already_written.get(name, -1)
         label = name if topic is None else topic.name
-        heard, write, announced = self.statistics.count_received, writer.write, self._announced
+        count, write, announced = self.statistics.count_received, writer.write, self._announced
 
         def handle(data: bytes, info: Any) -> None:
             if topic is not None:
@@ -177,7 +176,7 @@ class RecorderBase(MissionNode):
             published_ns, received_ns = info["source_timestamp"], info["received_timestamp"]
             if published_ns > already_ns:
                 write(name, data, log_time_ns=received_ns, publish_time_ns=published_ns)
-            heard(label, info)
+            count(label, info)
 
         return handle
 

@@ -44,7 +44,6 @@ class FoxgloveServer:
 
     Args:
         name: shown by clients.
-        address: network address to listen on.
         port: TCP port; 0: any free one.
         topics: rows of the topics, by full name.
 
@@ -86,13 +85,7 @@ class FoxgloveServer:
         return self._server.port
 
     def send(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Send a message to the subscribers of its topic.
-
-        Args:
-            topic: full name.
-            data: the message, CDR.
-            time_ns: time of receipt, nanoseconds since the epoch.
-        """
+        """Send a CDR message to the subscribers of its topic (full name); `time_ns`: time of receipt."""
         channel = self._channels[topic]
         if not self._topics[topic].latched:
             if channel.has_sinks():
