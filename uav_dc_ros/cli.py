@@ -283,11 +283,9 @@ class LiveDisplay:
         )
 
     def __enter__(self) -> Self:
-        """Start the bar."""
         self._bar.start()
         return self
 
-    def __exit__(self, *error: object) -> None:
-        """Restore the terminal, and wait until everything is written."""
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
         self._output.drain()

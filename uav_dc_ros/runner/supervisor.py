@@ -99,15 +99,13 @@ class Supervisor:
         self._checked_s = time.monotonic()
 
     def __enter__(self) -> Self:
-        """Start the processes."""
         composed = [node for node in self.nodes if node.row.name in self._composed]
         for nodes in (composed, *([node] for node in self.nodes if node not in composed)):
             if nodes:
                 self._start(nodes)
         return self
 
-    def __exit__(self, *error: object) -> None:
-        """Stop all processes."""
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     @property

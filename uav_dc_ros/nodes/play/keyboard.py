@@ -42,7 +42,6 @@ class Keyboard:
         self._partial = ""  # start of an escape sequence
 
     def __enter__(self) -> Self:
-        """Switch the terminal to single keys."""
         try:
             self._fd = sys.stdin.fileno()
             # The terminal stops background processes that change its settings.
@@ -55,8 +54,7 @@ class Keyboard:
             self._activate()
         return self
 
-    def __exit__(self, *error: object) -> None:
-        """Restore the terminal."""
+    def __exit__(self, *_: object) -> None:
         if self._settings:
             signal.signal(signal.SIGTSTP, signal.SIG_DFL)
             self._restore()

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uav_dc_ros import __version__
+from uav_dc_ros import __version__, cli
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.agents.policy import CONFIG, Policy
 from uav_dc_ros.bags.read import BagReader
@@ -54,19 +54,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--policy-dir", type=Path, metavar="DIR", help="folder of the policy that flew, or of policies")
     add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the mission, for a bag with several")
-    tolerance = "relative, of numbers; 0: to the last bit"
-    add("--tolerance", type=_tolerance, default=0.0, metavar="X", help=tolerance)
+    tolerance = cli.number(0.0, 1e-3, "a number from 0 to 0.001")
+    what = "relative, of numbers; 0: to the last bit"
+    add("--tolerance", type=tolerance, default=0.0, metavar="X", help=what)
     add("--complete", action="store_true", help="exit status 1 also for what could not be recomputed")
-
-
-def _tolerance(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value <= 1e-3:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected a number from 0 to 0.001")
-    return value
 
 
 def run(options: argparse.Namespace) -> int:
