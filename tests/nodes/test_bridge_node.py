@@ -268,7 +268,7 @@ def test_a_position_that_cannot_be_true_is_not_published(made: Made, monkeypatch
     monkeypatch.setattr(made.node, "publish", note)
     made.until(lambda: len(said) > 3)
     made.vehicle.known = replace(FLIES, position=Enu(400.0, 0.0, 100.0))
-    made.until(lambda: made.node.bridge.discarded.get("impossible position", 0) > 3)
+    made.until(lambda: made.node.bridge.detector.discarded.get("impossible position", 0) > 3)
     made.vehicle.known = replace(FLIES, position=Enu(1.0, 0.0, 100.0))
     made.until(lambda: said[-1] == 1.0)
     assert set(said) == {0.0, 1.0}

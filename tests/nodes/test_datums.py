@@ -36,7 +36,7 @@ def test_a_datum_with_a_minus_is_a_value() -> None:
     check("--datum", "-35.36,149.16,584", "--arm")
 
 
-def test_who_arms_says_where_the_grid_lies() -> None:
+def test_arming_requires_a_datum() -> None:
     expected = r"arm: without a datum; expected one with it: here \(.*\), last \(.*\) or LAT,LON,ALT"
     with pytest.raises(ParameterError, match=f"{expected}$"):
         check("--arm")
@@ -69,21 +69,21 @@ def test_a_flight_through_mavros_has_no_altitude_for_the_others() -> None:
 
 
 def test_a_grid_that_moves_is_seen() -> None:
-    told, moved = datums.describe(DATUM, "here", FIVE)
-    assert (moved, told) == (
+    text, moved = datums.describe(DATUM, "here", FIVE)
+    assert (moved, text) == (
         False,
         f"the grid's corner lies at {DATUM}, from the vehicle's position; no earlier flight in this world",
     )
     datums.save(FIVE, DATUM, "mavlink")
-    told, moved = datums.describe(DATUM.at(Enu(200.0, -200.0, 0.0)), "here", FIVE)
+    text, moved = datums.describe(DATUM.at(Enu(200.0, -200.0, 0.0)), "here", FIVE)
     assert moved
-    assert re.search(r"; 200\.0 m east and 200\.0 m south of that of the last flight \(20", told)
-    told, moved = datums.describe(DATUM, "last", FIVE)
+    assert re.search(r"; 200\.0 m east and 200\.0 m south of that of the last flight \(20", text)
+    text, moved = datums.describe(DATUM, "last", FIVE)
     assert not moved
-    assert ", as in the last flight; 0.0 m east and 0.0 m north of that" in told
+    assert ", as in the last flight; 0.0 m east and 0.0 m north of that" in text
 
 
-def test_a_broken_file_is_told_and_stops_nobody_who_names_the_place(state: Path) -> None:
+def test_a_broken_file_is_an_error_only_where_it_is_needed(state: Path) -> None:
     datums.save(FIVE, DATUM, "mavlink")
     (file,) = state.rglob("*.json")
     for broken in (b"", b"{}", b'{"scenario": "x", "datum": "x", "vehicle": "x", "time": "x"}', b"\xff"):

@@ -40,31 +40,31 @@ def test_a_whole_mission_from_the_ground_to_the_dock() -> None:
     assert not flight.vehicle.armed
 
 
-def test_without_arm_it_waits_for_a_pilot_and_asks_for_nothing() -> None:
+def test_without_arm_it_waits_for_a_pilot_and_requests_nothing() -> None:
     flight = Flight(SafetySettings())
     flight.run(100.0)
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
     assert flight.bridge.phase is Phase.PREFLIGHT
     flight.vehicle.mode, flight.vehicle.armed = Mode.COMMANDED, True
     flight.until(Phase.LANDED)
     assert not any(
-        isinstance(command, Arm) or command == SetMode(Mode.COMMANDED) for command in flight.vehicle.asked
+        isinstance(command, Arm) or command == SetMode(Mode.COMMANDED) for command in flight.vehicle.commands
     )
 
 
-def test_a_vehicle_whose_motors_need_their_time_is_not_told_to_take_off_anew() -> None:
+def test_a_vehicle_whose_motors_need_their_time_gets_no_second_take_off_command() -> None:
     flight = Flight()
     flight.until(Phase.TAKEOFF)
-    flight.vehicle.deaf = True  # it has heard, and is still on the ground
+    flight.vehicle.ignores_commands = True  # it has received the command, and is still on the ground
     flight.run(2.5)
-    assert sum(isinstance(command, TakeOff) for command in flight.vehicle.asked) == 1
+    assert sum(isinstance(command, TakeOff) for command in flight.vehicle.commands) == 1
     flight.run(1.0)
-    assert sum(isinstance(command, TakeOff) for command in flight.vehicle.asked) == 2
+    assert sum(isinstance(command, TakeOff) for command in flight.vehicle.commands) == 2
 
 
 def test_a_pilot_who_takes_over_has_it_at_once_and_for_good() -> None:
     flight = fly_to_step(5)
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.vehicle.mode = Mode.OTHER
     flight.run(0.2)
     assert flight.bridge.phase is Phase.ABORTED
@@ -72,14 +72,14 @@ def test_a_pilot_who_takes_over_has_it_at_once_and_for_good() -> None:
     flight.vehicle.mode = Mode.COMMANDED
     flight.run(60.0)
     assert flight.bridge.setpoint is None
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
 
 
 @pytest.mark.parametrize("mode", [Mode.RETURN, Mode.LAND])
 def test_a_failsafe_is_watched_down_and_not_meddled_with(mode: Mode) -> None:
     flight = fly_to_step(5)
-    flight.vehicle.asked.clear()
-    flight.vehicle.mode, flight.vehicle.said = mode, "GCS Failsafe"
+    flight.vehicle.commands.clear()
+    flight.vehicle.mode, flight.vehicle.status_text = mode, "GCS Failsafe"
     flight.run(0.2)
     assert flight.bridge.phase is Phase.LANDING
     assert flight.bridge.setpoint is None
@@ -87,7 +87,7 @@ def test_a_failsafe_is_watched_down_and_not_meddled_with(mode: Mode) -> None:
         "changed by a pilot or by the autopilot's failsafe (autopilot: GCS Failsafe)" in flight.bridge.reason
     )
     flight.until(Phase.ABORTED, 600.0)
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
     assert not flight.vehicle.armed
 
 
@@ -97,30 +97,30 @@ def test_a_pilot_may_take_over_a_vehicle_that_comes_down(mode: Mode) -> None:
     flight.vehicle.battery = 0.1
     flight.run(1.0)
     assert flight.vehicle.mode is Mode.RETURN
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.vehicle.mode = mode
     flight.run(60.0)
     assert flight.bridge.phase is Phase.ABORTED
     assert "changed by a pilot" in flight.bridge.reason
     assert "after: battery 10%" in flight.bridge.reason
-    assert (flight.vehicle.asked, flight.vehicle.mode) == ([], mode)
+    assert (flight.vehicle.commands, flight.vehicle.mode) == ([], mode)
 
 
 def test_a_pilot_may_choose_another_way_down() -> None:
     flight = fly_to_step(5, SafetySettings(arm=True, failsafe_action=Mode.LAND))
     flight.vehicle.battery = 0.1
     flight.run(1.0)
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.vehicle.mode = Mode.RETURN
     flight.until(Phase.ABORTED, 600.0)
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
 
 
-def test_who_disarmed_it_is_told_with_what_the_autopilot_says() -> None:
+def test_a_disarmed_vehicle_is_reported_with_the_status_text() -> None:
     flight = Flight()
     flight.until(Phase.TAKEOFF)
     flight.vehicle.armed, flight.vehicle.mode = False, Mode.COMMANDED
-    flight.vehicle.said = "Disarming motors"
+    flight.vehicle.status_text = "Disarming motors"
     flight.run(0.2)
     reason = (
         "disarmed by a pilot or by the autopilot itself in the phase takeoff (autopilot: Disarming motors)"
@@ -133,7 +133,7 @@ def test_a_policy_has_its_time_on_the_clock_that_it_lives_by() -> None:
     flight = fly_to_step(3)
     flight.policy = None
     flight.until(Phase.READY)
-    bridge, known = flight.bridge, flight.vehicle.told
+    bridge, known = flight.bridge, flight.vehicle.telemetry
     for tick in range(1, 90):
         now_s = flight.vehicle.now_s + tick / 20
         ahead = dataclasses.replace(
@@ -159,39 +159,39 @@ def test_a_fault_that_stays_brings_it_down(fault: dict[str, object], why: str, t
         setattr(flight.vehicle, name, value)
     flight.until(Phase.ABORTED, 600.0)
     assert why in flight.bridge.reason
-    # Who does not know where it is cannot return.
-    assert flight.vehicle.asked[-1] == SetMode(then if flight.vehicle.estimate_ok else Mode.LAND)
+    # A vehicle without an estimate cannot return.
+    assert flight.vehicle.commands[-1] == SetMode(then if flight.vehicle.estimate_ok else Mode.LAND)
     assert not flight.vehicle.armed
 
 
-def test_a_vehicle_that_refuses_to_return_is_told_to_land() -> None:
+def test_land_is_requested_from_a_vehicle_that_refuses_to_return() -> None:
     flight = fly_to_step(5)
     flight.vehicle.battery, flight.vehicle.refused = 0.1, (Mode.RETURN,)
     flight.until(Phase.ABORTED, 600.0)
-    asked = [command for command in flight.vehicle.asked if isinstance(command, SetMode)]
+    sent = [command for command in flight.vehicle.commands if isinstance(command, SetMode)]
     tries = flight.bridge.settings.max_return_attempts
-    assert asked[1:] == [SetMode(Mode.RETURN)] * tries + [SetMode(Mode.LAND)]
+    assert sent[1:] == [SetMode(Mode.RETURN)] * tries + [SetMode(Mode.LAND)]
     assert "return not executed" in flight.bridge.reason
 
 
 def test_until_it_obeys_a_vehicle_that_is_to_land_is_held() -> None:
     flight = fly_to_step(5)
-    flight.vehicle.battery, flight.vehicle.deaf = 0.1, True
+    flight.vehicle.battery, flight.vehicle.ignores_commands = 0.1, True
     before = flight.bridge.setpoint
     flight.run(60.0)
     assert flight.bridge.phase is Phase.LANDING
     assert flight.bridge.setpoint == before, "an autopilot may do anything when the stream ends"
-    flight.vehicle.deaf = False
+    flight.vehicle.ignores_commands = False
     flight.until(Phase.ABORTED, 600.0)
 
 
-def test_a_vehicle_that_is_never_heard_of_again_ends_the_mission_without_a_wish() -> None:
+def test_a_link_that_never_comes_back_ends_the_mission_without_a_request() -> None:
     flight = fly_to_step(5)
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.vehicle.silent = True
     flight.until(Phase.ABORTED, 400.0)
     assert "no heartbeat for 300 s" in flight.bridge.reason
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
 
 
 @pytest.mark.parametrize("metres", [30.0, 300.0, 5000.0])  # the last one lies outside the fence
@@ -200,7 +200,7 @@ def test_a_jump_is_ignored_then_held_through_then_ends_the_mission(metres: float
     flight.vehicle.offset = (0.0, metres, 0.0)
     flight.run(0.4)
     assert flight.bridge.fault is None
-    assert flight.bridge.discarded["impossible position"] > 0
+    assert flight.bridge.detector.discarded["impossible position"] > 0
     flight.run(0.4)
     assert "the position jumped by" in str(flight.bridge.fault)
     flight.vehicle.offset = (0.0, 0.0, 0.0)
@@ -216,11 +216,11 @@ def test_a_pilot_who_flies_already_is_left_alone() -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, 150.0), mode=Mode.OTHER, armed=True)
     flight = Flight(vehicle=vehicle)
     flight.run(120.0)
-    assert vehicle.asked == []
+    assert vehicle.commands == []
     assert "a pilot flies" in flight.bridge.reason
 
 
-def test_nobody_takes_off_with_a_low_battery() -> None:
+def test_no_take_off_with_a_low_battery() -> None:
     flight = Flight(vehicle=Vehicle(position=Enu(START.east_m, START.north_m, 0.0), battery=0.1))
     flight.run(60.0)
     assert not flight.vehicle.armed
@@ -276,7 +276,7 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
     while vehicle.now_s < at_s and not first.bridge.is_over:
         first.tick(0.2)
     before = first.bridge.phase
-    standing = msgspec.json.decode(msgspec.json.encode(first.bridge.checkpoint), type=Checkpoint)
+    checkpoint = msgspec.json.decode(msgspec.json.encode(first.bridge.checkpoint), type=Checkpoint)
     setpoint = first.bridge.setpoint
     flew = vehicle.armed and not vehicle.on_ground
     if flew and pilot:
@@ -286,17 +286,17 @@ def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bo
     vehicle.pass_time(0.1, setpoint)
     for _ in range(round(gone_s)):
         vehicle.pass_time(1.0, setpoint)  # it goes on to its last setpoint
-    asked = len(vehicle.asked)
-    second = Flight(ARMING, vehicle, checkpoint=standing)
+    n_sent = len(vehicle.commands)
+    second = Flight(ARMING, vehicle, checkpoint=checkpoint)
     while not second.bridge.is_over and vehicle.now_s < 4000.0:
         second.tick(0.2)
     assert second.bridge.is_over, second.log[-3:]
     flown = first.executed + second.executed
     assert flown == sorted(set(flown)), "no step twice"
     if flew:
-        assert Arm() not in vehicle.asked[asked:], "never armed a second time"
+        assert Arm() not in vehicle.commands[n_sent:], "never armed a second time"
         if pilot:
-            assert not vehicle.asked[asked:], "never a fight with the pilot"
+            assert not vehicle.commands[n_sent:], "never a fight with the pilot"
             assert second.bridge.phase is Phase.ABORTED
         elif not falls and before in (Phase.TAKEOFF, Phase.READY, Phase.MOVING):
             assert second.bridge.phase is Phase.LANDED, second.log[-3:]
@@ -309,7 +309,7 @@ def test_a_bridge_that_comes_back_to_a_vehicle_outside_the_fence_brings_it_home(
     flight.until(Phase.ABORTED)
     assert flight.executed == []
     assert flight.bridge.reason.startswith("outside the fence when the bridge restarted: 2000.0 m east")
-    assert SetMode(Mode.RETURN) in vehicle.asked
+    assert SetMode(Mode.RETURN) in vehicle.commands
 
 
 def test_a_bridge_that_comes_back_knows_its_battery() -> None:
@@ -330,15 +330,15 @@ def test_a_vehicle_that_flies_already_lands_where_that_is_wanted() -> None:
 
 
 @pytest.mark.parametrize("mode", [Mode.RETURN, Mode.OTHER])
-def test_a_vehicle_that_somebody_else_flew_is_not_armed_again(mode: Mode) -> None:
-    """One that returns, say, while a bridge is started anew: it must not take off again by itself."""
+def test_a_vehicle_that_another_pilot_flew_is_not_armed_again(mode: Mode) -> None:
+    """One that returns while a bridge is restarted, for example: it must not take off again by itself."""
     vehicle = Vehicle(position=Enu(300.0, 300.0, 50.0), mode=mode, armed=True)
     flight = Flight(ARMING, vehicle)
     flight.run(20.0)
     vehicle.mode = Mode.LAND
     flight.run(60.0)
     assert not vehicle.armed
-    assert vehicle.asked == []
+    assert vehicle.commands == []
     assert flight.bridge.reason == "a pilot had control: waiting for a pilot to set the mode and arm"
     vehicle.mode, vehicle.armed = Mode.COMMANDED, True
     flight.until(Phase.LANDED)
@@ -355,7 +355,7 @@ def test_moves_out_of_turn_change_nothing() -> None:
 
 
 FAULTS = st.sampled_from(
-    ["frozen", "silent", "deaf", "estimate", "battery", "pilot", "disarmed", "blown", "policy"]
+    ["frozen", "silent", "ignores_commands", "estimate", "battery", "pilot", "disarmed", "blown", "policy"]
 )
 
 
@@ -368,7 +368,7 @@ def test_whatever_goes_wrong_has_an_end(fault: str, at_s: float, lasts_s: float)
     while not flight.bridge.is_over and vehicle.now_s < 4000.0:
         if at_s <= vehicle.now_s < at_s + lasts_s:
             match fault:
-                case "frozen" | "silent" | "deaf":
+                case "frozen" | "silent" | "ignores_commands":
                     setattr(vehicle, fault, True)
                 case "estimate":
                     vehicle.estimate_ok = False
@@ -383,7 +383,7 @@ def test_whatever_goes_wrong_has_an_end(fault: str, at_s: float, lasts_s: float)
                 case "policy":
                     flight.policy = None
         elif vehicle.now_s >= at_s + lasts_s and not healed:
-            vehicle.frozen = vehicle.silent = vehicle.deaf = False
+            vehicle.frozen = vehicle.silent = vehicle.ignores_commands = False
             vehicle.estimate_ok, flight.policy, healed = True, way_home, True
             vehicle.battery = 1.0  # on the ground, it waits for a full one
         flight.tick(0.2)

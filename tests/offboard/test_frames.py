@@ -92,6 +92,6 @@ def test_a_kilometre_of_the_grid_is_one_on_the_earth_in_arducopter_s_metres(
     "text",
     ["", "1,2", "1,2,3,4", "a,b,c", "nan,1,2", "1,2,nan", "90.1,0,0", "0,-180.1,0", "1,2,inf", "1,2,1e5"],
 )
-def test_what_is_no_datum_is_told(text: str) -> None:
+def test_what_is_no_datum_is_an_error(text: str) -> None:
     with pytest.raises(VehicleError, match=r"^datum: .*; expected LATITUDE,LONGITUDE,ALTITUDE"):
         Geodetic.parse(text)

@@ -23,7 +23,7 @@ STEP_S = SCENARIO.mission.step_s
 
 
 def test_who_lands_away_from_the_dock_has_not_landed() -> None:
-    """Blown away from it on the way down, say."""
+    """Blown away from it during the landing, for example."""
     flight = Flight()
     flight.until(Phase.LANDING)
     flight.vehicle.wind_mps = (0.5, 0.0)
@@ -47,7 +47,7 @@ def test_a_circle_that_the_autopilot_keeps_in_silence_is_noticed() -> None:
     flight.until(Phase.ABORTED)
 
 
-def test_what_comes_after_the_heartbeat_that_tells_of_disarming_is_waited_for() -> None:
+def test_messages_after_the_heartbeat_that_reports_disarming_are_waited_for() -> None:
     flight = Flight()
     flight.until(Phase.LANDING)
     while flight.vehicle.position.up_m > 2.0:
@@ -59,7 +59,7 @@ def test_what_comes_after_the_heartbeat_that_tells_of_disarming_is_waited_for() 
     assert flight.bridge.phase is Phase.LANDING
     flight.vehicle.frozen = False
     flight.vehicle.pass_time(0.1, None)
-    flight.tick(known=dataclasses.replace(flight.vehicle.told, on_ground=False))
+    flight.tick(known=dataclasses.replace(flight.vehicle.telemetry, on_ground=False))
     assert flight.bridge.phase is Phase.LANDING
     flight.until(Phase.LANDED, 1.0)
 
@@ -75,10 +75,10 @@ def test_a_landing_without_a_position_is_none() -> None:
 def test_a_bridge_that_was_killed_while_it_landed_judges_where_the_vehicle_stands() -> None:
     flight = Flight()
     flight.until(Phase.LANDING)
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
+    checkpoint = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
     for off_m, phase in ((0.0, Phase.LANDED), (40.0, Phase.ABORTED)):
         place = Enu(SCENARIO.mission.dock_m[0] - off_m, SCENARIO.mission.dock_m[1], 0.0)
-        again = Flight(ARMING, Vehicle(position=place, mode=Mode.LAND), checkpoint=standing)
+        again = Flight(ARMING, Vehicle(position=place, mode=Mode.LAND), checkpoint=checkpoint)
         again.until(phase, 10.0)
 
 
@@ -101,7 +101,7 @@ def test_a_field_that_the_autopilot_s_fence_does_not_hold_is_refused(
     flight.run(5.0)
     assert flight.bridge.phase is Phase.ABORTED
     assert [word for word in words if word not in flight.bridge.reason] == []
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
 
 
 def test_home_counts_where_the_vehicle_stands_now_and_where_it_was_armed() -> None:
@@ -113,7 +113,7 @@ def test_home_counts_where_the_vehicle_stands_now_and_where_it_was_armed() -> No
     flight.vehicle.mode, flight.vehicle.armed = Mode.COMMANDED, True
     flight.vehicle.home = Enu(5000.0, 0.0, 0.0)
     flight.until(Phase.ABORTED)
-    assert flight.vehicle.asked == [SetMode(Mode.LAND)]
+    assert flight.vehicle.commands == [SetMode(Mode.LAND)]
     assert "1420 m from home" in flight.bridge.reason
 
 
@@ -124,7 +124,7 @@ def test_limits_that_fit_or_are_not_reported_are_no_reason_not_to_fly(limits: Li
     assert flight.bridge.warnings == []
 
 
-def test_steps_that_the_vehicle_s_speeds_do_not_allow_are_told_before_take_off() -> None:
+def test_steps_that_the_vehicle_s_speeds_do_not_allow_are_reported_before_take_off() -> None:
     limits = Limits(speed_mps=10.0, climb_mps=2.5, descent_mps=1.5, polygon_fence=True)
     flight = Flight(vehicle=Vehicle(position=GROUND, limits=limits))
     flight.until(Phase.TAKEOFF)
@@ -243,14 +243,14 @@ def test_a_vehicle_that_stands_where_it_should_fly_ends_the_mission_at_once() ->
     assert flight.bridge.reason.startswith("on the ground while it should fly")
 
 
-def test_who_has_come_down_again_after_take_off_is_not_told_to_take_off_anew() -> None:
+def test_a_vehicle_that_has_come_down_after_take_off_gets_no_take_off_command_again() -> None:
     flight = Flight(SafetySettings(arm=True, max_sink_m=1000.0))
     flight.until(Phase.TAKEOFF)
     flight.run(10.0)
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.vehicle.falls = True
     flight.until(Phase.ABORTED, 20.0)
-    assert not any(isinstance(command, TakeOff) for command in flight.vehicle.asked)
+    assert not any(isinstance(command, TakeOff) for command in flight.vehicle.commands)
     assert flight.bridge.reason.startswith("on the ground while it should fly")
 
 
@@ -273,7 +273,7 @@ def test_commands_to_take_off_that_are_lost_are_repeated_before_the_autopilot_di
         def send_command(self, command: object) -> None:
             if isinstance(command, TakeOff) and self.lost:
                 self.lost -= 1
-                self.asked.append(command)
+                self.commands.append(command)
             else:
                 super().send_command(command)  # type: ignore[arg-type]
 
@@ -297,10 +297,10 @@ def test_a_return_that_does_not_come_home_lands(wind_mps: float, reports_home: b
     """Wind outdoes the vehicle, from take-off on."""
     vehicle = Vehicle(position=GROUND, wind_mps=(wind_mps, 0.0))
     if not reports_home:
-        tell = vehicle._tell
-        vehicle._tell = lambda: (
-            tell(),
-            setattr(vehicle, "told", dataclasses.replace(vehicle.told, home=None)),
+        report = vehicle._report
+        vehicle._report = lambda: (
+            report(),
+            setattr(vehicle, "telemetry", dataclasses.replace(vehicle.telemetry, home=None)),
         )  # type: ignore[method-assign,assignment,func-returns-value]
     flight = Flight(SafetySettings(arm=True, max_speed_mps=30.0), vehicle)
     flight.until(Phase.LANDING)
@@ -308,7 +308,7 @@ def test_a_return_that_does_not_come_home_lands(wind_mps: float, reports_home: b
     flight.until(Phase.ABORTED)
     assert vehicle.now_s - begun_s < 35.0 + 30.0 + 210.0 / 1.5
     assert [
-        command for command in vehicle.asked if command in (SetMode(Mode.RETURN), SetMode(Mode.LAND))
+        command for command in vehicle.commands if command in (SetMode(Mode.RETURN), SetMode(Mode.LAND))
     ] == [
         SetMode(Mode.RETURN),
         SetMode(Mode.LAND),
@@ -318,19 +318,19 @@ def test_a_return_that_does_not_come_home_lands(wind_mps: float, reports_home: b
     assert not vehicle.armed
 
 
-def test_a_return_that_somebody_else_chose_is_only_watched_and_has_an_end_all_the_same() -> None:
+def test_a_return_that_a_pilot_chose_is_only_monitored_and_ends_all_the_same() -> None:
     flight = fly_to_step(5)
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.vehicle.mode, flight.vehicle.wind_mps = Mode.RETURN, (20.0, 0.0)
     flight.until(Phase.ABORTED, 60.0)
     assert "return no nearer to home" in flight.bridge.reason
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
 
 
 @pytest.mark.parametrize("obeys", [True, False])
 def test_a_landing_that_comes_no_lower_has_an_end(obeys: bool) -> None:
     flight = fly_to_step(5, SafetySettings(arm=True, failsafe_action=Mode.LAND))
-    flight.vehicle.battery, flight.vehicle.stuck, flight.vehicle.deaf = 0.1, True, not obeys
+    flight.vehicle.battery, flight.vehicle.stuck, flight.vehicle.ignores_commands = 0.1, True, not obeys
     flight.until(Phase.ABORTED, 200.0)
     mode = "LAND" if obeys else "COMMANDED"
     assert f"in mode {mode} neither descended nor disarmed for 120 s" in flight.bridge.reason
@@ -343,7 +343,7 @@ def test_a_way_home_longer_than_the_limit_is_no_stall() -> None:
     flight.until(Phase.ABORTED)
     assert np.allclose(flight.vehicle.position, GROUND, atol=1.0)
     assert flight.bridge.reason.startswith("battery 10%")
-    assert SetMode(Mode.LAND) not in flight.vehicle.asked
+    assert SetMode(Mode.LAND) not in flight.vehicle.commands
 
 
 def test_a_vehicle_whose_clock_stands_has_an_end() -> None:
@@ -351,7 +351,7 @@ def test_a_vehicle_whose_clock_stands_has_an_end() -> None:
     stands_s = flight.vehicle.now_s
     while not flight.bridge.is_over:
         assert flight.vehicle.now_s < stands_s + 1000.0
-        flight.tick(known=dataclasses.replace(flight.vehicle.told, vehicle_s=stands_s))
+        flight.tick(known=dataclasses.replace(flight.vehicle.telemetry, vehicle_s=stands_s))
     assert "time has not advanced" in flight.bridge.reason
 
 
@@ -363,7 +363,7 @@ def cut(flight: Flight, seconds: float) -> None:
     vehicle = flight.vehicle
     vehicle.silent = True
     flight.run(seconds)
-    before = vehicle.told
+    before = vehicle.telemetry
     vehicle.silent = False
     for _ in range(10):
         flight.tick(known=dataclasses.replace(before, heartbeat_s=vehicle.now_s, vehicle_s=vehicle.now_s))
@@ -375,11 +375,11 @@ def test_after_a_lost_link_the_failsafe_that_was_chosen_is_requested(
     fault_timeout_s: float, seconds: float
 ) -> None:
     flight = fly_to_step(5, SafetySettings(arm=True, fault_timeout_s=fault_timeout_s))
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     cut(flight, seconds)
     flight.until(Phase.ABORTED)
-    assert flight.vehicle.asked[0] == SetMode(Mode.RETURN)
-    assert SetMode(Mode.LAND) not in flight.vehicle.asked
+    assert flight.vehicle.commands[0] == SetMode(Mode.RETURN)
+    assert SetMode(Mode.LAND) not in flight.vehicle.commands
     assert flight.bridge.reason == "link lost: no heartbeat for 3 s"
 
 
@@ -401,13 +401,13 @@ def test_an_estimate_that_is_lost_while_heartbeats_come_makes_it_land(reports: b
     vehicle = flight.vehicle
     link_lost_timeout_s = vehicle.now_s
     while not flight.bridge.is_over:
-        known = dataclasses.replace(vehicle.told, estimate_ok=False)
+        known = dataclasses.replace(vehicle.telemetry, estimate_ok=False)
         if not reports:
             silent = vehicle.now_s - link_lost_timeout_s > 3.0
             known = dataclasses.replace(known, estimate_ok=not silent, estimate_s=link_lost_timeout_s)
         flight.tick(known=known)
     assert flight.bridge.reason == "the autopilot has lost its position estimate"
-    assert vehicle.asked[-1] == SetMode(Mode.LAND)
+    assert vehicle.commands[-1] == SetMode(Mode.LAND)
 
 
 def test_telemetry_without_a_position_ends_nothing_by_an_exception() -> None:
@@ -416,8 +416,8 @@ def test_telemetry_without_a_position_ends_nothing_by_an_exception() -> None:
         flight = Flight()
         flight.until(phase)
         flight.run(2.0)
-        flight.tick(known=dataclasses.replace(flight.vehicle.told, position=None))
-        flight.tick(known=dataclasses.replace(flight.vehicle.told, position=None, position_s=None))
+        flight.tick(known=dataclasses.replace(flight.vehicle.telemetry, position=None))
+        flight.tick(known=dataclasses.replace(flight.vehicle.telemetry, position=None, position_s=None))
         flight.tick(known=Telemetry(heartbeat_s=flight.vehicle.now_s, armed=True, mode=Mode.COMMANDED))
         assert flight.bridge.phase is phase
         flight.until(Phase.LANDED)

@@ -15,7 +15,7 @@ AIM_MS = 10.0
 
 
 def _may() -> bool:
-    """Does this machine let a thread run when it is due; asked in a thread that ends then."""
+    """Does this machine let a thread run when it is due; in a thread that ends then."""
     answers: list[bool] = []
     thread = threading.Thread(target=lambda: answers.append(use_realtime_priority()))
     thread.start()
@@ -23,20 +23,20 @@ def _may() -> bool:
     return answers[0]
 
 
-def test_setpoints_keep_their_pace_whoever_wants_the_processor() -> None:
-    told = []
+def test_setpoints_keep_their_pace_on_a_busy_computer() -> None:
+    found = []
     for _ in range(3):  # one hiccup of a virtual machine is two of the eighty gaps of a try
         ours_ms, bare_ms = off_beat_ms(4.0, ("transport", "bare"), burning=os.cpu_count() or 1, loading=True)
-        told.append(f"{ours_ms:.1f} ms; a bare loop {bare_ms:.1f} ms")
+        found.append(f"{ours_ms:.1f} ms; a bare loop {bare_ms:.1f} ms")
         # Where the system does not let it run when due: no better than any other process, and not much worse.
         if ours_ms < (AIM_MS if _may() else AIM_MS + 2 * bare_ms):
             return
-    raise AssertionError(told)
+    raise AssertionError(found)
 
 
 def test_the_thread_that_streams_runs_when_it_is_due() -> None:
     if not _may():
-        pytest.skip("this process may not ask for it")
+        pytest.skip("this process may not set it")
     with MavlinkVehicle("tcp:127.0.0.1:1") as vehicle:
         end_s = time.monotonic() + 5.0
         while "refused" not in str(vehicle.telemetry().missing):  # by then it runs
@@ -49,12 +49,12 @@ def test_the_thread_that_streams_runs_when_it_is_due() -> None:
 
 def test_what_is_started_from_a_thread_that_runs_when_due_is_ordinary() -> None:
     if not _may():
-        pytest.skip("this process may not ask for it")
+        pytest.skip("this process may not set it")
     seen: dict[str, int] = {}
 
     def look() -> None:
         use_realtime_priority()
-        seen["asked"] = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+        seen["realtime"] = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
         child = threading.Thread(target=lambda: seen.update(thread=os.sched_getscheduler(0)))
         child.start()
         child.join()
@@ -64,4 +64,4 @@ def test_what_is_started_from_a_thread_that_runs_when_due_is_ordinary() -> None:
     thread = threading.Thread(target=look)
     thread.start()
     thread.join()
-    assert seen == {"asked": os.SCHED_RR, "thread": os.SCHED_OTHER, "process": os.SCHED_OTHER}
+    assert seen == {"realtime": os.SCHED_RR, "thread": os.SCHED_OTHER, "process": os.SCHED_OTHER}

@@ -23,15 +23,15 @@ class Stubborn(Vehicle):
 
     def send_command(self, command: object) -> None:
         if isinstance(command, Arm) and self.stick_is_up:
-            self.asked.append(command)
+            self.commands.append(command)
         else:
             super().send_command(command)  # type: ignore[arg-type]
 
 
 def restarted(flight: Flight) -> Flight:
-    """Another bridge beside the same vehicle, that knows what the journal tells."""
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
-    return Flight(flight.bridge.settings, flight.vehicle, checkpoint=standing)
+    """Another bridge beside the same vehicle, with what the journal holds."""
+    checkpoint = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
+    return Flight(flight.bridge.settings, flight.vehicle, checkpoint=checkpoint)
 
 
 def test_a_switch_on_the_ground_is_the_last_word() -> None:
@@ -39,30 +39,30 @@ def test_a_switch_on_the_ground_is_the_last_word() -> None:
     flight.run(10.0)
     assert flight.vehicle.mode is Mode.COMMANDED
     flight.vehicle.mode, flight.vehicle.mode_name = Mode.OTHER, "LOITER"
-    asked = len(flight.vehicle.asked)
+    n_sent = len(flight.vehicle.commands)
     flight.vehicle.stick_is_up = False  # type: ignore[attr-defined]
     flight.run(60.0)
-    assert flight.vehicle.asked[asked:] == []
+    assert flight.vehicle.commands[n_sent:] == []
     assert (flight.vehicle.mode, flight.vehicle.armed) == (Mode.OTHER, False)
     reason = "mode LOITER before take-off: changed by a pilot or by the autopilot's failsafe"
     assert (flight.bridge.phase, flight.bridge.reason) == (Phase.ABORTED, reason)
     again = restarted(flight)
     again.run(10.0)
-    assert flight.vehicle.asked[asked:] == []
+    assert flight.vehicle.commands[n_sent:] == []
     assert (again.bridge.phase, again.bridge.reason) == (Phase.ABORTED, reason)
 
 
 @pytest.mark.parametrize("obeys", [True, False])
 def test_a_bridge_that_is_restarted_on_the_ground_knows_what_it_requested(obeys: bool) -> None:
     """The pilot's switch came while no bridge was there; also if the mode was never taken."""
-    flight = Flight(vehicle=Stubborn(position=GROUND, mode_name="STABILIZE", deaf=not obeys))
+    flight = Flight(vehicle=Stubborn(position=GROUND, mode_name="STABILIZE", ignores_commands=not obeys))
     flight.run(10.0)
-    assert SetMode(Mode.COMMANDED) in flight.vehicle.asked
+    assert SetMode(Mode.COMMANDED) in flight.vehicle.commands
     flight.vehicle.mode, flight.vehicle.mode_name = Mode.OTHER, "LOITER"
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     again = restarted(flight)
     again.run(10.0)
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
     assert again.bridge.phase is Phase.ABORTED
     assert again.bridge.reason.startswith("mode LOITER before take-off: changed by a pilot")
 
@@ -75,23 +75,23 @@ def test_what_was_requested_is_kept_before_it_is_sent() -> None:
     def keep() -> None:
         note()
         kept.append(flight.bridge.checkpoint.allowed_mode)
-        assert flight.vehicle.asked == [] or kept[-1] is not None
+        assert flight.vehicle.commands == [] or kept[-1] is not None
 
     flight.bridge._on_change = keep
     flight.until(Phase.TAKEOFF)
     assert kept[-1] is not None
 
 
-def test_a_request_that_is_refused_is_repeated_until_somebody_chooses_a_third_mode() -> None:
+def test_a_request_that_is_refused_is_repeated_until_a_pilot_chooses_a_third_mode() -> None:
     vehicle = Vehicle(position=GROUND, mode_name="STABILIZE", refused=(Mode.COMMANDED,))
     flight = Flight(vehicle=vehicle)
     flight.run(10.0)
-    assert vehicle.asked.count(SetMode(Mode.COMMANDED)) >= 4
+    assert vehicle.commands.count(SetMode(Mode.COMMANDED)) >= 4
     vehicle.mode_name = "LOITER"
     vehicle.refused = ()
-    vehicle.asked.clear()
+    vehicle.commands.clear()
     flight.run(10.0)
-    assert vehicle.asked == []
+    assert vehicle.commands == []
     assert flight.bridge.phase is Phase.ABORTED
 
 
@@ -122,14 +122,14 @@ def test_what_a_pilot_took_over_stays_the_pilot_s_after_a_restart_and_a_stop() -
     flight.vehicle.mode = Mode.OTHER
     flight.run(0.5)
     flight.vehicle.mode = Mode.COMMANDED  # a ground station's now
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     again = restarted(flight)
     again.run(5.0)
     assert (again.bridge.phase, again.bridge.reason) == (Phase.ABORTED, flight.bridge.reason)
     third = restarted(flight)
-    third.bridge.stop("the bridge was stopped", flight.vehicle.told)
+    third.bridge.stop("the bridge was stopped", flight.vehicle.telemetry)
     third.run(1.0)
-    assert flight.vehicle.asked == []
+    assert flight.vehicle.commands == []
 
 
 @pytest.mark.parametrize("how", [ARMING, SafetySettings()])
@@ -143,7 +143,7 @@ def test_a_vehicle_that_another_system_commands_is_refused_before_anything_is_se
     ):
         flight = Flight(how, vehicle)
         flight.run(5.0)
-        assert vehicle.asked == []
+        assert vehicle.commands == []
         assert flight.bridge.setpoint is None
         assert (flight.bridge.phase, flight.bridge.reason) == (
             Phase.ABORTED,
@@ -153,17 +153,17 @@ def test_a_vehicle_that_another_system_commands_is_refused_before_anything_is_se
 
 @pytest.mark.parametrize("armed", [False, True])
 def test_what_is_missing_after_connecting_stops_a_take_off(armed: bool) -> None:
-    """Such as a second vehicle on the link; also where somebody has armed meanwhile."""
+    """Such as a second vehicle on the link; also where a pilot has armed meanwhile."""
     flight = Flight(vehicle=Stubborn(position=GROUND))
     flight.until(Phase.PREFLIGHT)
     flight.run(5.0)
     vehicle, missing = flight.vehicle, "2 autopilots on this link"
     vehicle.missing, vehicle.stick_is_up = missing, False  # type: ignore[attr-defined]
     vehicle.armed = armed
-    vehicle._tell()
-    vehicle.asked.clear()
+    vehicle._report()
+    vehicle.commands.clear()
     flight.run(10.0)
-    assert vehicle.asked == []
+    assert vehicle.commands == []
     assert flight.bridge.setpoint is None
     assert (flight.bridge.phase, flight.bridge.reason) == (Phase.CONNECTING, missing)
     vehicle.missing = None
@@ -203,7 +203,7 @@ def test_a_vehicle_in_the_air_without_a_datum_is_refused_at_once(mode: Mode) -> 
     flight = Flight(vehicle=vehicle)
     flight.until(Phase.ABORTED, 10.0)
     assert "expected --datum=LAT,LON,ALT" in flight.bridge.reason
-    assert vehicle.asked == []
+    assert vehicle.commands == []
 
 
 def test_a_vehicle_in_the_air_outside_the_fence_is_refused_at_once() -> None:
@@ -211,7 +211,7 @@ def test_a_vehicle_in_the_air_outside_the_fence_is_refused_at_once() -> None:
     flight = Flight(vehicle=vehicle)
     flight.until(Phase.ABORTED, 5.0)
     assert flight.bridge.reason.startswith("the vehicle is outside the fence: 3000.0 m east")
-    assert vehicle.asked == []
+    assert vehicle.commands == []
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5, 20])
@@ -225,10 +225,10 @@ def test_a_bridge_that_is_stopped_brings_a_vehicle_down_in_every_phase(
     flight = Flight(SafetySettings(failsafe_action=then), vehicle)
     for _ in range(ticks):
         flight.tick()
-    flight.bridge.stop("the bridge was stopped", vehicle.told)
+    flight.bridge.stop("the bridge was stopped", vehicle.telemetry)
     flight.run(0.3)
-    assert vehicle.asked == [SetMode(then)]
-    assert flight.bridge.can_be_released(vehicle.told)
+    assert vehicle.commands == [SetMode(then)]
+    assert flight.bridge.can_be_released(vehicle.telemetry)
     flight.until(Phase.ABORTED)
     assert flight.bridge.reason == "the bridge was stopped"
 
@@ -239,31 +239,31 @@ def test_a_bridge_that_is_stopped_lets_a_pilot_s_vehicle_alone() -> None:
         flight.tick()
         flight.bridge.stop("the bridge was stopped")
         flight.run(1.0)
-        assert vehicle.asked == []
+        assert vehicle.commands == []
         assert flight.bridge.phase is Phase.ABORTED
 
 
 def test_a_bridge_that_is_stopped_lets_one_of_several_vehicles_alone() -> None:
-    """The first one that it heard on the link flies, commanded by somebody else."""
+    """The first one on the link flies, commanded by another system."""
     vehicle = Vehicle(position=ALOFT, mode=Mode.COMMANDED, armed=True, missing="2 autopilots on this link")
     vehicle.pass_time(0.1, None)
     flight = Flight(vehicle=vehicle)
     for _ in range(20):
-        flight.tick(known=dataclasses.replace(vehicle.told, is_selected=False))
+        flight.tick(known=dataclasses.replace(vehicle.telemetry, is_selected=False))
     flight.bridge.stop("the bridge was stopped")
     flight.run(1.0)
-    assert (vehicle.asked, flight.bridge.phase) == ([], Phase.ABORTED)
+    assert (vehicle.commands, flight.bridge.phase) == ([], Phase.ABORTED)
 
 
 def test_a_mission_in_the_air_that_cannot_be_taken_up_has_an_end() -> None:
     """The position never comes back, though the link does."""
     flight = fly_to_step(3)
     flight.vehicle.frozen = True
-    flight.vehicle.told = Telemetry()
+    flight.vehicle.telemetry = Telemetry()
     again = restarted(flight)
     again.until(Phase.ABORTED, 1500.0)
     assert again.bridge.reason.startswith("no position for 0.5 s; waited 300 s")
-    assert SetMode(Mode.RETURN) in flight.vehicle.asked
+    assert SetMode(Mode.RETURN) in flight.vehicle.commands
 
 
 def test_a_vehicle_that_was_armed_and_disarmed_before_take_off_is_not_armed_again() -> None:
@@ -272,18 +272,18 @@ def test_a_vehicle_that_was_armed_and_disarmed_before_take_off_is_not_armed_agai
     vehicle = flight.vehicle
     flight.run(3.0)
     vehicle.missing, vehicle.armed = "2 autopilots on this link", True
-    vehicle._tell()
+    vehicle._report()
     flight.run(3.0)
     vehicle.armed = vehicle.stick_is_up = False  # type: ignore[attr-defined]
     vehicle.missing = None
-    vehicle._tell()
-    vehicle.asked.clear()
+    vehicle._report()
+    vehicle.commands.clear()
     flight.run(10.0)
-    assert vehicle.asked == []
+    assert vehicle.commands == []
     assert flight.bridge.reason == "a pilot had control: waiting for a pilot to set the mode and arm"
     again = restarted(flight)
     again.run(10.0)
-    assert vehicle.asked == []
+    assert vehicle.commands == []
 
 
 def test_a_vehicle_that_is_disarmed_as_a_bridge_comes_back_is_not_armed_again() -> None:
@@ -294,10 +294,10 @@ def test_a_vehicle_that_is_disarmed_as_a_bridge_comes_back_is_not_armed_again() 
     again = restarted(flight)
     again.until(Phase.PREFLIGHT)
     again.vehicle.armed = False
-    again.vehicle._tell()
-    again.vehicle.asked.clear()
+    again.vehicle._report()
+    again.vehicle.commands.clear()
     again.run(5.0)
-    assert again.vehicle.asked == []
+    assert again.vehicle.commands == []
     assert (again.bridge.phase, again.bridge.reason) == (
         Phase.ABORTED,
         "on the ground and disarmed when the bridge restarted",

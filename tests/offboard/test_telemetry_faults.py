@@ -42,7 +42,7 @@ FAILURES = (
     "wind",
     "stuck",
     "falls",
-    "deaf",
+    "ignores_commands",
     "silent",
     "frozen",
     "fence",
@@ -110,7 +110,7 @@ def fail(fault: Fault, vehicle: Vehicle, present: bool) -> None:
     match fault.kind:
         case "wind":
             vehicle.wind_mps = (30.0 * fault.much, 0.0) if present else (0.0, 0.0)
-        case "stuck" | "falls" | "deaf" | "silent" | "frozen":
+        case "stuck" | "falls" | "ignores_commands" | "silent" | "frozen":
             setattr(vehicle, fault.kind, present)
         case "fence":
             vehicle.fence_m = 300.0 * fault.much if present else None
@@ -149,11 +149,11 @@ class Distorted(Flight):
         vehicle, bridge = self.vehicle, self.bridge
         while not bridge.is_over and vehicle.now_s < LONGEST_S:
             now_s = vehicle.now_s
-            self.history.append(vehicle.told)
+            self.history.append(vehicle.telemetry)
             present = [f for f in self.faults if f.at_s <= now_s < f.at_s + f.lasts_s]
             for fault in self.faults:
                 fail(fault, vehicle, fault in present)
-            known = vehicle.told
+            known = vehicle.telemetry
             for fault in present:
                 known = distorted(fault, known, self.history, now_s)
             self.policy = None if any(f.kind == "silent policy" for f in present) else _way
@@ -202,7 +202,7 @@ QUIET = [HealthCheck.too_slow]
 @example(faults=[Fault("impossible", 80.0, 0.8, 0.0)])
 @example(faults=[Fault("wind", 0.0, 1e6, 0.5)])
 @example(faults=[Fault("wind", 0.0, 1e6, 0.5), Fault("silent", 40.0, 20.0, 0.5)])
-@example(faults=[Fault("falls", 60.0, 1e6, 0.0), Fault("deaf", 30.0, 1e6, 0.0)])
+@example(faults=[Fault("falls", 60.0, 1e6, 0.0), Fault("ignores_commands", 30.0, 1e6, 0.0)])
 def test_whatever_goes_wrong_the_mission_has_an_end(faults: list[Fault]) -> None:
     check(faults)
 
@@ -216,7 +216,7 @@ def test_whatever_goes_wrong_the_mission_has_an_end_every_time(faults: list[Faul
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_message_that_is_wrong_ends_nothing(kind: str) -> None:
-    """Whatever it is, in one phase after the other; but who is told that it was disarmed believes it."""
+    """Whatever it is, in one phase after the other; but a report that it is disarmed is believed."""
     flight = check([Fault(kind, at_s, TICK_S, 0.8) for at_s in (10.0, 40.0, 41.0, 100.0)])
     if kind == "other":
         assert flight.bridge.phase is Phase.ABORTED or flight.bridge.warnings == []

@@ -16,13 +16,13 @@ GROUND = Enu(START.east_m, START.north_m, 0.0)
 
 
 def restarted(flight: Flight) -> Flight:
-    """Another bridge beside the same vehicle, that knows what the journal tells."""
-    standing = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
-    return Flight(flight.bridge.settings, flight.vehicle, checkpoint=standing)
+    """Another bridge beside the same vehicle, with what the journal holds."""
+    checkpoint = msgspec.json.decode(msgspec.json.encode(flight.bridge.checkpoint), type=Checkpoint)
+    return Flight(flight.bridge.settings, flight.vehicle, checkpoint=checkpoint)
 
 
 def drifting() -> Flight:
-    """It was asked to return, and the wind is stronger than it flies."""
+    """Return was requested, and the wind is stronger than it flies."""
     flight = fly_to_step(3)
     flight.vehicle.battery = 0.1
     flight.run(1.0)
@@ -37,13 +37,13 @@ def test_a_pilot_may_return_a_vehicle_that_lands_instead_of_returning() -> None:
     vehicle = flight.vehicle
     flight.run(20.0)
     assert vehicle.mode is Mode.LAND
-    vehicle.asked.clear()
+    vehicle.commands.clear()
     vehicle.mode = Mode.RETURN  # the pilot's: there is water below
     flight.run(10.0)
-    assert (vehicle.asked, vehicle.mode) == ([], Mode.RETURN)
+    assert (vehicle.commands, vehicle.mode) == ([], Mode.RETURN)
     vehicle.stuck = False
     flight.until(Phase.ABORTED)
-    assert vehicle.asked == []
+    assert vehicle.commands == []
 
 
 def test_a_return_that_does_not_come_home_is_ended_by_a_bridge_that_is_started_anew_too() -> None:
@@ -53,27 +53,27 @@ def test_a_return_that_does_not_come_home_is_ended_by_a_bridge_that_is_started_a
 
 
 def test_a_landing_at_the_dock_goes_on_as_one() -> None:
-    """Killed before the vehicle had heard of it."""
+    """Killed before the vehicle received the request."""
     flight = fly_to_step(3)
-    flight.vehicle.deaf = True
+    flight.vehicle.ignores_commands = True
     flight.until(Phase.LANDING)
     assert flight.bridge.checkpoint.outcome is Phase.LANDED
-    flight.vehicle.deaf = False
+    flight.vehicle.ignores_commands = False
     again = restarted(flight)
     again.until(Phase.LANDED)
 
 
-def test_a_vehicle_without_an_estimate_is_not_told_to_return_by_a_bridge_that_is_started_anew() -> None:
+def test_a_restarted_bridge_requests_no_return_without_an_estimate() -> None:
     flight = fly_to_step(3)
-    flight.vehicle.deaf = True
+    flight.vehicle.ignores_commands = True
     flight.vehicle.estimate_ok = False
     flight.until(Phase.LANDING)
     flight.vehicle.estimate_ok = True
-    flight.vehicle.asked.clear()
-    flight.vehicle.deaf = False
+    flight.vehicle.commands.clear()
+    flight.vehicle.ignores_commands = False
     again = restarted(flight)
     again.until(Phase.ABORTED)
-    assert set(again.vehicle.asked) == {SetMode(Mode.LAND)}
+    assert set(again.vehicle.commands) == {SetMode(Mode.LAND)}
 
 
 def test_who_takes_a_vehicle_that_comes_down_keeps_it_though_no_bridge_was_there_to_see_it() -> None:
@@ -81,11 +81,11 @@ def test_who_takes_a_vehicle_that_comes_down_keeps_it_though_no_bridge_was_there
     flight.vehicle.battery = 0.1
     flight.run(5.0)
     assert flight.vehicle.mode is Mode.RETURN
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.vehicle.mode = Mode.COMMANDED  # a ground station's
     again = restarted(flight)
     again.until(Phase.ABORTED)
-    assert again.vehicle.asked == []
+    assert again.vehicle.commands == []
 
 
 @pytest.mark.parametrize("refused", ["rival", "outside", "unplaced", "stopped"])
@@ -101,16 +101,16 @@ def test_what_was_left_alone_is_let_alone_by_a_bridge_that_is_started_anew(refus
         vehicle.unplaced = True
     else:
         vehicle.mode = Mode.OTHER
-    vehicle._tell()
+    vehicle._report()
     flight.run(8.0)
     flight.bridge.stop("the bridge was stopped")
     assert flight.bridge.is_over
     vehicle.mode = Mode.COMMANDED
     vehicle.unplaced, vehicle.other_controller = False, None
-    vehicle._tell()
+    vehicle._report()
     again = restarted(flight)
     again.run(5.0)
-    assert (vehicle.asked, again.bridge.phase) == ([], Phase.ABORTED)
+    assert (vehicle.commands, again.bridge.phase) == ([], Phase.ABORTED)
 
 
 def test_what_a_pilot_has_is_let_alone_also_without_a_position() -> None:
@@ -118,12 +118,12 @@ def test_what_a_pilot_has_is_let_alone_also_without_a_position() -> None:
     flight.vehicle.mode = Mode.OTHER
     flight.run(0.5)
     flight.vehicle.mode = Mode.COMMANDED
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     again = restarted(flight)
     again.vehicle.unplaced = True
-    again.vehicle._tell()
+    again.vehicle._report()
     again.until(Phase.ABORTED)
-    assert again.vehicle.asked == []
+    assert again.vehicle.commands == []
 
 
 def test_a_mode_that_was_entered_is_known_to_a_bridge_that_is_started_anew() -> None:
@@ -141,17 +141,17 @@ def test_a_mode_that_was_entered_is_known_to_a_bridge_that_is_started_anew() -> 
     while vehicle.mode is not Mode.COMMANDED:
         flight.tick()
     flight.tick()
-    vehicle.asked.clear()
+    vehicle.commands.clear()
     vehicle.armed = False
     vehicle.mode = Mode.OTHER
-    vehicle._tell()
+    vehicle._report()
     again = Flight(ARMING, vehicle, checkpoint=kept[-1])
     again.run(10.0)
-    assert vehicle.asked == []
+    assert vehicle.commands == []
 
 
 @pytest.mark.parametrize("phase", [Phase.MOVING, Phase.PREFLIGHT])
-def test_a_vehicle_without_an_estimate_is_not_told_to_return_when_the_bridge_is_stopped(phase: Phase) -> None:
+def test_a_stopped_bridge_requests_no_return_without_an_estimate(phase: Phase) -> None:
     if phase is Phase.MOVING:
         flight = fly_to_step(3)
     else:
@@ -161,18 +161,20 @@ def test_a_vehicle_without_an_estimate_is_not_told_to_return_when_the_bridge_is_
     flight.vehicle.refused = (Mode.RETURN,)
     flight.run(1.0)
     flight.bridge.stop("the bridge was stopped")
-    flight.vehicle.asked.clear()
+    flight.vehicle.commands.clear()
     flight.run(1.0)
-    assert flight.vehicle.asked == [SetMode(Mode.LAND)]
+    assert flight.vehicle.commands == [SetMode(Mode.LAND)]
 
 
 @pytest.mark.parametrize(("link_lost_timeout_s", "mode"), [(7.0, Mode.RETURN), (20.0, Mode.LAND)])
-def test_a_vehicle_whose_clock_stands_is_asked_again(link_lost_timeout_s: float, mode: Mode) -> None:
+def test_requests_are_repeated_to_a_vehicle_whose_clock_stands(
+    link_lost_timeout_s: float, mode: Mode
+) -> None:
     """Nothing comes but heartbeats, and the first request is lost, or as many as are a refusal."""
     flight = fly_to_step(3)
     vehicle = flight.vehicle
-    vehicle.deaf = True
-    told = dataclasses.replace(vehicle.told)
+    vehicle.ignores_commands = True
+    told = dataclasses.replace(vehicle.telemetry)
 
     def run(seconds: float) -> None:
         for _ in range(round(seconds / 0.1)):
@@ -180,7 +182,7 @@ def test_a_vehicle_whose_clock_stands_is_asked_again(link_lost_timeout_s: float,
 
     run(link_lost_timeout_s)
     assert flight.bridge.phase is Phase.LANDING
-    vehicle.deaf = False
+    vehicle.ignores_commands = False
     run(5.0)
     assert vehicle.mode is mode
 
@@ -189,8 +191,8 @@ def test_a_vehicle_whose_clock_stands_is_asked_again(link_lost_timeout_s: float,
 @pytest.mark.parametrize("again", [True, False])
 def test_a_vehicle_that_flies_goes_straight_up_or_down_then_across(up_m: float, again: bool) -> None:
     vehicle = Vehicle(position=Enu(300.0, 300.0, up_m), mode=Mode.COMMANDED, armed=True)
-    standing = Checkpoint(step=0, cell=SCENARIO.start_cell, airborne=True) if again else None
-    flight = Flight(SafetySettings(), vehicle, checkpoint=standing)
+    checkpoint = Checkpoint(step=0, cell=SCENARIO.start_cell, airborne=True) if again else None
+    flight = Flight(SafetySettings(), vehicle, checkpoint=checkpoint)
     while abs(vehicle.position.up_m - START.up_m) > 3.0:
         assert vehicle.position[:2] == (300.0, 300.0)
         flight.tick()

@@ -100,7 +100,7 @@ class Flight:
     def kill_bridge(self) -> None:
         """SIGKILL it; another one comes after a while."""
         assert self.bridge is not None
-        self._standing, self._setpoint = self.bridge.checkpoint, self.bridge.setpoint
+        self._checkpoint, self._setpoint = self.bridge.checkpoint, self.bridge.setpoint
         self.bridge, self._dead_until_s = None, self.vehicle.now_s + DEAD_S
 
     def set_clock(self, by_s: float) -> None:
@@ -113,21 +113,21 @@ class Flight:
         """The time of the machine."""
         return self._begun_ns + round(self.vehicle.now_s / self.speed * 1e9)
 
-    def _bridge(self, **standing: object) -> MissionController:
-        return MissionController(self.scenario, self.settings, self._tell, **standing)  # type: ignore[arg-type]
+    def _bridge(self, **checkpoint: object) -> MissionController:
+        return MissionController(self.scenario, self.settings, self._tell, **checkpoint)  # type: ignore[arg-type]
 
     def _tick(self) -> None:
         self._beat(self)
         bridge, vehicle = self.bridge, self.vehicle
         if bridge is None:
             if vehicle.now_s >= self._dead_until_s:
-                self.bridge = self._bridge(checkpoint=self._standing)
+                self.bridge = self._bridge(checkpoint=self._checkpoint)
             vehicle.pass_time(self.tick_s, self._setpoint)
             return
-        for command in bridge.tick(vehicle.now_s, vehicle.told):
+        for command in bridge.tick(vehicle.now_s, vehicle.telemetry):
             vehicle.send_command(command)
-        if vehicle.told.position is not None and vehicle.told.position_s == vehicle.now_s:
-            self._say_pose(vehicle.told.position)
+        if vehicle.telemetry.position is not None and vehicle.telemetry.position_s == vehicle.now_s:
+            self._say_pose(vehicle.telemetry.position)
         self._decide(bridge)
         vehicle.pass_time(self.tick_s, bridge.setpoint)
 

@@ -311,7 +311,7 @@ class AutopilotBridge(MissionNode):
             "system": telemetry.system,
             "other controller": telemetry.other_controller or "",
         }
-        for reason, n in (Counter(telemetry.discarded) + Counter(bridge.discarded)).items():
+        for reason, n in (Counter(telemetry.discarded) + Counter(bridge.detector.discarded)).items():
             values[f"discarded: {reason}"] = str(n)
         for name, at_s in (("position", telemetry.position_s), ("heartbeat", telemetry.heartbeat_s)):
             values[f"{name} age [s]"] = "" if at_s is None else f"{now_s - at_s:.2f}"

@@ -24,7 +24,7 @@ class Enu(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read `EAST,NORTH,UP`, metres.
+        """Parse `EAST,NORTH,UP`, metres.
 
         Raises:
             VehicleError: the text is not three finite numbers.
@@ -33,12 +33,17 @@ class Enu(NamedTuple):
             position = cls(*map(float, text.split(",")))
         except (TypeError, ValueError):
             position = cls(math.nan, math.nan, math.nan)
-        if not all(map(math.isfinite, position)):
+        if not position.is_finite:
             raise VehicleError(f"grid origin: {text!r}; expected EAST,NORTH,UP in metres")
         return position
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all coordinates are finite numbers."""
+        return all(map(math.isfinite, self))
+
     def to_text(self) -> str:
-        """As `parse` reads it, with all digits."""
+        """All digits, as `parse` reads them."""
         return ",".join(map(repr, self))
 
     def plus(self, other: Self) -> Self:
@@ -79,14 +84,8 @@ def tilt_rad(w: float, x: float, y: float, z: float) -> float | None:
     return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y) / (length * length))))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Geodetic:
-    """A point on WGS84.
-
-    Attributes:
-        latitude_deg, longitude_deg: north and east positive.
-        altitude_m: above a reference that is the same for all points of one flight.
-    """
+class Geodetic(NamedTuple):
+    """A point on WGS84, north and east positive. The reference of its altitude is the same in one flight."""
 
     latitude_deg: float
     longitude_deg: float
@@ -100,34 +99,28 @@ class Geodetic:
             VehicleError: the text has another form, or a value is out of range.
         """
         try:
-            latitude_deg, longitude_deg, altitude_m = (float(part) for part in text.split(","))
-        except ValueError:
-            latitude_deg = math.nan
-        if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and abs(altitude_m) <= MAX_ALTITUDE_M):
+            point = cls(*map(float, text.split(",")))
+        except (TypeError, ValueError):
+            point = cls(math.nan, math.nan, math.nan)
+        limits = (90, 180, MAX_ALTITUDE_M)
+        if not all(abs(value) <= limit for value, limit in zip(point, limits, strict=True)):
             raise VehicleError(
                 f"datum: {text!r}; expected LATITUDE,LONGITUDE,ALTITUDE in degrees and metres, such as "
                 "47.397742,8.545594,488.0"
             )
-        return cls(latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=altitude_m)
+        return point
 
     def __str__(self) -> str:
         """All digits, as `parse` reads them."""
-        return f"{self.latitude_deg!r},{self.longitude_deg!r},{self.altitude_m!r}"
+        return ",".join(map(repr, self))
 
     def enu_from(self, datum: Self) -> Enu:
         """Position of this point in the ENU frame of a datum, exact on WGS84."""
-        here = (self.latitude_deg, self.longitude_deg, self.altitude_m)
-        there = (datum.latitude_deg, datum.longitude_deg, datum.altitude_m)
-        return Enu(*(float(value) for value in _pymap3d().geodetic2enu(*here, *there)))
+        return Enu(*map(float, _pymap3d().geodetic2enu(*self, *datum)))
 
     def at(self, offset: Enu) -> Self:
         """Point at an offset in this point's ENU frame."""
-        latitude_deg, longitude_deg, altitude_m = _pymap3d().enu2geodetic(
-            *offset, self.latitude_deg, self.longitude_deg, self.altitude_m
-        )
-        return type(self)(
-            latitude_deg=float(latitude_deg), longitude_deg=float(longitude_deg), altitude_m=float(altitude_m)
-        )
+        return type(self)(*map(float, _pymap3d().enu2geodetic(*offset, *self)))
 
 
 NO_SCALE = Enu(1.0, 1.0, 1.0)
@@ -162,9 +155,9 @@ def sphere_scale(origin: Geodetic, radius_m: float) -> Enu:
     The autopilot converts degrees to metres by one radius, `radius_m`. The radii of curvature of WGS84 at
     `origin` differ from it by up to 0.5 %: metres per kilometre.
     """
-    curvature = 1 - SQUARED_ECCENTRICITY * math.sin(math.radians(origin.latitude_deg)) ** 2
-    across_m = EQUATOR_M / math.sqrt(curvature) + origin.altitude_m
-    along_m = EQUATOR_M * (1 - SQUARED_ECCENTRICITY) / curvature**1.5 + origin.altitude_m
+    denominator = 1 - SQUARED_ECCENTRICITY * math.sin(math.radians(origin.latitude_deg)) ** 2
+    across_m = EQUATOR_M / math.sqrt(denominator) + origin.altitude_m
+    along_m = EQUATOR_M * (1 - SQUARED_ECCENTRICITY) / denominator**1.5 + origin.altitude_m
     return Enu(radius_m / across_m, radius_m / along_m, 1.0)
 
 

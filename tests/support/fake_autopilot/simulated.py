@@ -26,7 +26,7 @@ ARMING = SafetySettings(arm=True)
 
 @dataclass
 class Vehicle:
-    """Flies to setpoints, does what it is asked, and tells of itself; faults are attributes."""
+    """Flies to setpoints, executes commands, and reports its state; faults are attributes."""
 
     position: Enu
     mode: Mode = Mode.OTHER
@@ -37,17 +37,17 @@ class Vehicle:
     estimate_ok: bool = True
     frozen: bool = False  # its position does not come any more
     silent: bool = False  # nothing comes any more
-    deaf: bool = False  # it follows no command
+    ignores_commands: bool = False  # it follows no command
     refused: tuple[Mode, ...] = ()
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of what it believes of its position
-    said: str = ""
+    status_text: str = ""
     now_s: float = 0.0
     climb_to_m: float | None = None
     wind_mps: tuple[float, float] = (0.0, 0.0)  # east, north
     speeds_mps: dict[str, float] = field(default_factory=lambda: dict(SPEED_MPS))
     fence_m: float | None = None  # circle around home; targets outside are ignored
     stuck: bool = False  # it flies nowhere
-    falls: bool = False  # its motors are off, whatever it is asked
+    falls: bool = False  # its motors are off, whatever is commanded
     tilt_rad: float | None = None
     home: Enu | None = None
     target: Enu | None = None
@@ -55,18 +55,18 @@ class Vehicle:
     reports_target: bool = True
     limits: Limits | None = None
     other_controller: str | None = None
-    unplaced: bool = False  # nobody knows where it is on the grid
+    unplaced: bool = False  # its position on the grid is not known
     missing: str | None = None  # what else has not come
-    asked: list[Command] = field(default_factory=list)
-    told: Telemetry = field(default_factory=Telemetry)
+    commands: list[Command] = field(default_factory=list)
+    telemetry: Telemetry = field(default_factory=Telemetry)
 
     @property
     def on_ground(self) -> bool:
         return self.position.up_m <= 0.05
 
     def send_command(self, command: Command) -> None:
-        self.asked.append(command)
-        if self.deaf or self.silent:
+        self.commands.append(command)
+        if self.ignores_commands or self.silent:
             return
         match command:
             case SetMode(mode) if mode in self.refused:
@@ -91,7 +91,7 @@ class Vehicle:
             self.position = Enu(x_m + east_mps * seconds, y_m + north_mps * seconds, up_m)
         if self.armed and self.on_ground and self.mode in (Mode.LAND, Mode.RETURN):
             self.armed, self.climb_to_m = False, None
-        self._tell()
+        self._report()
 
     def _goal(self, setpoint: Enu | None) -> Enu | None:
         x_m, y_m, up_m = self.position
@@ -114,15 +114,15 @@ class Vehicle:
             return False
         return math.dist(target[:2], self.home[:2]) > self.fence_m
 
-    def _tell(self) -> None:
-        before = self.told
+    def _report(self) -> None:
+        before = self.telemetry
         if self.silent:
             stale = before.estimate_s is None or self.now_s - before.estimate_s > STALE_S
-            self.told = dataclasses.replace(before, estimate_ok=before.estimate_ok and not stale)
+            self.telemetry = dataclasses.replace(before, estimate_ok=before.estimate_ok and not stale)
             return
         believed = Enu(*(p + o for p, o in zip(self.position, self.offset, strict=True)))
         known = not self.unplaced
-        self.told = Telemetry(
+        self.telemetry = Telemetry(
             heartbeat_s=self.now_s,
             mode=self.mode,
             mode_name=(self.mode_name if self.mode is Mode.OTHER else "") or self.mode.value.upper(),
@@ -136,7 +136,7 @@ class Vehicle:
             battery_v=self.battery_v,
             vehicle_s=self.now_s,
             missing="the grid has no datum" if self.unplaced else self.missing,
-            status_text=self.said,
+            status_text=self.status_text,
             home=self.home if self.reports_home else None,
             target=self.target if self.reports_target else None,
             target_s=self.now_s,
@@ -207,7 +207,7 @@ class Flight:
 
     def tick(self, tick_s: float = TICK_S, known: Telemetry | None = None) -> None:
         bridge, vehicle = self.bridge, self.vehicle
-        for command in bridge.tick(vehicle.now_s, known or vehicle.told):
+        for command in bridge.tick(vehicle.now_s, known or vehicle.telemetry):
             vehicle.send_command(command)
         if bridge.setpoint is not None:
             assert bridge.fence.breach(bridge.setpoint) is None

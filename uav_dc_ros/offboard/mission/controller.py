@@ -23,7 +23,6 @@ from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, Landing
 from uav_dc_ros.offboard.mission.preflight import Preflight, other_controller
 from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, MissionProgress
-from uav_dc_ros.offboard.mission.stall_detector import StallDetector
 from uav_dc_ros.offboard.mission.steps import StepControl
 from uav_dc_ros.offboard.mission.timers import CommandRetry, FaultTimer, PolicyTimeout, Time
 from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
@@ -43,6 +42,7 @@ class MissionController:
     Attributes:
         phase, reason: current phase, and why.
         progress: steps flown, current cell and goal.
+        detector: faults, battery and discarded values of the telemetry.
         setpoint: to be streamed, in the grid's ENU frame, inside the fence; None: none.
         policy_lost: set by the caller while the policy is not alive: the vehicle stops.
         is_strict: whether an impossible transition raises PhaseError (in tests) or ends the mission.
@@ -72,12 +72,11 @@ class MissionController:
         self._released = before.released  # another controller has the vehicle
         self._other_controller: str | None = None  # as reported
         home = Enu(*before.home) if before.home else None
-        self._detector = FaultDetector(settings, before.at_rest_v, home)
+        self.detector = FaultDetector(settings, before.at_rest_v, home)
         self._crash = CrashDetector(settings)
-        self._stall = StallDetector(self.progress, settings)
-        self._steps = StepControl(self.progress, settings, self._stall)
-        self._preflight = Preflight(self.progress, settings, self.fence, self._detector)
-        self._landing = Landing(self.progress, self._detector, settings.failsafe_action, Phase.ABORTED, "")
+        self._steps = StepControl(self.progress, settings)
+        self._preflight = Preflight(self.progress, settings, self.fence, self.detector)
+        self._landing = Landing(self.progress, self.detector, settings.failsafe_action, Phase.ABORTED, "")
         self._fault_timer = FaultTimer(settings.fault_timeout_s)
         self._policy = PolicyTimeout(settings, scenario.mission.step_s)
         self._retry = CommandRetry(settings)
@@ -113,11 +112,6 @@ class MissionController:
         return FaultKind.POLICY if self._policy.lost_since is not None else None
 
     @property
-    def discarded(self) -> dict[str, int]:
-        """Number of impossible values in telemetry by reason; `Telemetry.discarded` has those of messages."""
-        return self._detector.discarded
-
-    @property
     def warnings(self) -> list[str]:
         """Warnings that do not prevent the flight."""
         return self._preflight.warnings(self._telemetry)
@@ -129,8 +123,8 @@ class MissionController:
             self.progress.checkpoint,
             allowed_mode=self._preflight.allowed_mode,
             pilot_has_control=self._preflight.pilot_has_control,
-            at_rest_v=self._detector.battery.at_rest_v,
-            home=self._detector.home,
+            at_rest_v=self.detector.battery.at_rest_v,
+            home=self.detector.home,
         )
         if self.phase in GROUND:
             return saved
@@ -170,13 +164,10 @@ class MissionController:
         return None
 
     def stop(self, reason: str, telemetry: Telemetry | None = None) -> None:
-        """End the mission: a vehicle that flies lands.
+        """End the mission: a vehicle that flies lands; `telemetry` is needed before the first tick.
 
-        So does one that is armed in the commanded mode before take-off; in another mode it is a pilot's, and
-        where several vehicles are on the link it may be anyone's.
-
-        Args:
-            telemetry: before the first tick.
+        So does one that is armed in the commanded mode before take-off. In another mode it is a pilot's, and
+        where several vehicles are on the link, it may be another system's.
         """
         telemetry = telemetry or self._telemetry
         is_ours = telemetry.armed and telemetry.is_selected and telemetry.mode is Mode.COMMANDED
@@ -184,7 +175,7 @@ class MissionController:
             self._abort(reason)
         elif self.phase in GROUND and is_ours and not self._released:
             self._telemetry = telemetry
-            mode = self._detector.landing_mode(self._now.steady_s, telemetry)
+            mode = self.detector.landing_mode(self._now.steady_s, telemetry)
             self._land(Mode.LAND if telemetry.on_ground else mode, Phase.ABORTED, reason)
         elif self.phase is not Phase.LANDING and not self.is_over:
             self._released = True  # nothing was requested
@@ -195,17 +186,13 @@ class MissionController:
         return self.is_over or (self.phase is Phase.LANDING and self._landing.confirm(telemetry))
 
     def tick(self, now_s: float, telemetry: Telemetry) -> list[Command]:
-        """Decide; returns commands to be sent now.
-
-        Args:
-            now_s: steady clock.
-        """
+        """Decide at a steady time; returns commands to be sent now."""
         if self.phase.is_over:
             return []
-        self._telemetry = telemetry = self._detector.update(now_s, telemetry)
+        self._telemetry = telemetry = self.detector.update(now_s, telemetry)
         self._now = Time(telemetry.vehicle_s, now_s)
-        self._retry.update(self._now, clock_stopped=self._detector.clock_stopped(now_s))
-        self._stall.set_setpoint(self.setpoint, now_s)
+        self._retry.update(self._now, clock_stopped=self.detector.clock_stopped(now_s))
+        self._steps.set_setpoint(self.setpoint, now_s)
         if self.phase is Phase.IDLE:
             self._enter(Phase.CONNECTING, "waiting for a heartbeat and a position")
         if self.phase in FLYING:
@@ -256,24 +243,24 @@ class MissionController:
 
     def _check_faults(self, now_s: float, telemetry: Telemetry) -> None:
         """End the mission at once, or when the fault timer expires."""
-        if (low := self._detector.battery_fault(telemetry)) is not None:
+        if (low := self.detector.battery_fault(telemetry)) is not None:
             self._abort(low)
             return
         if (other := other_controller(telemetry)) not in (None, self._other_controller):
             self._other_controller = other
             self._set_reason(f"{self.reason}; {other}")
-        lost = self._detector.link_lost(now_s, telemetry)
+        lost = self.detector.link_lost(now_s, telemetry)
         if not lost and (crash := self._crash.update(telemetry, self.setpoint)) is not None:
             self._abort(crash, Mode.LAND)
             return
         if telemetry.position is not None and (breach := self.fence.breach(telemetry.position)) is not None:
             self._abort(f"the vehicle is outside the fence: {breach}")
             return
-        fault = self._detector.fault(now_s, telemetry)
+        fault = self.detector.fault(now_s, telemetry)
         if fault is None and self.phase in POLICY_CONTROLLED:
-            fault = self._stall.fault(telemetry, self.phase is Phase.MOVING and not self.policy_lost)
+            fault = self._steps.fault(telemetry, self.phase is Phase.MOVING and not self.policy_lost)
         match self._fault_timer.update(self._now, fault):
-            case "started" | "changed":
+            case "changed":
                 self._set_reason(str(self.fault))
             case "cleared" if self._policy.lost_since is not None:
                 self._set_reason(POLICY_LOST)
@@ -295,25 +282,25 @@ class MissionController:
             self._abort(f"{POLICY_LOST} for {self._policy.limit_s:g} s")
         elif not self.policy_lost and since is not None:
             self._policy.lost_since = None
-            entered_s = self._entered.vehicle_s + now.vehicle_s - since.vehicle_s
+            entered_s = self._entered.vehicle_s + (now.vehicle_s - since.vehicle_s)
             self._entered = self._entered._replace(vehicle_s=entered_s)
-            self._stall.resume()
+            self._steps.resume()
             self.setpoint = self.progress.target
             self._set_reason(f"resumed after: {self.reason}")
         return not self.policy_lost
 
-    def _abort(self, reason: str, mode: Mode | None = None, no_position_since_s: float | None = None) -> None:
+    def _abort(self, reason: str, mode: Mode | None = None, blind_since_s: float | None = None) -> None:
         """Land, and end the mission as `aborted`."""
         self._fault_timer.fault = None
         reason = reason if self._other_controller is None else f"{reason}; {self._other_controller}"
-        mode = mode or self._detector.landing_mode(self._now.steady_s, self._telemetry)
-        self._land(mode, Phase.ABORTED, reason, no_position_since_s)
+        mode = mode or self.detector.landing_mode(self._now.steady_s, self._telemetry)
+        self._land(mode, Phase.ABORTED, reason, blind_since_s)
 
     # Phases.
 
     def _act(self, now_s: float, telemetry: Telemetry) -> Command | None:
         """Decide by the current phase; returns a command, also one that was sent before."""
-        takeoff_s, now = self.settings.takeoff_timeout_s, (self.reason, self.setpoint)
+        takeoff_s, reason, setpoint = self.settings.takeoff_timeout_s, self.reason, self.setpoint
         match self.phase:
             case Phase.CONNECTING:
                 waited_s = now_s - self._entered.steady_s
@@ -324,20 +311,20 @@ class MissionController:
                 self._abort(f"not at the start after {takeoff_s:g} s")
             case Phase.TAKEOFF:
                 has_flown = self._crash.flies
-                return self._apply(self._steps.take_off(telemetry, *now, has_flown=has_flown))
+                return self._apply(self._steps.take_off(telemetry, reason, setpoint, has_flown))
             case Phase.READY if self._policy.has_expired(self._entered, self._now):
                 self._abort(f"no move from the policy for {self._policy.limit_s:g} s")
             case Phase.MOVING:
-                return self._apply(self._steps.fly(telemetry, *now, self._entered.vehicle_s))
+                return self._apply(self._steps.fly(telemetry, reason, setpoint, self._entered.vehicle_s))
             case Phase.LANDING:
                 since_s = self._retry.waited_s(SetMode(Mode.RETURN))
-                return self._apply(self._landing.update(now_s, telemetry, self.setpoint, since_s))
+                return self._apply(self._landing.update(now_s, telemetry, setpoint, since_s))
         return None
 
     def _apply(self, decision: Decision) -> Command | None:
         phase, self.setpoint = decision.phase, decision.setpoint
         if phase.is_over:
-            lost = self._detector.link_lost(self._now.steady_s, self._telemetry)
+            lost = self.detector.link_lost(self._now.steady_s, self._telemetry)
             self._released |= self.phase in GROUND and not lost
             self._end(phase, decision.reason)
         elif phase is self.phase:
@@ -351,12 +338,9 @@ class MissionController:
 
     # Transitions.
 
-    def _land(
-        self, mode: Mode, outcome: Phase, reason: str, no_position_since_s: float | None = None
-    ) -> None:
+    def _land(self, mode: Mode, outcome: Phase, reason: str, blind_since_s: float | None = None) -> None:
         """Begin a landing; the setpoint is streamed until the vehicle changes its mode."""
-        detector = self._detector
-        self._landing = Landing(self.progress, detector, mode, outcome, reason, no_position_since_s)
+        self._landing = Landing(self.progress, self.detector, mode, outcome, reason, blind_since_s)
         self._landing.confirm(self._telemetry)  # it may land already
         self._enter(Phase.LANDING, reason)
 
@@ -379,8 +363,8 @@ class MissionController:
             return
         self.phase, self.reason = phase, reason
         self._entered, self._entered_step = self._now, self.step
-        for part in (self._steps, self._stall, self._retry):
-            part.reset()
+        self._steps.reset()
+        self._retry.reset()
         self._crash.begin(flies=phase in POLICY_CONTROLLED)
         self._policy.lost_since = None
         self._on_change()

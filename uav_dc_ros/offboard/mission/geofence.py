@@ -1,4 +1,4 @@
-"""The geofence: a box for all setpoints and positions."""
+"""The bridge's geofence, and the autopilot's own limits compared with the field."""
 
 import math
 from dataclasses import dataclass
@@ -6,6 +6,8 @@ from typing import Self
 
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
+from uav_dc_ros.offboard.vehicle import Limits
 
 MARGIN_M = 20.0
 
@@ -36,3 +38,57 @@ class Geofence:
                 text = f"{value:.1f}" if math.isfinite(value) else str(value)
                 return f"{text} m {axis}; the fence reaches from {lower:g} to {upper:g} m"
         return None
+
+
+def limit_conflict(scenario: Scenario, settings: SafetySettings, limits: Limits, home: Enu) -> str | None:
+    """The limit that excludes a cell, with `tolerance_m` around its centre; None: there is none.
+
+    Args:
+        scenario: its start and dock are cells.
+        home: reference of the limits, in the grid's ENU frame, metres.
+    """
+    grid, margin_m = scenario.grid, settings.tolerance_m
+    corners = [(x * grid.cell_m, y * grid.cell_m) for x in (0, grid.n_x - 1) for y in (0, grid.n_y - 1)]
+    # No cell is farther away than a corner.
+    far_m, far = max((math.dist(home[:2], corner), corner) for corner in corners)
+    bottom_m = grid.altitude_min_m - home.up_m
+    top_m = bottom_m + (grid.n_z - 1) * grid.altitude_step_m
+    radius_m, ceiling_m, floor_m = limits.fence_radius_m, limits.fence_ceiling_m, limits.fence_floor_m
+    if radius_m is not None and far_m + margin_m > radius_m:
+        return (
+            f"the autopilot's circular fence ends {radius_m:g} m from home, and the cell at {far[0]:g} m "
+            f"east, {far[1]:g} m north is {far_m:.0f} m from there; expected at least "
+            f"{far_m + margin_m:.0f} m (FENCE_RADIUS, GF_MAX_HOR_DIST)"
+        )
+    if ceiling_m is not None and top_m + margin_m > ceiling_m:
+        return (
+            f"the autopilot's fence ends {ceiling_m:g} m above home, and the top layer is {top_m:.0f} m "
+            f"above it; expected at least {top_m + margin_m:.0f} m (FENCE_ALT_MAX, GF_MAX_VER_DIST)"
+        )
+    if floor_m is not None and bottom_m - margin_m < floor_m:
+        return (
+            f"the autopilot's fence begins {floor_m:g} m above home, and the lowest layer is "
+            f"{bottom_m:.0f} m above it; expected at most {bottom_m - margin_m:.0f} m (FENCE_ALT_MIN)"
+        )
+    return None
+
+
+def limit_warnings(scenario: Scenario, settings: SafetySettings, limits: Limits) -> list[str]:
+    """Limits that do not prevent the flight: a fence that is not compared, steps that take too long."""
+    grid, found = scenario.grid, []
+    if limits.polygon_fence:
+        found.append("the autopilot has a fence of another shape, which was not compared with the field")
+    layer_m = grid.altitude_step_m if grid.n_z > 1 else 0.0
+    ways = (
+        ("to the next cell", grid.cell_m if max(grid.n_x, grid.n_y) > 1 else 0.0, limits.speed_mps),
+        ("a layer up", layer_m, limits.climb_mps),
+        ("a layer down", layer_m, limits.descent_mps),
+    )
+    slow = [
+        f"{name} takes {way_m / speed_mps + settings.dwell_s:.0f} s at {speed_mps:g} m/s"
+        for name, way_m, speed_mps in ways
+        if speed_mps and way_m / speed_mps + settings.dwell_s > scenario.mission.step_s
+    ]
+    if slow:
+        found.append(f"{', '.join(slow)}, and a step has {scenario.mission.step_s:g} s")
+    return found

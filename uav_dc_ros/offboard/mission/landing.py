@@ -47,7 +47,7 @@ class Landing:
         mode: mode to request.
         outcome: final phase of the mission after the landing.
         reason: of the landing.
-        no_position_since_s: start of the position fault that caused the landing, steady clock.
+        blind_since_s: start of the position fault that caused the landing, steady clock.
 
     Attributes:
         confirmed: whether the vehicle was in a landing mode; any later change of the mode is a pilot's.
@@ -61,12 +61,12 @@ class Landing:
         mode: Mode,
         outcome: Phase,
         reason: str,
-        no_position_since_s: float | None = None,
+        blind_since_s: float | None = None,
     ) -> None:
         self._progress, self._detector, self._settings = progress, detector, detector.settings
         self.mode, self.outcome, self.reason = mode, outcome, reason
         self.confirmed, self.requests = False, 0
-        self._no_position_since_s = no_position_since_s
+        self._blind_since_s = blind_since_s
         self._replaces_return = False  # land is requested because the return makes no progress
         self._last_mode: Mode | None = None
         self._link_lost_since_s: float | None = None  # steady clock
@@ -134,9 +134,9 @@ class Landing:
         for timer in self._timers:
             timer.pause()
         self._updated_s = None
-        if self._no_position_since_s is not None and (heartbeat_s or 0.0) <= self._no_position_since_s:
+        if self._blind_since_s is not None and (heartbeat_s or 0.0) <= self._blind_since_s:
             # Positions were missing because the link was lost.
-            self.mode, self._no_position_since_s = settings.failsafe_action, None
+            self.mode, self._blind_since_s = settings.failsafe_action, None
             self.reason = f"link lost: no heartbeat for {settings.heartbeat_timeout_s:g} s"
         if self._link_lost_since_s is None:
             self._link_lost_since_s = now_s if heartbeat_s is None else min(now_s, heartbeat_s)

@@ -50,8 +50,8 @@ class PlausibilityFilter:
             vehicle_s=self._vehicle_s,
             position=position,
             position_s=position_s,
-            home=telemetry.home if _is_finite(telemetry.home) else None,
-            target=telemetry.target if _is_finite(telemetry.target) else None,
+            home=telemetry.home if telemetry.home and telemetry.home.is_finite else None,
+            target=telemetry.target if telemetry.target and telemetry.target.is_finite else None,
         )
         return self._last
 
@@ -62,26 +62,17 @@ class PlausibilityFilter:
         if position_s < self._newest_s or position_s > now_s + SLACK_S:
             self._discard("out of order")
             return
-        self._newest_s = position_s
-        self.jump = self._find_jump(position)
+        self._newest_s, self.jump = position_s, None
+        if not position.is_finite:
+            self.jump = "the position is not a number"
+        elif self._accepted is not None:
+            moved_m, passed_s = math.dist(position, self._accepted[0]), self._vehicle_s - self.accepted_s
+            if moved_m > self._max_jump_m + self._max_speed_mps * passed_s:
+                self.jump = f"the position jumped by {moved_m:.0f} m"
         if self.jump is None:
             self._accepted, self.accepted_s = (position, position_s), self._vehicle_s
         else:
             self._discard("impossible position")
 
-    def _find_jump(self, position: Enu) -> str | None:
-        if not _is_finite(position):
-            return "the position is not a number"
-        if self._accepted is None:
-            return None
-        moved_m, passed_s = math.dist(position, self._accepted[0]), self._vehicle_s - self.accepted_s
-        if moved_m > self._max_jump_m + self._max_speed_mps * passed_s:
-            return f"the position jumped by {moved_m:.0f} m"
-        return None
-
     def _discard(self, reason: str) -> None:
         self.discarded[reason] = self.discarded.get(reason, 0) + 1
-
-
-def _is_finite(position: Enu | None) -> bool:
-    return position is not None and all(map(math.isfinite, position))

@@ -2,9 +2,8 @@
 
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission import field_check
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
-from uav_dc_ros.offboard.mission.geofence import Geofence
+from uav_dc_ros.offboard.mission.geofence import Geofence, limit_conflict, limit_warnings
 from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, finish
 from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, Telemetry
@@ -199,7 +198,7 @@ class Preflight:
     def warnings(self, telemetry: Telemetry) -> list[str]:
         """Warnings that do not prevent the flight."""
         limits, scenario = telemetry.limits, self.progress.scenario
-        found = [] if limits is None else field_check.warnings(scenario, self.settings, limits)
+        found = [] if limits is None else limit_warnings(scenario, self.settings, limits)
         if (other := other_controller(telemetry)) is not None:
             found.append(other)
         return found
@@ -213,7 +212,7 @@ class Preflight:
         home = telemetry.home if telemetry.armed else telemetry.position or telemetry.home
         if telemetry.limits is None or home is None:
             return None
-        return field_check.conflict(self.progress.scenario, self.settings, telemetry.limits, home)
+        return limit_conflict(self.progress.scenario, self.settings, telemetry.limits, home)
 
 
 def other_controller(telemetry: Telemetry) -> str | None:

@@ -31,10 +31,8 @@ class FaultTimer:
         self.fault: Fault | None = None
         self.since = Time(0.0, 0.0)
 
-    def update(
-        self, now: Time, fault: Fault | None
-    ) -> Literal["started", "changed", "lasts", "cleared", "expired"] | None:
-        """Note the present fault; None: none, as before. `expired`: the timeout has passed on either clock.
+    def update(self, now: Time, fault: Fault | None) -> Literal["changed", "cleared", "expired"] | None:
+        """Note the present fault; returns the change. `expired`: the timeout has passed on either clock.
 
         A lost link causes the faults that follow it, and stays the current fault until all are cleared.
         """
@@ -43,12 +41,12 @@ class FaultTimer:
             return None if before is None else "cleared"
         if before is None:
             self.since = now
-            return "started"
+            return "changed"
         if before.kind in (fault.kind, FaultKind.LINK):
             self.fault = before
         if max(now.steady_s - self.since.steady_s, now.vehicle_s - self.since.vehicle_s) > self._timeout_s:
             return "expired"
-        return "lasts" if self.fault is before else "changed"
+        return None if self.fault is before else "changed"
 
 
 class PolicyTimeout:
