@@ -89,9 +89,8 @@ class Preflight:
                     return Decision(Phase.ABORTED, reason)
                 return self._land(telemetry, reason)
         elif since_s is not None and now_s - since_s > NO_POSITION_S:
-            reason = f"the vehicle flies, and its position on the grid is not known ({reason})"
-            expected = "expected --datum=LAT,LON,ALT, or the vehicle on the ground"
-            return Decision(Phase.ABORTED, f"{reason}; {expected}")
+            reason = f"the vehicle flies, and its position on the grid is not known ({reason}); expected "
+            return Decision(Phase.ABORTED, f"{reason}--datum=LAT,LON,ALT, or the vehicle on the ground")
         return Decision(Phase.CONNECTING, reason)
 
     def _is_taken_over(self, telemetry: Telemetry) -> bool:
@@ -109,11 +108,7 @@ class Preflight:
             mode = telemetry.mode
         requested = before.landing_requested and before.landing_mode is telemetry.mode
         return Decision(
-            Phase.LANDING,
-            reason,
-            landing_mode=mode,
-            outcome=outcome,
-            landing_requested=requested,
+            Phase.LANDING, reason, landing_mode=mode, outcome=outcome, landing_requested=requested
         )
 
     def _after_restart(self, telemetry: Telemetry, breach: str | None) -> Decision | None:
