@@ -10,7 +10,7 @@ from uav_dc_ros.agents import network
 from uav_dc_ros.agents.dqn import Learner, Member, td_target
 from uav_dc_ros.agents.network import Architecture
 from uav_dc_ros.agents.policy import Hyperparameters
-from uav_dc_ros.agents.replay import Transitions
+from uav_dc_ros.agents.replay import TransitionBatch
 
 CPU = torch.device("cpu")
 # Both algorithms and both aggregations, in one batch, each with values of its own. Runs 1 and 2 are
@@ -42,7 +42,7 @@ def batches(n, mixed=MIXED):
         return torch.from_numpy(np.stack([draw(rng) for rng in rngs]))
 
     for _ in range(n):
-        yield Transitions(
+        yield TransitionBatch(
             observation=stack(lambda rng: rng.random((size, 3), np.float32)),
             action=stack(lambda rng: rng.integers(0, 4, size)),
             reward=stack(lambda rng: rng.random(size, np.float32)),
@@ -53,7 +53,7 @@ def batches(n, mixed=MIXED):
 
 def of_run(batch, run, n_rows):
     """The first rows of a run's share of a mini-batch, without the dimension of the runs."""
-    return Transitions(*(values[run, :n_rows] for values in batch))
+    return TransitionBatch(*(values[run, :n_rows] for values in batch))
 
 
 class Written:
@@ -216,7 +216,7 @@ def test_a_run_learns_the_same_alone():
         alone = Learner(members(target_every=7)[run : run + 1], CPU)
         size = MIXED[run][1]["batch_size"]
         for batch in batches(30):
-            alone.update(Transitions(*(values[run : run + 1, :size] for values in batch)))
+            alone.update(TransitionBatch(*(values[run : run + 1, :size] for values in batch)))
         for name, values in alone.parameters(0).items():
             np.testing.assert_allclose(values, together.parameters(run)[name], rtol=1e-4, atol=1e-6)
 
@@ -235,7 +235,7 @@ def test_rows_beyond_a_run_s_batch_size_count_for_nothing():
     made, disturbed = Learner(members(), CPU), Learner(members(), CPU)
     for batch in batches(5):
         made.update(batch)
-        other = Transitions(*(values.clone() for values in batch))
+        other = TransitionBatch(*(values.clone() for values in batch))
         for run, (_, values) in enumerate(MIXED):
             other.reward[run, values["batch_size"] :] = 1e6
             other.observation[run, values["batch_size"] :] = 7.0

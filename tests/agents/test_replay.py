@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from uav_dc_ros.agents.replay import ReplayBuffer, Transitions
+from uav_dc_ros.agents.replay import ReplayBuffer, TransitionBatch
 
 
 def transitions(value, n_runs=2):
     """One transition of each run, all its numbers made from `value` and the run."""
     number = value + 1000.0 * torch.arange(n_runs)
-    return Transitions(
+    return TransitionBatch(
         observation=number[:, None].expand(-1, 3),
         action=number.to(torch.int64),
         reward=number,

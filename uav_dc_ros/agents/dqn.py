@@ -1,13 +1,12 @@
 """Deep Q-learning and its dueling variant (the paper's algorithms 1 and 2) for a population of runs.
 
-N independent runs learn side by side, with parameters `[N, ...]`; N = 1 is a single run. They share
-nothing but the arithmetic: every operation works run by run. The gradient is written out, for the sake
-of speed: of one fixed shape of network it is short, and a test holds it equal to torch's own.
+N independent runs learn side by side, with parameters `[N, ...]`; N = 1 is a single run. Every operation
+works run by run. The gradient is written out for speed; a test compares it with torch's own.
 
-Departures from the text of the paper, which has slips here: the dueling target uses the target
-network's own streams (theta_A', theta_V') and has the terminal case of the first algorithm. Departures of
-choice: theta' starts as a copy of theta, where the paper draws both at random, and learning begins with
-the first transition, where the prose waits for a full buffer.
+Corrections of the paper's text: the dueling target uses the target network's own streams (theta_A',
+theta_V') and has the terminal case of the first algorithm. Deviations: theta' starts as a copy of theta,
+where the paper draws both at random, and learning begins with the first transition, where the prose waits
+for a full buffer.
 """
 
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from uav_dc_ros.agents import network
 from uav_dc_ros.agents.policy import Hyperparameters
-from uav_dc_ros.agents.replay import Transitions
+from uav_dc_ros.agents.replay import TransitionBatch
 
 
 def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float | Tensor) -> Tensor:
@@ -39,7 +38,7 @@ def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float |
 
 
 class Member(NamedTuple):
-    """A run as the learner sees it: the sizes must be those of all others, the rest is its own."""
+    """A run of the learner. All runs have equal sizes; `dueling` and the hyperparameters may differ."""
 
     architecture: network.Architecture
     hyperparameters: Hyperparameters
@@ -49,13 +48,12 @@ class Member(NamedTuple):
 class Learner:
     """N Q-networks, their target networks and their optimiser.
 
-    Every network has the two streams of the dueling one in a single last layer, `head`, whose first
-    output is V and whose others are A(a). A plain network takes its Q-values from the others alone: its
-    V has no gradient and never moves.
+    Every network has both streams of the dueling one in a single last layer, `head`: its first output is V,
+    the others are A(a). The Q-values of a plain network are A(a): its V has no gradient and stays constant.
     """
 
     def __init__(self, members: Sequence[Member], device: torch.device) -> None:
-        """Networks with random parameters, each from its run's generator."""
+        """Networks with random parameters from the generator of each run."""
         self._architectures = [member.architecture for member in members]
         settings = [member.hyperparameters for member in members]
         self._n_hidden = len(self._architectures[0].hidden)
@@ -72,14 +70,13 @@ class Learner:
         self._subtracts_max = column([float(kind == "max") for kind in kinds]) > 0
         self._any_dueling, self._any_max = any(kinds), "max" in kinds
         sizes = [values.batch_size for values in settings]
-        # Twice the weight of each row in its run's mean, as the gradient of a square has it; rows beyond
-        # a run's batch size count for nothing.
+        # Twice the weight of each row in its run's mean (the gradient of a square); 0 beyond the batch size.
         rows = torch.arange(max(sizes), device=device)
         self._weight = 2.0 * (rows < column(sizes)) / column(sizes)
 
         made = [_stacked(network.initial(member.architecture, member.rng)) for member in members]
         stacks = {name: torch.from_numpy(np.stack([one[name] for one in made])) for name in made[0]}
-        # One piece of memory each, which the optimiser walks through in one go; the layers are views of it.
+        # Contiguous memory, for one pass of the optimiser; the layers are views of it.
         self._flat = torch.cat([values.reshape(-1) for values in stacks.values()]).to(device)
         self._flat_target, self._flat_gradient = self._flat.clone(), torch.zeros_like(self._flat)
         shapes = {name: values.shape for name, values in stacks.items()}
@@ -89,7 +86,7 @@ class Learner:
         self._optimiser = self._adam([values.learning_rate for values in settings])
 
     def _adam(self, rates: list[float]) -> torch.optim.Adam:
-        """Adam; with a parameter group for each stretch of neighbouring runs that share a learning rate."""
+        """Adam with a parameter group for each stretch of neighbouring runs that share a learning rate."""
         if len(set(rates)) == 1:
             self._flat.grad = self._flat_gradient
             return torch.optim.Adam([self._flat], lr=rates[0], fused=True)
@@ -111,23 +108,20 @@ class Learner:
         return self.q_values(observation).argmax(dim=-1)
 
     def act(self, observation: Tensor, explore: Tensor, choice: Tensor) -> Tensor:
-        """Epsilon-greedy actions (eq. 18): greedy with probability epsilon, else any one.
+        """Epsilon-greedy actions (eq. 18), integers `[N]`: greedy with probability epsilon, else random.
 
         Args:
             observation: `[N, D]`.
-            explore, choice: uniform draws in [0, 1), `[N]` each: whether to be greedy, and what else.
-
-        Returns:
-            Integers `[N]`.
+            explore: uniform draws in [0, 1), `[N]`; below epsilon the action is greedy.
+            choice: uniform draws in [0, 1), `[N]`, of the random action.
         """
-        anything = (choice * self._architectures[0].n_actions).to(torch.int64)
-        return torch.where(explore < self._epsilon, self.greedy(observation[:, None])[:, 0], anything)
+        random = (choice * self._architectures[0].n_actions).to(torch.int64)
+        return torch.where(explore < self._epsilon, self.greedy(observation[:, None])[:, 0], random)
 
-    def update(self, batch: Transitions) -> Tensor:
-        """One gradient step on a mini-batch `[N, B, ...]`, of which each run takes its own batch size.
+    def update(self, batch: TransitionBatch) -> Tensor:
+        """One gradient step on a mini-batch `[N, B, ...]`; returns each run's loss before the step, `[N]`.
 
-        Returns:
-            The loss of each run before the step, `[N]`.
+        A run with a smaller batch size uses the first rows.
         """
         next_q = self._q(self._forward(self._theta_target, batch.next_observation)[-1])
         y = td_target(batch.reward, batch.terminated, next_q.mT, self._gamma)
@@ -148,7 +142,7 @@ class Learner:
         for i in range(self._n_hidden):
             before = torch.bmm(outputs[-1], theta[f"hidden_{i}.weight"]).add_(theta[f"hidden_{i}.bias"])
             outputs.append(before.clamp_min_(0.0))
-        # Transposed, since the few outputs make a matrix that is slow to multiply the other way round.
+        # Transposed: with few outputs the other order is slow.
         outputs.append(torch.bmm(theta["head.weight"], outputs[-1].mT).add_(theta["head.bias"]))
         return outputs
 
@@ -164,7 +158,7 @@ class Learner:
         return torch.addcmul(advantage, self._dueling[..., None], value - subtracted)
 
     def _backward(self, features: list[Tensor], head: Tensor, action: Tensor, d_q: Tensor) -> None:
-        """Writes the gradient, from that of the Q-values of the actions taken, `[N, B]`."""
+        """Write the gradient of the parameters, from that of the taken actions' Q-values, `[N, B]`."""
         gradient, n_actions = self._gradient, head.shape[1] - 1
         d_head = torch.zeros_like(head)
         d_advantage = d_head[:, 1:]
@@ -183,7 +177,7 @@ class Learner:
         torch.sum(d_head, 2, keepdim=True, out=gradient["head.bias"])
         d_features = torch.bmm(d_head.mT, self._theta["head.weight"])
         for i in reversed(range(self._n_hidden)):
-            d_before = d_features.mul_(features[i + 1].sign_())  # ReLU: what passed is positive, the rest 0
+            d_before = d_features.mul_(features[i + 1].sign_())  # gradient of ReLU
             torch.bmm(features[i].mT, d_before, out=gradient[f"hidden_{i}.weight"])
             torch.sum(d_before, 1, keepdim=True, out=gradient[f"hidden_{i}.bias"])
             if i > 0:
@@ -195,14 +189,14 @@ class Learner:
         return _unstacked(own, self._architectures[run])
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that a later `update` depends on."""
+        """Everything that later updates depend on."""
         state = {"theta": self._flat, "theta_target": self._flat_target}
         for i, moments in self._optimiser.state_dict()["state"].items():
             state |= {f"adam.{i}.{key}": values for key, values in moments.items()}
         return state | {"iterations": torch.tensor(self._iterations)}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Becomes what gave `state`, which had the same members."""
+        """Restore the `state` of a learner with the same members."""
         self._flat.copy_(state["theta"])
         self._flat_target.copy_(state["theta_target"])
         adam = self._optimiser.state_dict()
@@ -216,20 +210,20 @@ class Learner:
 
 
 def _layers(flat: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
-    """Views of one piece of memory as layers, one behind the other."""
+    """Views of contiguous memory as layers."""
     pieces = torch.split(flat, [shape.numel() for shape in shapes.values()])
     return {name: piece.view(shape) for piece, (name, shape) in zip(pieces, shapes.items(), strict=True)}
 
 
 def _stacked(parameters: network.Parameters) -> network.Parameters:
-    """One network's parameters as the learner holds them: biases as rows, both streams in `head`."""
+    """One network's parameters in the learner's layout: biases as rows, both streams in `head`."""
     own = {name: v[None] if v.ndim == 1 else v for name, v in parameters.items() if "hidden" in name}
     streams = {"weight": [], "bias": []}  # type: dict[str, list[np.ndarray]]
     for name in ("value", "advantage") if "value.bias" in parameters else ("q",):
         for part, values in streams.items():
             values.append(np.atleast_2d(parameters[f"{name}.{part}"]))
     head = {part: np.concatenate(values, axis=-1).T for part, values in streams.items()}
-    if "q.bias" in parameters:  # has no V: a row of zeros in its place
+    if "q.bias" in parameters:  # no V: a row of zeros
         head = {part: np.concatenate([np.zeros_like(values[:1]), values]) for part, values in head.items()}
     return own | {f"head.{part}": np.ascontiguousarray(values) for part, values in head.items()}
 

@@ -1,8 +1,9 @@
 """The Q-network: one definition, as functions over a dict of arrays.
 
-It runs on numpy (a node in flight) and on torch (training, with gradients) alike. Parameters may have
-leading run dimensions: `[N, in, out]` holds N independent networks, which answer for observations
-`[N, B, D]` in one product; without them, `[in, out]`, one network answers for `[B, D]`.
+It runs on numpy (a node in flight) and on torch (training, with gradients). Parameters may have leading run
+dimensions: `[N, in, out]` are N independent networks for observations `[N, B, D]`; `[in, out]` is one
+    network for
+`[B, D]`.
 """
 
 import math
@@ -25,8 +26,8 @@ class Architecture(msgspec.Struct, frozen=True, kw_only=True):
         n_inputs: length D of the observation.
         hidden: units of each hidden layer.
         n_actions: number of actions A.
-        dueling: what is subtracted from the advantage: its `mean` (eq. 30) or its `max` (eq. 29); None
-            for the plain network of the paper's first algorithm.
+        dueling: subtracted from the advantage: its `mean` (eq. 30) or its `max` (eq. 29); None for the plain
+            network of the paper's first algorithm.
     """
 
     n_inputs: int
@@ -61,15 +62,12 @@ def initial(architecture: Architecture, rng: np.random.Generator) -> Parameters:
 
 
 def q_values(architecture: Architecture, parameters: Parameters, observation: Array) -> Array:
-    """Q(s, a) of every action.
+    """Q(s, a) of every action, `[..., B, A]`.
 
     Args:
         architecture: the sizes.
         parameters: arrays as named by `shapes`, each with the same leading dimensions `[...]`.
         observation: `[..., B, D]`, of the parameters' library and dtype.
-
-    Returns:
-        `[..., B, A]`.
     """
 
     def layer(name: str, inputs: Array) -> Array:

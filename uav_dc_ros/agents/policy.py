@@ -6,6 +6,8 @@ A policy is a folder: `config.json` (a `PolicyConfig`), `model.safetensors` (the
 
 import hashlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -27,7 +29,6 @@ from uav_dc_ros.errors import PolicyError, ScenarioError
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z"
 NAME_IN_WORDS = "at most 64 letters (a to z, A to Z), digits, '_', '.' and '-', a letter or digit first"
 CONFIG, MODEL, CARD = "config.json", "model.safetensors", "README.md"
-# Pictures for people, which nothing reads: how it learnt, and one of its missions.
 LEARNING_CURVE, TRAJECTORY = "learning_curve.png", "trajectory.png"
 
 Algorithm: TypeAlias = Literal["dqn", "dueling_dqn"]
@@ -36,18 +37,17 @@ Probability: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Hyperparameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How a policy learns; the defaults are the paper's where it gives one.
+    """Hyperparameters of training; the defaults are the paper's where it gives one.
 
     Attributes:
         gamma: discount.
         epsilon: probability of the greedy action.
         batch_size: transitions in a mini-batch.
         learning_rate: of Adam.
-        target_every: iterations between two copies to the target network. The paper leaves it open;
-            500 is about eight missions.
-        buffer_size: transitions that the replay buffer holds. The paper leaves it open; 50 000 is
-            about 800 missions.
-        episodes: missions flown to learn.
+        target_every: iterations between copies to the target network. The paper leaves it open; 500 is about
+            eight missions.
+        buffer_size: transitions in the replay buffer. The paper leaves it open; 50 000 is about 800 missions.
+        episodes: missions of training.
     """
 
     gamma: Probability = 0.9
@@ -60,21 +60,21 @@ class Hyperparameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Everything about a policy but its parameters.
+    """A policy without its parameters.
 
     Attributes:
         format: version of this file's layout.
         name: the policy's name.
         algorithm: `dqn` or `dueling_dqn`.
-        aggregation: what the dueling network subtracts from the advantage; without meaning for `dqn`.
-        observation: what the policy sees, see `core.observations`.
+        aggregation: subtracted from the advantage by the dueling network; ignored for `dqn`.
+        observation: encoding, see `core.observations`.
         hidden: units of each hidden layer.
         actions: labels of the actions, in the order of the network's outputs.
-        hyperparameters: how it learnt.
+        hyperparameters: of training.
         seed: seed of its run.
         episode: episode after which these parameters were taken.
         version: version of the package that made it.
-        scenario: the world it learnt in, as plain values.
+        scenario: the world it was trained in, as plain values.
     """
 
     format: Literal[1] = 1
@@ -91,7 +91,7 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     scenario: dict[str, Any]
 
     def architecture(self, scenario: Scenario) -> network.Architecture:
-        """Sizes of its network for the world it learnt in."""
+        """Sizes of its network for the world it was trained in."""
         return network.Architecture(
             n_inputs=observations.size(self.observation, scenario),
             hidden=self.hidden,
@@ -100,55 +100,52 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Policy:
-    """A trained policy, ready to fly.
+    """A trained policy.
 
     Attributes:
-        name: its name.
-        folder: where it was loaded from.
-        config: everything about it but its parameters.
-        scenario: the world it learnt in.
+        folder: folder that it was loaded from.
+        config: everything except the parameters.
+        scenario: the world it was trained in.
         parameters: of its network, float32, as named by `network.shapes`.
-        sha256: of its config and its model, in hex: names exactly what flew.
+        sha256: hash of config and model, in hex: identifies exactly what flew.
     """
 
-    def __init__(
-        self,
-        *,
-        folder: Path,
-        config: PolicyConfig,
-        scenario: Scenario,
-        parameters: Mapping[str, Array],
-        sha256: str,
-    ) -> None:
-        self.name = config.name
-        self.folder = folder
-        self.config = config
-        self.scenario = scenario
-        self.parameters = parameters
-        self.sha256 = sha256
-        self._architecture = config.architecture(scenario)
-        # In float64 the last digit of a product, which depends on how many missions are asked about at
-        # once, is too small to decide between two actions.
-        self._exact = {name: np.asarray(values, np.float64) for name, values in parameters.items()}
+    folder: Path
+    config: PolicyConfig
+    scenario: Scenario
+    parameters: Mapping[str, Array]
+    sha256: str
+
+    @property
+    def name(self) -> str:
+        """The policy's name."""
+        return self.config.name
+
+    @cached_property
+    def _architecture(self) -> network.Architecture:
+        return self.config.architecture(self.scenario)
+
+    @cached_property
+    def _float64(self) -> network.Parameters:
+        # The last digit of a product depends on the batch size: in float64 it cannot decide between two
+        # actions.
+        return {name: np.asarray(values, np.float64) for name, values in self.parameters.items()}
 
     def observe(
         self, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
     ) -> Array:
-        """What this policy sees of a mission, float32 `[..., D]`; see `core.observations.encode`."""
+        """The policy's observation of a mission, float32 `[..., D]`; see `core.observations.encode`."""
+        kind = self.config.observation
         return observations.encode(
-            self.config.observation,
-            scenario,
-            cell=cell,
-            step=step,
-            data_bits=data_bits,
-            collected=collected,
+            kind, scenario, cell=cell, step=step, data_bits=data_bits, collected=collected
         )
 
     def q_values(self, observation: Array) -> Array:
         """Q(s, a) of observations `[..., D]`, float64 `[..., A]`."""
         rows = np.asarray(observation, np.float64).reshape(-1, self._architecture.n_inputs)
-        values = network.q_values(self._architecture, self._exact, rows)
+        values = network.q_values(self._architecture, self._float64, rows)
         return values.reshape(*observation.shape[:-1], self._architecture.n_actions)
 
     def act(self, observation: Array) -> Array:
@@ -156,46 +153,43 @@ class Policy:
         return self.q_values(observation).argmax(axis=-1)
 
     def check(self, scenario: Scenario) -> None:
-        """Refuses a world in which what this policy sees would mean something else.
-
-        (That its actions are those of this version has been checked by `load`.)
+        """Reject a world in which the policy's observations have another meaning.
 
         Raises:
-            PolicyError: another grid, or another number of clusters unless it sees its position only.
+            PolicyError: another grid, or another number of clusters unless the policy observes its position
+                only.
         """
-        mine, flown = self.scenario, scenario
+        own = self.scenario
         facts: list[tuple[str, object, object]] = [
-            ("the grid's number of cells east, north, up", mine.grid.shape, flown.grid.shape)
+            ("the grid's number of cells east, north, up", own.grid.shape, scenario.grid.shape)
         ]
         if self.config.observation != "position":
-            facts.append(("the number of clusters", mine.n_clusters, flown.n_clusters))
-        for what, expected, value in facts:
+            facts.append(("the number of clusters", own.n_clusters, scenario.n_clusters))
+        for fact, expected, value in facts:
             if value != expected:
                 raise PolicyError(
-                    f"policy {self.name!r} does not fit scenario {flown.name!r}: {what} is {value}; "
-                    f"expected {expected}, as in {mine.name!r}, where it learnt"
+                    f"policy {self.name!r} does not fit scenario {scenario.name!r}: {fact} is {value}; "
+                    f"expected {expected}, as in {own.name!r}, where it was trained"
                 )
 
 
 def names() -> list[str]:
     """Names of the shipped policies."""
-    root = files.shipped_folder("policies")
-    # Hidden is what a killed `save` has left behind.
-    return sorted(path.parent.name for path in root.glob(f"[!.]*/{CONFIG}"))
+    # A hidden folder is the partial one of a killed `save`.
+    return sorted(path.parent.name for path in files.shipped_folder("policies").glob(f"[!.]*/{CONFIG}"))
 
 
 def load(name_or_path: str | Path) -> Policy:
     """The policy with a shipped name, or in the folder at a path.
 
     Raises:
-        PolicyError: no such policy, a file that is missing or damaged, or a config and a model that do
-            not fit together.
+        PolicyError: no such policy, a missing or damaged file, or a model that does not match the config.
     """
-    wanted = str(name_or_path)
-    folder = files.shipped_folder("policies") / wanted if wanted in names() else Path(name_or_path)
+    name = str(name_or_path)
+    folder = files.shipped_folder("policies") / name if name in names() else Path(name_or_path)
     if not folder.is_dir():
         raise PolicyError(
-            f"policy {wanted!r}: no such name or folder; expected one of {', '.join(names()) or '(none)'}, "
+            f"policy {name!r}: no such name or folder; expected one of {', '.join(names()) or '(none)'}, "
             f"or the path of a folder with {CONFIG} and {MODEL}"
         )
     config_bytes, model_bytes = _read(folder / CONFIG), _read(folder / MODEL)
@@ -222,34 +216,34 @@ def save(
     card: Callable[[Policy], str],
     draw: Callable[[Policy, Path], None] | None = None,
 ) -> None:
-    """Writes a policy's folder: under another name first, so that it is there in full or not at all.
+    """Write a policy's folder, completely or not at all.
 
     Args:
         folder: the folder to make.
-        config: everything but the parameters.
+        config: everything except the parameters.
         parameters: arrays as named by `network.shapes`.
-        card: gives the text of README.md, from the policy as it was read back.
+        card: returns the text of README.md for the policy, as loaded from the new folder.
         draw: draws pictures of the policy into the folder.
 
     Raises:
-        PolicyError: `folder` exists or cannot be written, or what was written cannot be loaded.
+        PolicyError: `folder` exists or cannot be written, or the new policy cannot be loaded.
     """
-    refuse_existing(folder)
+    check_new(folder)
     arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in parameters.items()}
     try:
         with files.building(folder) as partial:
             (partial / MODEL).write_bytes(safetensors.numpy.save(arrays))
             (partial / CONFIG).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2) + b"\n")
-            made = load(partial)
-            (partial / CARD).write_text(card(made), "utf-8")
+            policy = load(partial)
+            (partial / CARD).write_text(card(policy), "utf-8")
             if draw:
-                draw(made, partial)
+                draw(policy, partial)
     except OSError as error:
         raise PolicyError(f"policy {str(folder)!r} cannot be written: {error}") from None
 
 
-def refuse_existing(folder: Path) -> None:
-    """Raises PolicyError when `folder` exists: a policy is never overwritten."""
+def check_new(folder: Path) -> None:
+    """Raise PolicyError when `folder` exists: a policy is never overwritten."""
     if folder.exists():
         raise PolicyError(f"{str(folder)!r} exists; expected a new folder, a policy is never overwritten")
 
@@ -262,7 +256,7 @@ def _read(path: Path) -> bytes:
 
 
 def _parameters(model: bytes, architecture: network.Architecture, path: Path) -> dict[str, Array]:
-    """The arrays in a model file, which must be exactly those of the architecture."""
+    """The arrays in a model file, checked against the architecture."""
     try:
         arrays = safetensors.numpy.load(model)
     except (SafetensorError, ValueError, KeyError, TypeError) as error:

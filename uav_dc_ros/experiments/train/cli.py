@@ -123,7 +123,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
 
     folder = options.out.with_name(f"{options.out.name}.checkpoints")
     saved = folder / "training.safetensors"
-    policy.refuse_existing(options.out)
+    policy.check_new(options.out)
     try:
         training = Training(population, device)
     except (MemoryError, RuntimeError) as error:  # torch raises the latter when memory is short
@@ -207,7 +207,7 @@ def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
     Removes policies that a killed training saved after its last checkpoint.
     """
     if not resume:
-        policy.refuse_existing(folder)
+        policy.check_new(folder)
     try:
         folder.mkdir(parents=True, exist_ok=resume)
     except OSError as error:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from uav_dc_ros.agents.dqn import Learner, Member
-from uav_dc_ros.agents.replay import ReplayBuffer, Transitions
+from uav_dc_ros.agents.replay import ReplayBuffer, TransitionBatch
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import Rewards
@@ -90,7 +90,7 @@ class Training:
             torch.from_numpy(values).to(self.device).expand(n_runs, -1)
             for values in (transition.observation, transition.next_observation)
         )
-        self._buffer.add(Transitions(observation, action, reward, next_observation, terminated))
+        self._buffer.add(TransitionBatch(observation, action, reward, next_observation, terminated))
 
     @torch.inference_mode()  # the learner computes its own gradient, so autograd need not record
     def fly_episode(self) -> None:
@@ -109,7 +109,7 @@ class Training:
             outcome = worlds.step(action.numpy() if self._on_host else action, walk[t])
             next_observation = self._tensor(worlds.observe(kind))
             reward, terminated = self._tensor(outcome.reward), self._tensor(outcome.terminated)
-            self._buffer.add(Transitions(observation, action, reward, next_observation, terminated))
+            self._buffer.add(TransitionBatch(observation, action, reward, next_observation, terminated))
             loss += self.learner.update(self._buffer.sample(replay[t]))
             self._stats.add_step(worlds.state, outcome)
             # Reading from the device which missions ended would make the host wait: under `at_time_limit`
