@@ -81,7 +81,7 @@ def test_a_fifo_passes_the_content_on(tmp_path: Path) -> None:
     os.mkfifo(path)
     files.check_writable(path)
     with pytest.raises(UavDcError, match="fifo cannot be written: No such device or address"):
-        files.write(path, b"nobody reads it")
+        files.write(path, b"without a reader")
     for large in (False, True):
         read: list[bytes] = []
         opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -130,7 +130,7 @@ def test_a_descriptor_that_is_closed_is_an_error() -> None:
             check(Path("/dev/fd/987"))
 
 
-def test_what_cannot_be_written_is_said_and_nothing_is_left(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     before = sorted(tmp_path.iterdir())
     for name, reason in (("", "Is a directory"), ("no/x", "No such file"), ("file/x", "Not a directory")):
@@ -191,7 +191,7 @@ def test_content_is_on_the_disk_before_its_name_and_the_name_before_it_returns(
     assert happened == ["name x"]
 
 
-def test_nothing_else_gives_a_file_its_name() -> None:
+def test_no_other_module_renames_files() -> None:
     """A rename elsewhere would replace a device, or lose its content in a power cut."""
     renames = [
         f"{path.relative_to(PACKAGE)}:{node.lineno}"

@@ -89,9 +89,8 @@ def check_writable(path: Path) -> None:
 def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """A temporary file that replaces `path` if the block succeeds, and is removed otherwise.
 
-    Args:
-        path: the file to write. An existing one keeps its permissions, and its content after an error.
-        durable: sync to disk, so that a power cut leaves the old content or the new one.
+    An existing file keeps its permissions, and its content after an error. With `durable`, a power cut leaves
+    the old content or the new one.
 
     Raises:
         OSError: the file cannot be written.
@@ -134,10 +133,7 @@ def building(folder: Path) -> Iterator[Path]:
 def move(source: Path, path: Path, *, durable: bool = True) -> None:
     """Rename a file, or a folder, to `path` in the same file system; a file of that name is replaced.
 
-    Args:
-        source: the current path.
-        path: the new path.
-        durable: sync the content to disk before the rename, and the rename before returning.
+    With `durable`, the content is synced to disk before the rename, and the rename before this returns.
 
     Raises:
         OSError: the rename or the disk failed.

@@ -48,13 +48,13 @@ def written(path: Path, *, about: bool = True, **options: Any) -> Path:
 Row = tuple[str, bytes, int, str]  # topic, data, time, type
 
 
-def rows(path: Path, *told: Row) -> Path:
+def rows(path: Path, *messages: Row) -> Path:
     """An MCAP file with some messages."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2", "field")
         channels: dict[tuple[str, str], int] = {}
-        for n, (topic, data, time_ns, type) in enumerate(told):
+        for n, (topic, data, time_ns, type) in enumerate(messages):
             if (topic, type) not in channels:
                 schema = writer.register_schema(type, "ros2msg", b"string data" if type == STRING else b"")
                 channels[topic, type] = writer.register_channel(topic, "cdr", schema)
@@ -96,14 +96,14 @@ def test_what_mcap_leaves_to_the_writer_changes_nothing(tmp_path: Path, lacks: s
     path.write_bytes(file[:-30])
     with pytest.raises(BagDamagedError):
         messages(path)
-    if lacks not in ("chunks", "summary, chunks", "checksums"):  # without them, nobody can tell
+    if lacks not in ("chunks", "summary, chunks", "checksums"):  # nothing else shows the damage
         at = file.index(b"\4\0\0\0zstd") + 60
         path.write_bytes(file[:at] + bytes([file[at] ^ 1]) + file[at + 1 :])
         with pytest.raises(BagDamagedError):
             messages(path)
 
 
-def test_a_file_that_counts_wrong_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_count_of_messages_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path / "one.mcap", enable_crcs=False)
     file = path.read_bytes()
     counted = struct.pack("<HQHQ", 1, N // 2, 2, N // 2)
@@ -147,10 +147,10 @@ def test_messages_that_are_compressed_one_by_one_are_read_and_named(
     if path.is_file():
         assert messages(path) == messages(path, torn=True)
         recover(path, tmp_path / "out")
-        assert in_bag(tmp_path / "out")[3] == ("/b", 1003, "message 3"), "plain, for who reads metadata.yaml"
+        assert in_bag(tmp_path / "out")[3] == ("/b", 1003, "message 3"), "plain, for readers of metadata.yaml"
 
 
-def test_payloads_that_cannot_be_decoded_are_told_when_they_are_recovered(tmp_path: Path) -> None:
+def test_recover_reports_payloads_that_cannot_be_decoded(tmp_path: Path) -> None:
     path = by_message(tmp_path / "one.mcap", damaged=5)
     lines = report(recover(path, tmp_path / "out"))
     assert (
@@ -175,8 +175,8 @@ def test_sqlite_storage_needs_no_metadata(tmp_path: Path, capsys: pytest.Capture
     (storage,) = bag.glob("*.db3")
     assert messages(storage) == expected
     assert "complete" in run(capsys, "info", bag).splitlines()[0]
-    told = (bag / "metadata.yaml").read_text()
-    (bag / "metadata.yaml").write_text(told.replace("message_count: 20", "message_count: 371", 1))
+    metadata = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(metadata.replace("message_count: 20", "message_count: 371", 1))
     assert "metadata.yaml lists other files, or other numbers of messages" in run(capsys, "info", bag)
     (bag / "metadata.yaml").unlink()
     assert messages(bag) == expected
@@ -244,7 +244,7 @@ def test_compressed_files_of_a_folder_are_named(tmp_path: Path, name: str) -> No
 
 
 @contextlib.contextmanager
-def nobody() -> Iterator[None]:
+def unprivileged() -> Iterator[None]:
     """Without the rights of root."""
     user = os.geteuid()
     if user == 0:
@@ -256,7 +256,7 @@ def nobody() -> Iterator[None]:
 
 
 def test_what_may_not_be_read_is_named() -> None:
-    """In folders that anybody may enter, which those of pytest are not."""
+    """In a folder that any user may enter; those of pytest are private."""
     with tempfile.TemporaryDirectory() as place:
         Path(place).chmod(0o755)
         bag = by_rosbags(Path(place) / "bag", StoragePlugin.MCAP)
@@ -268,12 +268,12 @@ def test_what_may_not_be_read_is_named() -> None:
         ):
             before = path.stat().st_mode
             path.chmod(mode)
-            with nobody(), pytest.raises(BagError) as raised:
+            with unprivileged(), pytest.raises(BagError) as raised:
                 messages(bag)
             path.chmod(before)
             assert str(raised.value) == expected
         (bag / "metadata.yaml").chmod(0)
-        with nobody():
+        with unprivileged():
             problems = survey(bag).problems
         assert problems == [f"{bag / 'metadata.yaml'} cannot be read: Permission denied"]
 
@@ -296,8 +296,8 @@ def test_mistakes_of_ours_are_no_damage(tmp_path: Path, monkeypatch: pytest.Monk
         messages(path)
 
 
-def test_a_bag_whose_name_says_damaged_is_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Only an error of its own kind tells of damage."""
+def test_a_bag_named_damaged_is_not_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Only the class of an error reports damage."""
     path = rows(
         tmp_path / "damaged.mcap",
         ("/mission", text("x"), 1, STRING),
@@ -321,7 +321,9 @@ def test_times_beyond_those_of_ros_are_the_last_of_them(tmp_path: Path) -> None:
     assert [time_ns for _, time_ns, _ in in_bag(tmp_path / "out")][-1] == 2**63 - 1
 
 
-def test_a_topic_of_two_types_is_read_and_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_topic_of_two_types_is_read_and_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()
     for part, other in enumerate(("std_msgs/msg/Bool", "std_msgs/msg/Int8")):
@@ -351,8 +353,8 @@ def test_parts_side_by_side_are_brought_together(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()
     for part, topic in enumerate(("/a", "/b")):
-        told = ((topic, text("x"), (10 * i + part) * 10**9, STRING) for i in range(5))
-        rows(bag / f"bag_{part}.mcap", *told)
+        messages = ((topic, text("x"), (10 * i + part) * 10**9, STRING) for i in range(5))
+        rows(bag / f"bag_{part}.mcap", *messages)
     with BagReader(bag) as reader:
         assert reader.set_back_ns == 0
         got = [(message.topic, message.log_time_ns) for _, message in reader.received(["/a", "/b"])]

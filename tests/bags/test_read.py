@@ -45,18 +45,18 @@ def check_flips(path: Path, flips: list[tuple[int, int]]) -> tuple[int, int]:
     expected = messages(path)
     assert expected
     equal = refused = 0
-    told = ""
+    line = ""
     for at, bit in flips:
         path.write_bytes(file[:at] + bytes([file[at] ^ (1 << bit)]) + file[at + 1 :])
         try:
             found = messages(path)
         except BagError as error:
-            told = str(error)
+            line = str(error)
             refused += 1
         else:
             assert found == expected, f"bit {bit} of byte {at}"
             equal += 1
-        assert "\n" not in told
+        assert "\n" not in line
     path.write_bytes(file)
     assert messages(path) == expected
     return equal, refused
@@ -98,7 +98,7 @@ def test_every_bit_of_a_bag_flipped(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("each", [101, pytest.param(37, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_cut_anywhere_it_is_refused_and_read_when_asked_to(tmp_path: Path, kind: str, each: int) -> None:
+def test_a_cut_bag_is_refused_and_read_as_torn(tmp_path: Path, kind: str, each: int) -> None:
     path = flip_target(tmp_path, kind)
     file, expected = path.read_bytes(), messages(path)
     n_before = 0
@@ -221,7 +221,7 @@ def test_a_foreign_bag_without_our_topics_is_read(tmp_path: Path) -> None:
     path = tmp_path / "foreign.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
-        writer.start("", "somebody")
+        writer.start("", "other")
         schema = writer.register_schema("Thing", "jsonschema", b'{"type": "object"}')
         channels = [writer.register_channel("things", "json", schema), writer.register_channel("raw", "", 0)]
         for i, channel in enumerate(channels):

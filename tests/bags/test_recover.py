@@ -185,10 +185,10 @@ def test_cut_anywhere_all_that_is_there_comes_back(
         ),
     ],
 )
-def test_a_flipped_bit_costs_its_chunk_at_most_and_never_lies(
+def test_a_flipped_bit_costs_at_most_its_chunk_and_changes_no_message(
     in_memory: Path, quick: None, compression: str, finished: bool, n_flips: int
 ) -> None:
-    """Each file has one bit flipped; what is missing is one chunk's, and is told."""
+    """Each file has one bit flipped; only one chunk is lost, and the report lists it."""
     file = mcap_file(compression=COMPRESSIONS[compression], chunked=True, n=30)
     starts_ends = chunks(file)
     if not finished:
@@ -197,7 +197,7 @@ def test_a_flipped_bit_costs_its_chunk_at_most_and_never_lies(
     of_chunk = [len(messages_in(chunk)) for *_, chunk in starts_ends]
     chance = random.Random(2)
     flips = [(at, chance.randrange(8)) for at in chance.sample(range(8, len(file)), n_flips)]
-    for start, *_ in starts_ends[1:2]:  # all that a chunk says of itself
+    for start, *_ in starts_ends[1:2]:  # the header of a chunk
         flips += [(at, bit) for at in range(start, start + 53) for bit in (0, 7)]
     flips.append((starts_ends[1][1], 1))  # a message index becomes a message
     bag = folder_of(in_memory / "bag", [flipped(file, *flip) for flip in flips])
@@ -210,7 +210,7 @@ def test_a_flipped_bit_costs_its_chunk_at_most_and_never_lies(
             n_lost += 1
             [number] = [i for i, (start, end, _) in enumerate(starts_ends) if start <= at < end]
             first = sum(of_chunk[:number])
-            # Without an end, nobody else tells of the topics that the first chunk names.
+            # Without an end, only the first chunk names its topics.
             assert missing == sorted(messages[first : first + of_chunk[number]]) or (
                 number == 0 and not finished
             )
@@ -228,7 +228,7 @@ def flipped(file: bytes, at: int, bit: int) -> bytes:
 
 
 def test_damage_across_chunks_is_passed_over(tmp_path: Path) -> None:
-    """With an end, that tells where chunks begin, and without one; and messages outside of chunks."""
+    """With an end, which lists the chunks, and without one; and messages outside of chunks."""
     for name, compression, chunked, finished in (
         ("indexed", CompressionType.ZSTD, True, True),
         ("torn", CompressionType.ZSTD, True, False),

@@ -145,7 +145,7 @@ def test_a_repaired_part_has_the_records_of_the_torn_one(tmp_path: Path, kind: s
     assert {"depth: 7" in c.metadata["offered_qos_profiles"] for c in summary.channels.values()} == {True}
 
 
-def test_a_part_tells_its_counts_once(tmp_path: Path) -> None:
+def test_a_repaired_part_records_its_counts_once(tmp_path: Path) -> None:
     """Killed at the very end, a part has rosbag2's record of itself already; the copy has its own."""
     with BagWriter(tmp_path / "bag", {}) as writer:
         writer.add_topic("/a", STRING)
@@ -154,8 +154,8 @@ def test_a_part_tells_its_counts_once(tmp_path: Path) -> None:
     repair(torn)
     with (torn / "torn_0.mcap").open("rb") as file:
         records = [record for record in make_reader(file).iter_metadata() if record.name == "rosbag2"]
-    [told] = [YAML(typ="safe").load(record.metadata["serialized_metadata"]) for record in records]
-    assert (told["relative_file_paths"], told["message_count"]) == (["torn_0.mcap"], 1)
+    [info] = [YAML(typ="safe").load(record.metadata["serialized_metadata"]) for record in records]
+    assert (info["relative_file_paths"], info["message_count"]) == (["torn_0.mcap"], 1)
 
 
 def test_metadata_yaml_of_a_repaired_bag(tmp_path: Path) -> None:
@@ -325,7 +325,7 @@ def test_a_file_that_is_no_mcap_file_is_refused_and_kept(tmp_path: Path, other: 
 
 def test_a_compression_that_cannot_be_read_loses_no_message(tmp_path: Path) -> None:
     file = made("zstd", finished=False).replace(b"\x04\0\0\0zstd", b"\x04\0\0\0fast")
-    file = file.replace(b"\x28\xb5\x2f\xfd", b"fast")  # zstd's magic: else its CRC tells that it is zstd
+    file = file.replace(b"\x28\xb5\x2f\xfd", b"fast")  # zstd's magic: else its CRC shows that it is zstd
     bag = folder_of(tmp_path / "bag", file)
     with pytest.raises(BagError, match="unsupported compression type fast"):
         repair(bag)

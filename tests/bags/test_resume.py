@@ -1,4 +1,4 @@
-"""Going on with a bag whose writer was killed: the next part, and nothing twice."""
+"""Resuming a bag whose writer was killed: the next part, and nothing twice."""
 
 import resource
 import subprocess
@@ -41,7 +41,7 @@ def left_by_a_killed_writer(
 
 
 def test_killed_twice_and_then_closed(tmp_path: Path) -> None:
-    """Three parts; whoever goes on repeats what was lost, and skips what was not, as with latched topics."""
+    """Three parts; a resumed writer repeats lost messages, and skips others, as with latched topics."""
     bag = tmp_path / "bag"
     first = 0
     for resume in (False, True):
@@ -49,7 +49,7 @@ def test_killed_twice_and_then_closed(tmp_path: Path) -> None:
         assert not (bag / "metadata.yaml").exists()
         with folder_lock(bag):
             pass  # a killed writer holds no lock
-        # What a second writer would be told, without making a part.
+        # What a second writer would read, without making a part.
         shadow = tmp_path / f"shadow_{resume}"
         shadow.mkdir()
         for name, data in content(bag).items():
@@ -131,7 +131,7 @@ def test_a_writer_that_was_killed_before_its_first_byte(tmp_path: Path) -> None:
     assert in_bag(tmp_path / "empty") == [("/a", 7, "x")]
 
 
-def test_a_moved_bag_goes_on_with_the_next_number(tmp_path: Path) -> None:
+def test_a_moved_bag_is_resumed_with_the_next_number(tmp_path: Path) -> None:
     moved = left_by_a_killed_writer(tmp_path / "bag").rename(tmp_path / "moved")
     BagWriter(moved, {}, resume=True).close()
     assert information(moved)["relative_file_paths"] == ["bag_0.mcap", "moved_1.mcap"]
@@ -139,7 +139,7 @@ def test_a_moved_bag_goes_on_with_the_next_number(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("before", [(), (qos(1),)])
 def test_rosbags_reads_every_part_though_the_qos_differs(tmp_path: Path, before: tuple[Qos, ...]) -> None:
-    """It skips the messages of a channel whose QoS is not that of metadata.yaml, and says nothing."""
+    """It silently skips the messages of a channel whose QoS is not that of metadata.yaml."""
     bag = left_by_a_killed_writer(tmp_path / "bag", offered=before)
     with BagWriter(bag, {}, resume=True) as writer:
         writer.add_topic("/a", STRING, [qos(2), qos(3)])
@@ -158,7 +158,7 @@ def test_a_topic_that_was_silent_gets_its_qos_from_the_part_that_has_messages(tm
     assert in_bag(bag) == [("/a", 1, "x")]
 
 
-def test_what_the_first_part_says_of_the_bag_stays(tmp_path: Path) -> None:
+def test_the_description_of_the_first_part_stays(tmp_path: Path) -> None:
     bag = left_by_a_killed_writer(tmp_path / "bag")
     BagWriter(bag, {"seed": "4", "more": "x"}, resume=True).close()
     assert information(bag)["custom_data"] == {"seed": "3", "more": "x"}
@@ -191,7 +191,7 @@ def test_a_full_disk_leaves_the_bag_as_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", ["add_message", "add_channel", "finish"])
-def test_a_failure_lets_the_folder_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+def test_a_failure_releases_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 

@@ -28,7 +28,7 @@ def qos(*, latched: bool) -> Qos:
 
 
 def split_bag(folder: Path, n: int = 2000, **limits: float) -> Path:
-    """A bag of incompressible messages, a hundred a second: a latched topic says something now and then."""
+    """A bag of incompressible messages, a hundred a second: every 500th message is on a latched topic."""
     noise = random.Random(1)
     with BagWriter(folder, {"seed": "3"}, compression="none", **limits) as bag:  # type: ignore[arg-type]
         bag.add_topic("/pose", STRING, [qos(latched=False)])
@@ -78,8 +78,8 @@ def test_each_part_begins_with_the_latched_messages_and_the_bag_has_them_once(tm
         assert log_time_ns == written[1][2] == n * 4 * S, "where the part begins"
         assert [one[1] for one in written[1:]].count(0) == 0
     with BagReader(bag) as reader:
-        told = [int(message.data[8:17]) for message in reader.messages()]
-        assert told == list(range(2000))
+        numbers = [int(message.data[8:17]) for message in reader.messages()]
+        assert numbers == list(range(2000))
         assert (reader.message_count, reader.topics["/map"].count) == (2000, 4)
     with BagReader(bag / "bag_3.mcap") as alone:
         assert next(alone.messages()).topic == "/map"
@@ -89,7 +89,7 @@ def test_each_part_begins_with_the_latched_messages_and_the_bag_has_them_once(tm
 
 
 def test_a_latched_topic_of_several_publishers_repeats_one_message_of_each(tmp_path: Path) -> None:
-    """As for /tf_static, where each of them says something else, once."""
+    """As for /tf_static, where each of them publishes its own message, once."""
     with BagWriter(tmp_path / "bag", {}, split_s=1.0) as bag:
         bag.add_topic("/tf_static", STRING, [qos(latched=True)])
         bag.add_topic("/pose", STRING)
@@ -101,7 +101,7 @@ def test_a_latched_topic_of_several_publishers_repeats_one_message_of_each(tmp_p
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_chunks_are_compressed_as_asked(tmp_path: Path, compression: str) -> None:
+def test_chunks_have_the_given_compression(tmp_path: Path, compression: str) -> None:
     with BagWriter(tmp_path / "bag", {}, compression=compression) as bag:
         bag.add_topic("/a", STRING)
         for i in range(100):
@@ -113,7 +113,7 @@ def test_chunks_are_compressed_as_asked(tmp_path: Path, compression: str) -> Non
     assert len(in_bag(tmp_path / "bag")) == 100
 
 
-def test_dropped_messages_are_told_by_each_part_and_summed_up(tmp_path: Path) -> None:
+def test_each_part_records_its_dropped_messages_and_the_bag_their_sum(tmp_path: Path) -> None:
     folder = tmp_path / "bag"
     with BagWriter(folder, {}, split_s=1.0) as bag:
         for topic in ("/a", "/b"):
@@ -135,7 +135,7 @@ def test_dropped_messages_are_told_by_each_part_and_summed_up(tmp_path: Path) ->
     assert information(folder)["custom_data"] == {"dropped": '{"/a": 7, "/b": 1}'}
 
 
-def test_a_bag_of_which_nothing_was_dropped_says_so_and_one_that_nobody_counted_does_not(
+def test_a_bag_without_dropped_messages_differs_from_one_without_a_count(
     tmp_path: Path,
 ) -> None:
     with BagWriter(tmp_path / "counted", {}) as bag:
@@ -158,12 +158,12 @@ def test_a_split_part_that_is_cut_anywhere_counts_what_it_repeats(tmp_path: Path
         (folder / "bag_1.mcap").write_bytes(last[:cut])
         repair(folder)
         with BagReader(folder) as reader:
-            told = [int(message.data[8:17]) for message in reader.messages()]
-            assert told == list(range(len(told)))
-            assert reader.message_count == len(told) >= 400
+            numbers = [int(message.data[8:17]) for message in reader.messages()]
+            assert numbers == list(range(len(numbers)))
+            assert reader.message_count == len(numbers) >= 400
 
 
-def test_who_goes_on_with_a_bag_repeats_the_latched_messages_too(tmp_path: Path) -> None:
+def test_a_resumed_writer_repeats_the_latched_messages_too(tmp_path: Path) -> None:
     folder = split_bag(tmp_path / "bag", n=100)
     (folder / "metadata.yaml").unlink()
     with BagWriter(folder, {}, resume=True) as bag:
@@ -177,7 +177,7 @@ def test_who_goes_on_with_a_bag_repeats_the_latched_messages_too(tmp_path: Path)
         assert [int(message.data[8:17]) for message in reader.messages()] == list(range(110))
 
 
-# Says of each message when it was handed over; a thousand a second, far less than fill a chunk.
+# Prints how many messages were synced; it writes a thousand a second, far less than fill a chunk.
 SYNCING = """
 import sys, time
 from pathlib import Path
@@ -208,7 +208,7 @@ def test_what_was_synced_survives_a_kill(tmp_path: Path) -> None:
     process.wait()
     repair(tmp_path / "bag")
     with BagReader(tmp_path / "bag") as reader:
-        told = [int(message.data[8:17]) for message in reader.messages()]
+        numbers = [int(message.data[8:17]) for message in reader.messages()]
     assert len(reader.parts) > 1
-    assert told == list(range(len(told)))
-    assert synced <= len(told) < synced + 100 + 10
+    assert numbers == list(range(len(numbers)))
+    assert synced <= len(numbers) < synced + 100 + 10

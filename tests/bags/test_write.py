@@ -9,21 +9,13 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
+from tests.support.bags import STRING, TYPES, text
 from uav_dc_ros.bags.metadata import ABOUT_RECORD
 from uav_dc_ros.bags.part_writer import CHUNK_BYTES
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.errors import BagError
-
-TYPES = get_typestore(Stores.ROS2_JAZZY)
-STRING = "std_msgs/msg/String"
-
-
-def text(content: str) -> bytes:
-    """A std_msgs/String, serialised."""
-    return bytes(TYPES.serialize_cdr(TYPES.types[STRING](content), STRING))
 
 
 def written(folder: Path, n: int = 3) -> Path:

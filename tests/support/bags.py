@@ -31,7 +31,7 @@ QOS = """
   avoid_ros_namespace_conventions: false
 """
 
-# Writes numbered messages on two topics until it is killed; says after each how many there are.
+# Writes numbered messages on two topics until it is killed; prints their number after each.
 WRITER = """
 import sys
 from pathlib import Path
@@ -124,7 +124,7 @@ def in_bag(folder: Path) -> list[tuple[str, int, Any]]:
 
 
 def information(folder: Path) -> dict[str, Any]:
-    """What metadata.yaml says."""
+    """The content of metadata.yaml."""
     return dict(YAML(typ="safe").load(folder / "metadata.yaml")["rosbag2_bagfile_information"])
 
 

@@ -36,7 +36,7 @@ def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False, repeats: bo
 
     Args:
         path: the file.
-        closing: closes the file.
+        closing: closes it.
         torn: scan the file as far as possible, if it has no end or is damaged.
         repeats: keep the latched messages at its head that an earlier part of the bag has.
 
@@ -240,35 +240,19 @@ def _message(topic: str, type: str, message: Message, data: bytes) -> BagMessage
 
 def _scanned(scan: Scan, left_out: Collection[str], topics: Collection[str] | None) -> Iterator[BagMessage]:
     """Messages of some topics (None: all) in the order of the file, without repeated ones of `left_out`."""
-    schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}
-    records = iter(scan)
-    while True:
-        with read_errors(scan.path):
-            record = next(records, None)
-        if record is None:
-            return
-        if isinstance(record, Schema):
-            schemas[record.id] = record.name
-        elif isinstance(record, Channel):
-            channels[record.id] = record.topic, schemas.get(record.schema_id, "")
-        elif isinstance(record, Message):
-            topic, type = channels[record.channel_id]
-            if (record.sequence == 0 and topic in left_out) or (topics is not None and topic not in topics):
-                continue
-            yield _message(topic, type, record, record.data)
+    with read_errors(scan.path):
+        for record in scan:
+            if isinstance(record, Message):
+                topic, type = scan.channels[record.channel_id]
+                is_repeated = record.sequence == 0 and topic in left_out
+                if not is_repeated and (topics is None or topic in topics):
+                    yield _message(topic, type, record, record.data)
 
 
 def _sorted(
     messages: Iterator[BagMessage], lag_ns: int, start_ns: int | None, end_ns: int | None
 ) -> Iterator[BagMessage]:
-    """Messages between two log times, sorted by log time.
-
-    Args:
-        messages: in the order of a file.
-        lag_ns: the longest step back in log time from any earlier message.
-        start_ns, end_ns: first log time, and end (excluded).
-    """
+    """Messages from one log time on and before another, sorted, with steps back of at most `lag_ns`."""
     newest_ns = 0
 
     def in_range() -> Iterator[tuple[int, BagMessage]]:

@@ -20,11 +20,7 @@ def typestore() -> "Typestore":
 
 
 def definition(type: str) -> bytes:
-    """A message type such as `std_msgs/msg/String` with all types inside it, in the encoding `ros2msg`.
-
-    Raises:
-        BagError: ROS 2 Jazzy has no such type.
-    """
+    """A message type with all types inside it, as `ros2msg`; BagError if ROS 2 Jazzy does not have it."""
     if type not in typestore().fielddefs:
         raise BagError(f"{type!r}; expected a type of ROS 2 Jazzy")
     text, _ = typestore().generate_msgdef(type, ros_version=2)
@@ -32,12 +28,9 @@ def definition(type: str) -> bytes:
 
 
 def matches_jazzy(type: str, encoding: str, definition: bytes) -> bool:
-    """Whether a recorded definition has the fields of ROS 2 Jazzy's; True without one to compare.
+    """Whether a recorded definition has the fields of ROS 2 Jazzy's.
 
-    Args:
-        type: such as `std_msgs/msg/String`.
-        encoding: `ros2msg` and `ros2idl` are compared.
-        definition: the text, with all types inside it.
+    True without a definition, and in another encoding than `ros2msg` and `ros2idl`.
     """
     if not definition or encoding not in ("ros2msg", "ros2idl"):
         return True

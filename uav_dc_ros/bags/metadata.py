@@ -58,13 +58,7 @@ class Part:
         return sum(self.counts.values())
 
     def add_topic(self, topic: str, type: str, encoding: str, channel: Mapping[str, str]) -> None:
-        """Add a topic; a known one stays as it is.
-
-        Args:
-            topic: full name.
-            type: ROS 2 message type.
-            encoding: of the messages, such as `cdr`.
-            channel: rosbag2's metadata of the MCAP channel.
+        """Add a topic with rosbag2's metadata of its channel; a known topic stays as it is.
 
         Raises:
             BagError: the channel's QoS is not in rosbag2's format.
@@ -171,11 +165,7 @@ def _times(part: Part, default_ns: int) -> dict[str, Any]:
 
 
 def write_metadata(folder: Path, parts: Sequence[Part]) -> None:
-    """Write metadata.yaml.
-
-    Raises:
-        BagError: the disk is full or gone.
-    """
+    """Write metadata.yaml; BagError if the disk is full or gone."""
     text = to_yaml({"rosbag2_bagfile_information": information(parts)}) + "\n"
     try:
         files.write(folder / METADATA_FILE, text.encode())

@@ -67,10 +67,10 @@ class PartWriter:
     """Writes one MCAP file in chunks, and records its contents in `part`.
 
     Args:
-        path: the file; must not exist.
-        name: the part's name, if the file has a temporary one.
-        compression: of the chunks, one of `bags.COMPRESSIONS`.
-        chunk_bytes: size of a finished chunk before compression.
+        path: must not exist.
+        name: the part's name, if `path` is temporary.
+        compression: one of `bags.COMPRESSIONS`.
+        chunk_bytes: size of a chunk before compression.
 
     Raises (all methods): OSError, which the owner of the bag translates.
     """

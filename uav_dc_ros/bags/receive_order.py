@@ -75,8 +75,7 @@ def set_back_ns(recorded: Iterable[BagMessage]) -> int:
 def in_order(recorded: Iterable[BagMessage]) -> Iterator[tuple[int, BagMessage]]:
     """Messages in the order of receipt, each with how often the clock had been set back before it.
 
-    Args:
-        recorded: messages in the order of recording; those of a topic are in the order of receipt.
+    Those of one topic are recorded in the order of receipt.
     """
     clock = _Clock()
     keyed = (((clock.setting(message), message.log_time_ns), message) for message in recorded)

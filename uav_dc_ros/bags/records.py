@@ -64,10 +64,7 @@ class _StrictStream(ReadDataStream):
 def parse(opcode: int, content: bytes, *, exact: bool = False) -> records.McapRecord | None:
     """A record of a kind in `_READERS`; None for other kinds and for an invalid record.
 
-    Args:
-        opcode: the record's.
-        content: the bytes after the record's header.
-        exact: reject bytes after the last field. MCAP allows them, for future fields.
+    With `exact`, bytes after the last field are invalid; MCAP allows them for future fields.
     """
     read = _READERS.get(Opcode(opcode)) if opcode in Opcode._value2member_map_ else None
     if read is None:
@@ -139,8 +136,7 @@ def _decompressed(compression: str, data: bytes) -> bytes | None:
 def decompress_chunk(header: ChunkHeader, data: bytes) -> bytes | None:
     """The data of a whole chunk, decompressed and checked; None if it is damaged.
 
-    Raises:
-        UnsupportedCompressionError: the compression is unknown.
+    Raises UnsupportedCompressionError.
     """
     known = header.compression in CHUNK_COMPRESSIONS
     for compression in (header.compression,) if known else CHUNK_COMPRESSIONS:  # the name may be damaged

@@ -43,12 +43,9 @@ _Key = TypeVar("_Key", int, tuple[int, int])
 
 
 class BagMessage(NamedTuple):
-    """A message of a bag.
+    """A message of a bag, its data serialised (CDR).
 
     Attributes:
-        topic: full name.
-        type: ROS 2 message type.
-        data: serialised (CDR).
         log_time_ns: receive time, nanoseconds since the epoch.
         publish_time_ns: publish time; the log time, if the bag has none.
     """
@@ -65,8 +62,6 @@ class RecordedTopic:
     """A topic of a bag.
 
     Attributes:
-        name: full name.
-        type: ROS 2 message type.
         definition: the type with all types inside it, as text in `encoding`; empty if the bag has none.
         encoding: of the definition: `ros2msg`, or `ros2idl`.
         serialization: of the messages, `cdr` in ROS 2.
@@ -175,11 +170,7 @@ def describe_foreign(beginning: bytes) -> str:
 
 
 def goes_back_ns(times: Iterable[tuple[object, int]]) -> int:
-    """The longest step back in time between consecutive messages of a topic.
-
-    Args:
-        times: topic (or channel) and log time of each message, in order within a topic.
-    """
+    """The longest step back between consecutive log times of a topic (or channel), given both by message."""
     max_ns, last_ns = 0, dict[object, int]()
     for topic, time_ns in times:
         max_ns = max(max_ns, last_ns.get(topic, 0) - time_ns)
@@ -192,12 +183,9 @@ def sorted_within(
     max_bytes: int,
     is_due: Callable[[_Key], bool] = lambda key: False,
 ) -> Iterator[tuple[_Key, BagMessage]]:
-    """Messages sorted by their keys within a buffer; those of equal keys keep their order.
+    """Messages sorted by their keys within a buffer of `max_bytes`; those of equal keys keep their order.
 
-    Args:
-        keyed: messages with their keys.
-        max_bytes: size of the buffer: a message that is further out of order stays so.
-        is_due: whether no message with a smaller key follows.
+    `is_due` is true of a key that no smaller one follows.
     """
     waiting: list[tuple[_Key, int, BagMessage]] = []  # key, number
     waiting_bytes = 0

@@ -113,13 +113,13 @@ def copy(scan: Scan, writer: PartWriter) -> None:
     """Copy the readable records of a part; the writer makes new indexes."""
     schemas = {0: 0}  # ids in the copy; 0: a channel without a schema
     channels: dict[int, int] = {}
-    topics: dict[int, str] = {}
     repeated: Counter[str] = Counter()
     for record in scan:
         match record:
             case Message():
-                if record.sequence == 0 and topics[record.channel_id] in scan.part.repeated:
-                    repeated[topics[record.channel_id]] += 1
+                topic, _ = scan.channels[record.channel_id]
+                if record.sequence == 0 and topic in scan.part.repeated:
+                    repeated[topic] += 1
                 channel = channels[record.channel_id]
                 writer.add_message(
                     channel, record.data, record.log_time, record.publish_time, record.sequence
@@ -130,7 +130,6 @@ def copy(scan: Scan, writer: PartWriter) -> None:
                 channels[record.id] = writer.add_channel(
                     record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
                 )
-                topics[record.id] = record.topic
             case Metadata(name="rosbag2") | Metadata(name=metadata.REPEATED_RECORD):
                 pass  # counts of the unfinished part: the copy has its own
             case Metadata():

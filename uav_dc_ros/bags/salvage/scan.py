@@ -126,6 +126,7 @@ class Scan:
 
     Attributes:
         part: contents read so far.
+        channels: topic and type by channel id so far.
         library: name of the software that wrote the file.
         lag_ns: the longest step back in log time from any earlier message so far.
         goes_back_ns: the longest step back from the message before on the same topic so far.
@@ -143,6 +144,7 @@ class Scan:
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self.path = path
         self.part = Part(path.name)
+        self.channels: dict[int, tuple[str, str]] = {}
         self.damages: list[Damage] = []
         self.unreadable = Unreadable()
         self.compressed: set[str] = set()
@@ -153,7 +155,6 @@ class Scan:
         self.size = self._reader.size
         self.magic = self._reader.read(0, len(MAGIC))
         self._schemas: dict[int, str] = {0: ""}
-        self._channels: dict[int, str] = {}
         self._cdr_channels: set[int] = set()
         self._latched: set[str] = set()
         self._times_ns: dict[str, int] = {}  # log time of the last message by topic
@@ -243,8 +244,8 @@ class Scan:
         if number < len(self._indexed_offsets):
             return self._indexed_offsets[number]
         found = None
-        if self._channels and not self._chunked:  # bytes of a damaged chunk can look like messages
-            found = self._reader.next_message(at, self._channels)
+        if self.channels and not self._chunked:  # bytes of a damaged chunk can look like messages
+            found = self._reader.next_message(at, self.channels)
         if found is None:
             found = self._reader.next_chunk(at)
         return self.size if found is None else found
@@ -300,12 +301,12 @@ class Scan:
     def _message(self, content: bytes) -> Iterator[McapRecord]:
         """A message, after its schema and channel if only the summary still has them."""
         channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(content)
-        if channel not in self._channels:
+        if channel not in self.channels:
             yield from self._from_summary(channel)
-        if channel not in self._channels:
+        if channel not in self.channels:
             self._add_damage(self._at, HEADER.size + len(content), "messages of a topic that is lost")
             return
-        topic = self._channels[channel]
+        topic, _ = self.channels[channel]
         log_time_ns, publish_time_ns = min(log_time_ns, TIME_MAX_NS), min(publish_time_ns, TIME_MAX_NS)
         self.part.add_message(topic, log_time_ns, publish_time_ns)
         self.lag_ns = max(self.lag_ns, self.part.last_ns - log_time_ns)
@@ -351,12 +352,12 @@ class Scan:
                 return False
             self._schemas[record.id] = record.name
         elif isinstance(record, Channel):
-            if record.id in self._channels or record.schema_id not in self._schemas:
+            if record.id in self.channels or record.schema_id not in self._schemas:
                 return False
-            self._channels[record.id] = record.topic
+            type = self._schemas[record.schema_id]
+            self.channels[record.id] = record.topic, type
             if record.message_encoding == CDR:
                 self._cdr_channels.add(record.id)
-            type = self._schemas[record.schema_id]
             self.part.add_topic(record.topic, type, record.message_encoding, record.metadata)
             if is_latched(self.part.topics[record.topic]):
                 self._latched.add(record.topic)
