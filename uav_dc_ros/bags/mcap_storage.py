@@ -8,7 +8,7 @@ from typing import IO
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Message, Metadata, Schema
+from mcap.records import Channel, Message, Schema
 from mcap.summary import Summary
 
 from uav_dc_ros.bags.metadata import Part
@@ -90,7 +90,8 @@ def _open_indexed(
     assert statistics is not None, "it is an index"
     part = Part(path.name)
     with damage_errors(path):
-        for metadata in _metadata(path, file, reader, summary):
+        indexed = statistics.metadata_count == len(summary.metadata_indexes) > 0
+        for metadata in reader.iter_metadata() if indexed else metadata_records(path, file):
             part.add_metadata(metadata.name, metadata.metadata)
         library = reader.get_header().library
     for index in summary.chunk_indexes:
@@ -153,14 +154,6 @@ def _open_indexed(
     )
 
 
-def _metadata(path: Path, file: IO[bytes], reader: SeekingReader, summary: Summary) -> Iterator[Metadata]:
-    """The metadata records, by their index if it has all of them."""
-    count = summary.statistics.metadata_count if summary.statistics is not None else 0
-    if count and count == len(summary.metadata_indexes):
-        return reader.iter_metadata()
-    return metadata_records(path, file)
-
-
 def _indexed_times(file: IO[bytes], summary: Summary) -> Iterator[tuple[int, int]]:
     """Channel and log time of each message, in order within a channel, by the message indexes.
 
@@ -183,7 +176,14 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
     path = scan.path
 
     def recorded(topics: Collection[str] | None) -> Iterator[BagMessage]:
-        return _scanned(Scan(path, file), left_out, topics)
+        with read_errors(path):
+            again = Scan(path, file)
+            for record in again:
+                if isinstance(record, Message):
+                    topic, type = again.channels[record.channel_id]
+                    is_repeated = record.sequence == 0 and topic in left_out
+                    if not is_repeated and (topics is None or topic in topics):
+                        yield _message(topic, type, record, record.data)
 
     def messages(
         topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
@@ -238,21 +238,10 @@ def _message(topic: str, type: str, message: Message, data: bytes) -> BagMessage
     return BagMessage(topic, type, data, log_time_ns, publish_time_ns)
 
 
-def _scanned(scan: Scan, left_out: Collection[str], topics: Collection[str] | None) -> Iterator[BagMessage]:
-    """Messages of some topics (None: all) in the order of the file, without repeated ones of `left_out`."""
-    with read_errors(scan.path):
-        for record in scan:
-            if isinstance(record, Message):
-                topic, type = scan.channels[record.channel_id]
-                is_repeated = record.sequence == 0 and topic in left_out
-                if not is_repeated and (topics is None or topic in topics):
-                    yield _message(topic, type, record, record.data)
-
-
 def _sorted(
     messages: Iterator[BagMessage], lag_ns: int, start_ns: int | None, end_ns: int | None
 ) -> Iterator[BagMessage]:
-    """Messages from one log time on and before another, sorted, with steps back of at most `lag_ns`."""
+    """Messages of a range of log times, sorted; `messages` go back by at most `lag_ns`."""
     newest_ns = 0
 
     def in_range() -> Iterator[tuple[int, BagMessage]]:

@@ -173,9 +173,8 @@ class Scan:
         try:
             if not has_end(self._file):
                 return None
-            self._file.seek(
-                -len(MAGIC), os.SEEK_END
-            )  # mcap checks for a magic; that at the start may be damaged
+            # mcap checks for a magic here; that at the start may be damaged.
+            self._file.seek(-len(MAGIC), os.SEEK_END)
             return SeekingReader(self._file).get_summary()
         except Exception:  # of mcap, struct: a damaged summary without a CRC
             return None
