@@ -183,7 +183,7 @@ def test_wind_that_outdoes_the_vehicle_ends_with_a_landing_where_it_is(kind: str
     moving(flight)
     flight.do("wind 20 0")
     flight.until_over(120.0)
-    check_aborted(flight, "no nearer to cell", "return no nearer to home", "lands")
+    check_aborted(flight, "no nearer to cell", "return makes no progress", "requests land")
     returns, lands = ("RTL", "LAND") if kind == "ardupilot" else ("AUTO.RTL", "AUTO.LAND")
     assert [event["mode"] for event in flight.all("mode")][-2:] == [returns, lands]
 

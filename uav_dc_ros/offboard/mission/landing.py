@@ -105,13 +105,12 @@ class Landing:
         if not telemetry.armed:
             return self._check_disarmed(now_s, telemetry)
         if self._detector.clock_stopped_for_s(now_s) > settings.link_lost_timeout_s:
-            text = f"the vehicle's time has not advanced for {settings.link_lost_timeout_s:g} s"
-            return Decision(Phase.ABORTED, f"{self.reason}; {text}")
+            return self._abort(f"the vehicle's time has not advanced for {settings.link_lost_timeout_s:g} s")
         if (stall := self._stall(now_s, telemetry)) is not None:
             if not (telemetry.mode is self.mode is Mode.RETURN and self.requests):
-                return Decision(Phase.ABORTED, f"{self.reason}; {stall}")
+                return self._abort(stall)
             self.mode, self._replaces_return = Mode.LAND, True
-            self.reason = f"{self.reason}; {stall}: lands"
+            self.reason += f"; {stall}: requests land"
             self._lower.reset()
             self._updated_s = now_s
         if self.confirm(telemetry):
@@ -119,14 +118,12 @@ class Landing:
         answered = waited_s is None or waited_s >= settings.command_retry_s
         if self.mode is Mode.RETURN and self.requests >= settings.max_return_attempts and answered:
             self.mode = Mode.LAND
-            self.reason += f"; return not executed ({telemetry.refusal or 'no answer'}): lands"
+            self.reason += f"; return not executed ({telemetry.refusal or 'no answer'}): requests land"
         refusal = f"; {telemetry.refusal}" if telemetry.refusal and self.requests else ""
-        return Decision(
-            Phase.LANDING,
-            f"{self.reason}{refusal}",
-            setpoint=setpoint,
-            command=SetMode(self.mode),
-        )
+        return Decision(Phase.LANDING, f"{self.reason}{refusal}", setpoint, SetMode(self.mode))
+
+    def _abort(self, text: str) -> Decision:
+        return Decision(Phase.ABORTED, f"{self.reason}; {text}")
 
     def _wait_for_link(self, now_s: float, telemetry: Telemetry, setpoint: Enu | None) -> Decision:
         """Send no request: the current mode is not known."""
@@ -141,13 +138,12 @@ class Landing:
         if self._link_lost_since_s is None:
             self._link_lost_since_s = now_s if heartbeat_s is None else min(now_s, heartbeat_s)
         if now_s - self._link_lost_since_s > settings.link_lost_timeout_s:
-            text = f"no heartbeat for {settings.link_lost_timeout_s:g} s"
-            return Decision(Phase.ABORTED, f"{self.reason}; {text}")
-        return Decision(Phase.LANDING, self.reason, setpoint=setpoint)
+            return self._abort(f"no heartbeat for {settings.link_lost_timeout_s:g} s")
+        return Decision(Phase.LANDING, self.reason, setpoint)
 
     def _check_disarmed(self, now_s: float, telemetry: Telemetry) -> Decision:
         """Compare the position of a disarmed vehicle with the dock."""
-        settings, fault = self._settings, None
+        settings = self._settings
         if self.outcome is not Phase.LANDED:
             return Decision(self.outcome, self.reason)
         if self._disarmed_s is None:
@@ -160,14 +156,13 @@ class Landing:
             # The other messages arrive after the heartbeat.
             return Decision(Phase.LANDING, self.reason)
         if telemetry.on_ground is False:
-            fault = "disarmed in the air"
-        elif here is None:
-            fault = "disarmed at an unknown position"
-        elif (off_m := self._progress.dock_distance_m(here)) > settings.landing_radius_m:
-            fault = f"landed {off_m:.0f} m from the dock; expected at most {settings.landing_radius_m:g} m"
-        if fault is None:
-            return Decision(Phase.LANDED, self.reason)
-        return Decision(Phase.ABORTED, f"{self.reason}; {fault}")
+            return self._abort("disarmed in the air")
+        if here is None:
+            return self._abort("disarmed at an unknown position")
+        off_m, limit_m = self._progress.dock_distance_m(here), settings.landing_radius_m
+        if off_m > limit_m:
+            return self._abort(f"landed {off_m:.0f} m from the dock; expected at most {limit_m:g} m")
+        return Decision(Phase.LANDED, self.reason)
 
     def _stall(self, now_s: float, telemetry: Telemetry) -> str | None:
         """Missing progress of an armed vehicle with a link; None: it makes progress."""
@@ -191,9 +186,8 @@ class Landing:
         landing_s = self._lower.update(here.up_m, vehicle_s)
         if is_return and not telemetry.on_ground and not self._replaces_return:
             limit_s = settings.return_progress_timeout_s * (1.0 if home is not None else NO_HOME_FACTOR)
-            far = f" ({away_m:.0f} m away)" if home is not None else ""
-            return None if return_s <= limit_s else f"return no nearer to home{far} for {limit_s:g} s"
-        if landing_s > settings.landing_progress_timeout_s:
-            limit_s = settings.landing_progress_timeout_s
-            return f"in mode {telemetry.mode_text} neither descended nor disarmed for {limit_s:g} s"
-        return None
+            far = f" ({away_m:.0f} m from home)" if home is not None else ""
+            return None if return_s <= limit_s else f"return makes no progress for {limit_s:g} s{far}"
+        limit_s = settings.landing_progress_timeout_s
+        text = f"in mode {telemetry.mode_text} neither descended nor disarmed for {limit_s:g} s"
+        return text if landing_s > limit_s else None
