@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "uav_dc_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-LONGEST = 480
+LONGEST = 400
 
 CHECKS = {
     "ruff check": ["-m", "ruff", "check", "."],

@@ -24,7 +24,7 @@ from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, Landing
 from uav_dc_ros.offboard.mission.preflight import Preflight, other_controller
 from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, MissionProgress
 from uav_dc_ros.offboard.mission.steps import StepControl
-from uav_dc_ros.offboard.mission.timers import CommandRetry, FaultTimer, PolicyTimeout, Time
+from uav_dc_ros.offboard.mission.timers import CommandRetry, FaultTimer, Instant, PolicyTimeout
 from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
 from uav_dc_ros.phases import FLYING, GROUND, OFFBOARD, POLICY_CONTROLLED, transition_error
 
@@ -66,7 +66,7 @@ class MissionController:
         self.policy_lost = False
         self._on_change = on_change
         self._telemetry = Telemetry()
-        self._now = self._entered = Time(0.0, 0.0)  # last tick; begin of the phase
+        self._now = self._entered = Instant(0.0, 0.0)  # last tick; begin of the phase
         self._entered_step = self.step
         before = self.progress.checkpoint
         self._released = before.released  # another controller has the vehicle
@@ -190,7 +190,7 @@ class MissionController:
         if self.phase.is_over:
             return []
         self._telemetry = telemetry = self.detector.update(now_s, telemetry)
-        self._now = Time(telemetry.vehicle_s, now_s)
+        self._now = Instant(telemetry.vehicle_s, now_s)
         self._retry.update(self._now, clock_stopped=self.detector.clock_stopped(now_s))
         self._steps.set_setpoint(self.setpoint, now_s)
         if self.phase is Phase.IDLE:

@@ -11,7 +11,7 @@ from uav_dc_ros.offboard.vehicle import Command, TakeOff
 TAKEOFF_RETRIES = 1.5
 
 
-class Time(NamedTuple):
+class Instant(NamedTuple):
     """One instant on both clocks, seconds."""
 
     vehicle_s: float
@@ -29,9 +29,9 @@ class FaultTimer:
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
         self.fault: Fault | None = None
-        self.since = Time(0.0, 0.0)
+        self.since = Instant(0.0, 0.0)
 
-    def update(self, now: Time, fault: Fault | None) -> Literal["changed", "cleared", "expired"] | None:
+    def update(self, now: Instant, fault: Fault | None) -> Literal["changed", "cleared", "expired"] | None:
         """Note the present fault; returns the change. `expired`: the timeout has passed on either clock.
 
         A lost link causes the faults that follow it, and stays the current fault until all are cleared.
@@ -60,9 +60,9 @@ class PolicyTimeout:
     def __init__(self, settings: SafetySettings, step_s: float) -> None:
         self.limit_s = settings.policy_timeout_steps * step_s
         self._min_s = settings.policy_timeout_s
-        self.lost_since: Time | None = None
+        self.lost_since: Instant | None = None
 
-    def has_expired(self, since: Time, now: Time) -> bool:
+    def has_expired(self, since: Instant, now: Instant) -> bool:
         """Whether the time since an instant exceeds both limits."""
         return now.vehicle_s - since.vehicle_s > self.limit_s and now.steady_s - since.steady_s > self._min_s
 
@@ -77,14 +77,14 @@ class CommandRetry:
     def __init__(self, settings: SafetySettings) -> None:
         self._settings = settings
         self._time_s = 0.0
-        self._now: Time | None = None
+        self._now: Instant | None = None
         self._sent_s: dict[Command, float] = {}
 
     def reset(self) -> None:
         """Start another phase."""
         self._sent_s.clear()
 
-    def update(self, now: Time, *, clock_stopped: bool) -> None:
+    def update(self, now: Instant, *, clock_stopped: bool) -> None:
         """Advance to an instant; `clock_stopped`: see `FaultDetector`."""
         if self._now is not None:
             vehicle_s = max(0.0, now.vehicle_s - self._now.vehicle_s)
