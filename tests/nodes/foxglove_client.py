@@ -21,8 +21,8 @@ MESSAGE_DATA = 1
 
 
 @dataclass
-class Heard:
-    """A message: its topic, when it was received, and what the sent schema says it is."""
+class Received:
+    """A message: its topic, when it was received, and its content by the sent schema."""
 
     topic: str
     time_ns: int
@@ -30,7 +30,7 @@ class Heard:
 
 
 class FoxgloveClient:
-    """A context manager: connects, and reads what the server tells at once.
+    """A context manager: connects, and reads what the server sends first.
 
     Attributes:
         server: its `serverInfo`.
@@ -47,10 +47,10 @@ class FoxgloveClient:
         self.server: dict[str, Any] = json.loads(self._socket.recv(5))
         self.channels: dict[str, dict[str, Any]] = {}
         while len(self.channels) < n_channels:
-            told = json.loads(self._socket.recv(5))
-            if told["op"] == "advertise":
-                self.channels |= {channel["topic"]: channel for channel in told["channels"]}
-        self._store = get_typestore(Stores.EMPTY)  # all it knows of types is what the server tells
+            data = json.loads(self._socket.recv(5))
+            if data["op"] == "advertise":
+                self.channels |= {channel["topic"]: channel for channel in data["channels"]}
+        self._store = get_typestore(Stores.EMPTY)  # with the types that the server sends only
         for channel in self.channels.values():
             types = get_types_from_msg(channel["schema"], channel["schemaName"])
             self._store.register(
@@ -63,31 +63,31 @@ class FoxgloveClient:
         wanted = [{"id": number, "channelId": number} for number in numbers]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
-    def read(self, within_s: float) -> Heard | None:
+    def read(self, within_s: float) -> Received | None:
         """The next message; None if none comes in time."""
         deadline_s = time.monotonic() + within_s
         while (left_s := deadline_s - time.monotonic()) > 0:
             try:
-                told = self._socket.recv(left_s)
+                data = self._socket.recv(left_s)
             except TimeoutError:
                 return None
-            if isinstance(told, bytes) and told[0] == MESSAGE_DATA:
-                _, number, time_ns = MESSAGE.unpack_from(told)
+            if isinstance(data, bytes) and data[0] == MESSAGE_DATA:
+                _, number, time_ns = MESSAGE.unpack_from(data)
                 (channel,) = (row for row in self.channels.values() if row["id"] == number)
-                content = self._store.deserialize_cdr(told[MESSAGE.size :], channel["schemaName"])
-                return Heard(channel["topic"], time_ns, content)
+                content = self._store.deserialize_cdr(data[MESSAGE.size :], channel["schemaName"])
+                return Received(channel["topic"], time_ns, content)
         return None
 
-    def read_until(self, enough: Callable[[list[Heard]], bool], within_s: float) -> list[Heard]:
+    def read_until(self, enough: Callable[[list[Received]], bool], within_s: float) -> list[Received]:
         """Messages until there are enough of them."""
-        heard: list[Heard] = []
+        received: list[Received] = []
         deadline_s = time.monotonic() + within_s
-        while not enough(heard):
+        while not enough(received):
             message = self.read(deadline_s - time.monotonic())
-            topics = sorted({m.topic for m in heard})
+            topics = sorted({m.topic for m in received})
             assert message is not None, f"nothing more came; until then there were {topics}"
-            heard.append(message)
-        return heard
+            received.append(message)
+        return received
 
     def __enter__(self) -> "FoxgloveClient":
         return self
@@ -97,7 +97,7 @@ class FoxgloveClient:
 
 
 def is_free(port: int) -> bool:
-    """Can somebody listen on a port, now."""
+    """Whether a port is free."""
     with socket.socket() as trial:
         trial.setsockopt(
             socket.SOL_SOCKET, socket.SO_REUSEADDR, 1

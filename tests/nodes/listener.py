@@ -1,9 +1,9 @@
-"""A subscriber that keeps what it hears, and prints it when its standard input is closed.
+"""A subscriber that keeps what it receives, and prints it when its standard input is closed.
 
     listener.py JSON
 
 JSON: {"topics": {NAME: {"type": ..., "latched": bool, "reliable": bool}}, "each_s": seconds that it
-takes for a message, "name": of the node}. It says "there" once it listens. A line on its standard input asks
+takes for a message, "name": of the node}. It prints "there" once it subscribes. A line on its input requests
 for the number of messages so far. At the end comes one line: a list of [topic, data (base64), when it was
 published, when it was received], in the order of receipt; times in nanoseconds. It keeps all that it has not
 handled yet.
@@ -31,12 +31,12 @@ def main() -> None:
     fastdds.use_profiles()
     rclpy.init()
     node = rclpy.create_node(spec.get("name", "listener"))
-    heard: list[tuple[str, bytes, int, int]] = []
+    received: list[tuple[str, bytes, int, int]] = []
     each_s = spec.get("each_s", 0.0)
 
     def listen(topic: str, row: dict[str, Any]) -> None:
-        def hear(data: bytes, info: Any) -> None:
-            heard.append((topic, data, info["source_timestamp"], info["received_timestamp"]))
+        def receive(data: bytes, info: Any) -> None:
+            received.append((topic, data, info["source_timestamp"], info["received_timestamp"]))
             if each_s:
                 time.sleep(each_s)
 
@@ -48,7 +48,7 @@ def main() -> None:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         kind = getattr(importlib.import_module(f"{package}.msg"), name)
-        node.create_subscription(kind, topic, hear, qos, raw=True)
+        node.create_subscription(kind, topic, receive, qos, raw=True)
 
     for topic, row in spec["topics"].items():
         listen(topic, row)
@@ -59,7 +59,7 @@ def main() -> None:
     def obey() -> None:
         nonlocal closed
         for _ in sys.stdin:
-            print(len(heard), flush=True)
+            print(len(received), flush=True)
         closed = True
         executor.wake()
 
@@ -67,7 +67,9 @@ def main() -> None:
     threading.Thread(target=obey, daemon=True).start()
     executor.spin(lambda: closed)
     executor.spin(lambda: False, QUIET_S)
-    print(json.dumps([[t, base64.b64encode(d).decode(), sent, got] for t, d, sent, got in heard]), flush=True)
+    print(
+        json.dumps([[t, base64.b64encode(d).decode(), sent, got] for t, d, sent, got in received]), flush=True
+    )
     rclpy.shutdown()
 
 

@@ -1,9 +1,9 @@
-"""A stranger on the network who publishes numbered messages on any topics, and says how many.
+"""A publisher outside the mission: publishes numbered messages on any topics, and prints how many.
 
 Its argument is a JSON list of publishers: {"topic", "reliable", "latched", "depth", "bytes", "hz", "n",
 "after_s", "patience_s"}, all but the first with a default. The number stands in the first nine characters of
 a std_msgs/String; with "stereo" the message is an empty stereo_msgs/DisparityImage. Prints "publishing",
-then, when all is said, the numbers of messages by topic as JSON, and ends when its standard input does.
+then, when all is published, the numbers of messages by topic as JSON, and ends when its standard input does.
 """
 
 import json
@@ -17,7 +17,7 @@ import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-said: Counter[str] = Counter()
+published: Counter[str] = Counter()
 
 
 def talk(node: Any, row: dict[str, Any]) -> None:
@@ -45,7 +45,7 @@ def talk(node: Any, row: dict[str, Any]) -> None:
     begun_s = time.monotonic()
     for i in range(row.get("n", 1)):
         publisher.publish(kind() if row.get("stereo") else String(data=f"{i:09d}{filling}"))
-        said[row["topic"]] += 1
+        published[row["topic"]] += 1
         time.sleep(max(0.0, begun_s + (i + 1) / row.get("hz", 1000.0) - time.monotonic()))
     row["publisher"] = publisher
 
@@ -61,7 +61,7 @@ def main() -> None:
     for thread in threads:
         thread.join()
     time.sleep(0.5)
-    print(json.dumps(said), flush=True)
+    print(json.dumps(published), flush=True)
     sys.stdin.read()
     rclpy.shutdown()
 

@@ -1,4 +1,4 @@
-"""What run_all prints of a real vehicle: each phase of a flight, and of those of each step the faults."""
+"""The console of run_all for a real vehicle: each phase of a flight, and faults during a step."""
 
 import io
 
@@ -16,7 +16,7 @@ FLIGHT = (
     (Phase.READY, "at the start, cell (0, 0, 0)", None),
     (Phase.MOVING, "right to cell (1, 0, 0)", None),
     (Phase.MOVING, "no heartbeat for 3 s", FaultKind.LINK),
-    (Phase.MOVING, "no heartbeat for 3 s", FaultKind.LINK),  # said again
+    (Phase.MOVING, "no heartbeat for 3 s", FaultKind.LINK),  # repeated
     (Phase.MOVING, "goes on after: no heartbeat for 3 s", None),
     (Phase.READY, "step 1: there", None),
     (Phase.READY, "", None),  # a simulated vehicle gives no reason
@@ -24,7 +24,7 @@ FLIGHT = (
 )
 
 
-def test_it_prints_what_is_no_daily_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_prints_what_is_no_routine(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(Output, "console", lambda self, file: Console(file=out, width=80))
     display = MissionConsole(SCENARIO, 1)

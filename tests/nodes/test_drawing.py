@@ -1,4 +1,4 @@
-"""What the markers and the path say, read back by ROS itself and by rosbags, which share no code with it."""
+"""The markers and the path, read back by ROS itself and by rosbags, which share no code with it."""
 
 import math
 import time
@@ -147,12 +147,12 @@ def test_the_uav_the_dock_and_the_text() -> None:
 
 
 def test_what_is_not_known_is_not_drawn() -> None:
-    nobody = np.zeros(0, dtype=bool)
+    no_users = np.zeros(0, dtype=bool)
     nothing = scene(
         position_m=None,
         users_m=np.empty((0, 2)),
-        served=nobody,
-        collected=nobody,
+        served=no_users,
+        collected=no_users,
         mission=None,
         sum_rate_bps=None,
     )
@@ -167,8 +167,8 @@ def test_ten_thousand_users_are_drawn_within_milliseconds() -> None:
     users = msgspec.structs.replace(SCENARIO.users, users_per_cluster=2000)
     crowded = msgspec.structs.replace(SCENARIO, users=users)
     users_m = np.random.default_rng(0).random((10_000, 2)) * 1000.0
-    nobody = np.zeros(10_000, dtype=bool)
-    many = scene(users_m=users_m, served=nobody, collected=nobody)
+    no_users = np.zeros(10_000, dtype=bool)
+    many = scene(users_m=users_m, served=no_users, collected=no_users)
     durations_s = []
     for _ in range(5):
         began_s = time.thread_time()
@@ -216,7 +216,7 @@ def test_a_pose_that_is_nowhere_is_refused(bad: float) -> None:
 
 
 class Flight:
-    """Tells a Track of steps, in the order in which the world publishes them."""
+    """Adds steps to a path, in the order in which the world publishes them."""
 
     def __init__(self, track: PathHistory) -> None:
         self.track, self.clock_ns = track, 0
@@ -225,19 +225,21 @@ class Flight:
         self.clock_ns += 1
         return self.clock_ns
 
-    def step(self, mission: int, step: int, *, heard: tuple[str, ...] = ("pose", "users", "target")) -> Any:
-        """One step; what is told in two halves comes as the executor may hand it over."""
+    def step(
+        self, mission: int, step: int, *, received: tuple[str, ...] = ("pose", "users", "target")
+    ) -> Any:
+        """One step; the executor may deliver its topics in another order."""
         time_ns = (mission * 61 + step) * STEP_NS
         pose = cdr.Pose(serialize_message(pose_message(np.array([mission, step, 100.0]), time_ns)))
         at_ns = {topic: self.published_ns() for topic in ("pose", "users", "target")}
-        told = {
+        calls = {
             "pose": lambda: self.track.add_pose(pose, at_ns["pose"]),
             "target": lambda: self.track.add_target(pose),
             "users": lambda: self.track.add_users(
                 mission=mission, step=step, stamp_ns=time_ns, published_ns=at_ns["users"]
             ),
         }
-        return [told[topic] for topic in ("pose", "target", "users") if topic in heard]
+        return [calls[topic] for topic in ("pose", "target", "users") if topic in received]
 
     @property
     def steps(self) -> list[tuple[float, float]]:
@@ -248,7 +250,7 @@ def test_a_new_mission_starts_a_new_path_whatever_the_order_of_topics() -> None:
     """All poses of a turn come before all users of it."""
     flight = Flight(PathHistory(SCENARIO))
     turns = [(0, step) for step in range(61)] + [(1, step) for step in range(5)]
-    calls = [flight.step(*turn, heard=("pose", "users")) for turn in turns]
+    calls = [flight.step(*turn, received=("pose", "users")) for turn in turns]
     for pose, _ in calls:
         pose()
     for _, users in calls:
@@ -257,7 +259,7 @@ def test_a_new_mission_starts_a_new_path_whatever_the_order_of_topics() -> None:
 
 
 def test_what_is_flown_between_two_missions_belongs_to_none() -> None:
-    """An aircraft tells its pose all the time."""
+    """An aircraft publishes its pose all the time."""
     flight = Flight(PathHistory(SCENARIO))
     for call in flight.step(0, 60):
         call()
@@ -287,10 +289,10 @@ def test_another_run_of_the_same_mission_starts_a_new_path() -> None:
 
 @pytest.mark.parametrize("pose_first", [False, True])
 def test_who_joins_late_knows_the_way_by_the_targets(pose_first: bool) -> None:
-    """What is latched comes from where it is kept, and may be overtaken by what is said now."""
+    """What is latched comes from where it is kept, and may arrive after newer messages."""
     flight = Flight(PathHistory(SCENARIO))
     missed = [(0, 59), (0, 60), (1, 0), (1, 1), (1, 2)]
-    latched = [call for step in missed for call in flight.step(*step, heard=("target",))]
+    latched = [call for step in missed for call in flight.step(*step, received=("target",))]
     now = [call for step in [(1, 3), (1, 4)] for call in flight.step(*step)]
     for call in now + latched if pose_first else latched + now:
         call()
@@ -300,7 +302,7 @@ def test_who_joins_late_knows_the_way_by_the_targets(pose_first: bool) -> None:
 def test_who_joins_after_the_end_sees_where_it_ended() -> None:
     flight = Flight(PathHistory(SCENARIO))
     for step in (0, 1, 2):
-        for call in flight.step(0, step, heard=("target", "users")):
+        for call in flight.step(0, step, received=("target", "users")):
             call()
     assert flight.steps == [(0.0, 0.0), (0.0, 1.0), (0.0, 2.0)]
 

@@ -33,10 +33,10 @@ def client(server: FoxgloveServer) -> FoxgloveClient:
     return FoxgloveClient(server.port, len(ROWS))
 
 
-def test_a_client_is_told_every_topic_with_its_type(server: FoxgloveServer) -> None:
+def test_a_client_gets_every_topic_with_its_type(server: FoxgloveServer) -> None:
     with client(server) as viewer:
         assert viewer.server["name"] == "test"
-        assert viewer.server["capabilities"] == []  # whoever looks on cannot set_setpoint
+        assert viewer.server["capabilities"] == []  # viewers cannot publish
         assert set(viewer.channels) == set(ROWS)
         for name, channel in viewer.channels.items():
             assert channel["encoding"] == "cdr"
@@ -48,7 +48,7 @@ def test_bytes_and_time_arrive_as_they_were(server: FoxgloveServer) -> None:
     with client(server) as viewer:
         viewer.open("/mission")
         server.send("/mission", cdr.encode_string(b"now"), 1_700_000_000_123_456_789)
-        (message,) = viewer.read_until(lambda heard: len(heard) == 1, 60.0)
+        (message,) = viewer.read_until(lambda received: len(received) == 1, 60.0)
     assert message.content.data == "now"
     assert message.time_ns == 1_700_000_000_123_456_789
 
@@ -59,8 +59,10 @@ def test_who_comes_late_gets_the_last_message_of_latched_topics_only(server: Fox
             server.send(topic, cdr.encode_string(text), 7)
     with client(server) as first:
         first.open("/users", "/mission", "/move", "/rates")
-        heard = [(m.topic, m.content.data, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 60.0)]
-        assert sorted(heard) == [("/mission", "newest", 7), ("/users", "newest", 7)]
+        received = [
+            (m.topic, m.content.data, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 60.0)
+        ]
+        assert sorted(received) == [("/mission", "newest", 7), ("/users", "newest", 7)]
         assert first.read(0.3) is None
         with client(server) as second:
             second.open("/users")
@@ -91,8 +93,8 @@ def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> 
         stop.set()
         sender.join(60.0)
         assert not sender.is_alive()
-        heard = watcher.read_until(lambda h: bool(h) and h[-1].content.data == "last", 60.0)
-    times = [message.time_ns for message in heard]
+        received = watcher.read_until(lambda h: bool(h) and h[-1].content.data == "last", 60.0)
+    times = [message.time_ns for message in received]
     assert times == sorted(times)
 
 
@@ -106,19 +108,19 @@ def test_a_stopped_server_is_gone(server: FoxgloveServer) -> None:
 
 
 def test_a_port_in_use_is_named(server: FoxgloveServer) -> None:
-    told = rf"port: {server.port} at .*in use.*expected a free port"
-    with pytest.raises(ParameterError, match=told):
+    message = rf"port: {server.port} at .*in use.*expected a free port"
+    with pytest.raises(ParameterError, match=message):
         serve(server.port)
-    with pytest.raises(ParameterError, match=told):
+    with pytest.raises(ParameterError, match=message):
         check(address="127.0.0.1", port=server.port)
 
 
 @pytest.mark.parametrize("address", ["192.0.2.1", "no such host"])
 def test_an_address_that_is_not_this_machine_s_is_named(address: str) -> None:
-    told = rf"'{address}'.*expected a free port of this machine"
-    with pytest.raises(ParameterError, match=told):
+    message = rf"'{address}'.*expected a free port of this machine"
+    with pytest.raises(ParameterError, match=message):
         serve(address=address)
-    with pytest.raises(ParameterError, match=told):
+    with pytest.raises(ParameterError, match=message):
         check(address=address, port=0)
 
 
@@ -135,8 +137,8 @@ def test_a_port_that_was_only_checked_is_free_still() -> None:
 
 def test_without_the_sdk_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    told = r"no module foxglove; pip install 'uav_dc_ros\[live\]'"
-    with pytest.raises(NodeError, match=told):
+    message = r"no module foxglove; pip install 'uav_dc_ros\[live\]'"
+    with pytest.raises(NodeError, match=message):
         serve()
-    with pytest.raises(NodeError, match=told):
+    with pytest.raises(NodeError, match=message):
         check(address="127.0.0.1", port=0)

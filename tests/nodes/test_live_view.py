@@ -14,7 +14,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from tests.conftest import Ros, finish, wait_for
-from tests.nodes.foxglove_client import FoxgloveClient, Heard, is_free
+from tests.nodes.foxglove_client import FoxgloveClient, Received, is_free
 from uav_dc_ros import cli, messages
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.topics import TOPICS
@@ -29,9 +29,9 @@ def start(ros: Ros, scenario: Path, policy: Path, *options: object) -> tuple[sub
     given = ("--scenario", scenario, "--policy", policy, "--pace", 100, "--no-record", "--live", 0)
     flight = ros.start("uav_dc_ros.run_all", *given, *options)
     assert flight.stdout is not None
-    told = LINE.search(wait_for(flight.stdout, "live view: "))
-    assert told is not None
-    return flight, int(told[1]), told[2]
+    match = LINE.search(wait_for(flight.stdout, "live view: "))
+    assert match is not None
+    return flight, int(match[1]), match[2]
 
 
 def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
@@ -44,7 +44,7 @@ def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy:
                 f"/{name}": TOPICS[name].type for name in SERVED
             }
             viewer.open(*viewer.channels)
-            heard = viewer.read_until(lambda h: {m.topic for m in h} == set(viewer.channels), 60.0)
+            received = viewer.read_until(lambda h: {m.topic for m in h} == set(viewer.channels), 60.0)
             with FoxgloveClient(port, len(SERVED)) as late:
                 late.open(*(f"/{name}" for name in LATCHED))
                 late.read_until(lambda h: {m.topic for m in h} == {f"/{name}" for name in LATCHED}, 60.0)
@@ -56,7 +56,7 @@ def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy:
     assert is_free(port)
 
     first: dict[str, Any] = {}
-    for message in heard:
+    for message in received:
         assert abs(message.time_ns - time.time_ns()) < 120e9  # the wall clock's
         first.setdefault(message.topic[1:], message.content)
     for name, kind in messages.PAYLOADS.items():
@@ -72,7 +72,7 @@ def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy:
     assert first["clock"].clock.sec >= 0
 
 
-def until_closed(viewer: FoxgloveClient) -> Iterator[Heard]:
+def until_closed(viewer: FoxgloveClient) -> Iterator[Received]:
     """All messages, until the server closes the connection."""
     try:
         while True:
@@ -92,10 +92,10 @@ def test_topics_are_called_as_in_the_graph_and_the_server_ends_with_the_mission(
         assert viewer.server["name"] == "uav_dc_ros /uav1"
         assert set(viewer.channels) == {f"/uav1/{name}" for name in SERVED}
         viewer.open("/uav1/mission")
-        heard = list(until_closed(viewer))
+        received = list(until_closed(viewer))
     status, output = finish(flight)
     assert status == 0, output
-    last = json.loads(heard[-1].content.data)
+    last = json.loads(received[-1].content.data)
     assert (last["mission"], last["remaining_steps"]) == (2, 0)
     assert is_free(port)
 

@@ -1,4 +1,4 @@
-"""run_all's options: what a newcomer gets wrong is one clear line, status 2, and nothing written."""
+"""run_all's options: a mistake is one clear line, status 2, and nothing written."""
 
 import os
 import shutil
@@ -28,7 +28,7 @@ def refused(ros: Ros, *arguments: object) -> str:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (
             ("--scenario", "mars"),
@@ -65,12 +65,12 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--sead", "1"), "unrecognized arguments: --sead"),
     ],
 )
-def test_an_option_that_cannot_be_flown(ros: Ros, arguments: tuple[str, ...], told: str) -> None:
-    assert told in refused(ros, *arguments)
+def test_an_option_that_cannot_be_flown(ros: Ros, arguments: tuple[str, ...], message: str) -> None:
+    assert message in refused(ros, *arguments)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("v_max_mps", "v_max", "users.v_max = 1.0; did you mean 'v_max_mps'?"),
         ("step_s = 10.0", 'step_s = "10"', "mission.step_s = '10'; expected float, got str"),
@@ -78,11 +78,11 @@ def test_an_option_that_cannot_be_flown(ros: Ros, arguments: tuple[str, ...], to
     ],
 )
 def test_a_scenario_file_with_a_slip(
-    ros: Ros, small_scenario: Path, small_policy: Path, old: str, new: str, told: str
+    ros: Ros, small_scenario: Path, small_policy: Path, old: str, new: str, message: str
 ) -> None:
     small_scenario.write_text(small_scenario.read_text().replace(old, new))
     line = refused(ros, "--scenario", small_scenario, "--policy", small_policy)
-    assert told in line
+    assert message in line
     assert str(small_scenario) in line
 
 

@@ -1,4 +1,4 @@
-"""Playing a bag: what a subscriber in another process hears of it."""
+"""Playing a bag: what a subscriber in another process receives."""
 
 import base64
 import json
@@ -34,7 +34,7 @@ VOLATILE = recorded_qos.offered(QoSProfile(depth=10), 10)
 LATCHED = recorded_qos.offered(QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL), 2)
 WAIT = ("--wait-for-subscribers", 20)
 Messages = list[tuple[str, float, str]]  # topic, milliseconds from the beginning, text
-Heard = list[tuple[str, str, int, int]]  # topic, text, when published, when received, nanoseconds
+Received = list[tuple[str, str, int, int]]  # topic, text, when published, when received, nanoseconds
 
 
 def made(folder: Path, topics: dict[str, Qos], messages: Messages) -> Path:
@@ -62,8 +62,8 @@ def listener(ros: Ros, *topics: str, each_s: float = 0.0, **row: Any) -> "subpro
     return process
 
 
-def heard_so_far(process: "subprocess.Popen[str]") -> int:
-    """How much a listener has heard."""
+def count_received(process: "subprocess.Popen[str]") -> int:
+    """Number of messages that a listener has received."""
     assert process.stdin is not None
     assert process.stdout is not None
     process.stdin.write("\n")
@@ -72,13 +72,15 @@ def heard_so_far(process: "subprocess.Popen[str]") -> int:
 
 
 def raw(process: "subprocess.Popen[str]") -> list[tuple[str, bytes, int, int]]:
-    """End a listener; all that it heard, serialised, in the order of receipt."""
-    told, _ = process.communicate(timeout=PATIENCE_S)
-    return [(topic, base64.b64decode(data), a, b) for topic, data, a, b in json.loads(told.splitlines()[-1])]
+    """End a listener; all that it received, serialised, in the order of receipt."""
+    content, _ = process.communicate(timeout=PATIENCE_S)
+    return [
+        (topic, base64.b64decode(data), a, b) for topic, data, a, b in json.loads(content.splitlines()[-1])
+    ]
 
 
-def heard_by(process: "subprocess.Popen[str]") -> Heard:
-    """End a listener of strings; all that it heard, in the order of receipt."""
+def received_by(process: "subprocess.Popen[str]") -> Received:
+    """End a listener of strings; all that it received, in the order of receipt."""
     return [(t, TYPES.deserialize_cdr(data, STRING).data, a, b) for t, data, a, b in raw(process)]
 
 
@@ -108,13 +110,15 @@ def test_every_play_publishes_what_the_bag_holds_in_its_order(ros: Ros, tmp_path
     listens = listener(ros, "/a", "/b", "/c")
     for bag in (mcap, sqlite):
         play(ros, bag, "--rate", "max", *WAIT)
-    heard = heard_by(listens)
-    assert len({sent for _, _, sent, _ in heard}) == len(heard)  # so there is one order
-    published = sorted(heard, key=lambda each: each[2])
-    assert [(topic, told) for topic, told, *_ in published] == 2 * [(t, told) for t, _, told in messages]
+    received = received_by(listens)
+    assert len({sent for _, _, sent, _ in received}) == len(received)  # so there is one order
+    published = sorted(received, key=lambda each: each[2])
+    assert [(topic, content) for topic, content, *_ in published] == 2 * [
+        (t, content) for t, _, content in messages
+    ]
     for topic in ("/a", "/b", "/c"):
-        each = [told for name, told, *_ in heard if name == topic]
-        assert each == 2 * [told for name, _, told in messages if name == topic]
+        each = [content for name, content, *_ in received if name == topic]
+        assert each == 2 * [content for name, _, content in messages if name == topic]
 
 
 def loses_nothing(ros: Ros, folder: Path, qos: Qos, n: int, each_s: float) -> None:
@@ -123,7 +127,7 @@ def loses_nothing(ros: Ros, folder: Path, qos: Qos, n: int, each_s: float) -> No
     latched = qos.durability.name == "TRANSIENT_LOCAL"
     listens = listener(ros, "/a", latched=latched, each_s=each_s)
     play(ros, bag, "--rate", "max", *WAIT)
-    assert [int(told) for _, told, *_ in heard_by(listens)] == list(range(n))
+    assert [int(content) for _, content, *_ in received_by(listens)] == list(range(n))
 
 
 def test_a_reliable_subscriber_that_falls_behind_loses_nothing(ros: Ros, tmp_path: Path) -> None:
@@ -132,14 +136,14 @@ def test_a_reliable_subscriber_that_falls_behind_loses_nothing(ros: Ros, tmp_pat
     bag = made(tmp_path / "bag", {"/a": VOLATILE}, numbers("/a", n, 0.001))
     listens = listener(ros, "/a")
     player = ros.start(BAG, PLAY, bag, "--rate", "max", *WAIT)
-    until(lambda: heard_so_far(listens))
+    until(lambda: count_received(listens))
     listens.send_signal(signal.SIGSTOP)
     time.sleep(2.5)
     assert player.poll() is None  # it waits
     listens.send_signal(signal.SIGCONT)
     status, printed = finish(player)
     assert status == 0, printed
-    assert [int(told) for _, told, *_ in heard_by(listens)] == list(range(n))
+    assert [int(content) for _, content, *_ in received_by(listens)] == list(range(n))
 
 
 @pytest.mark.long
@@ -169,9 +173,9 @@ def test_distances_in_time_are_kept(ros: Ros, tmp_path: Path) -> None:
     play(ros, bag, *WAIT)
     over.set()
     sleeper.join()
-    sent_ms = np.array([sent for _, _, sent, _ in heard_by(listens)]) * 1e-6
+    sent_ms = np.array([sent for _, _, sent, _ in received_by(listens)]) * 1e-6
     assert len(sent_ms) == len(at_ms)
-    # A distance has two ends. On a machine with much else to do, a late one tells of the machine.
+    # A distance has two ends. On a machine with much else to do, a late one is the machine's.
     assert np.median(np.abs(np.diff(sent_ms) - np.diff(at_ms))) < 2.0 + 2 * np.median(late_ms)
     # Lateness does not add up: of the last ones, most are as punctual as of the first.
     late = sent_ms - at_ms
@@ -190,13 +194,13 @@ def test_options_choose_what_is_played_and_how(ros: Ros, tmp_path: Path) -> None
     assert clocks.stdout.readline() == "there\n"
     options = ["--rate", 0.5, "--start", 1, "--duration", 1, "--exclude", "/c", "--namespace", "/uav1"]
     play(ros, bag, *options, "--remap", "/a:=/other", "--clock", 50)
-    heard = heard_by(listens)
+    received = received_by(listens)
     for topic in ("/other", "/uav1/b"):
-        of_it = [(int(told), sent) for name, told, sent, _ in heard if name == topic]
+        of_it = [(int(content), sent) for name, content, sent, _ in received if name == topic]
         assert [i for i, _ in of_it] == list(range(20, 40))
         took_s = (of_it[-1][1] - of_it[0][1]) * 1e-9
         assert took_s == pytest.approx(0.95 / 0.5, abs=1.0)
-    assert len(heard) == 40
+    assert len(received) == 40
     times = [
         (clock.clock.sec * 10**9 + clock.clock.nanosec, sent)
         for clock, sent in (
@@ -231,31 +235,31 @@ def test_a_split_bag_repeats_nothing(ros: Ros, tmp_path: Path) -> None:
             writer.start("ros2", "test")
             schema = writer.register_schema(STRING, "ros2msg", b"string data")
             channel = writer.register_channel("/a", "cdr", schema, {"offered_qos_profiles": qos})
-            for logged, published, told in part:
-                writer.add_message(channel, START_NS + logged * MS, text(told), START_NS + published * MS)
+            for logged, published, content in part:
+                writer.add_message(channel, START_NS + logged * MS, text(content), START_NS + published * MS)
             writer.finish()
     listens = listener(ros, "/a", latched=True)
     play(ros, tmp_path / "bag", *WAIT)
-    assert [told for _, told, *_ in heard_by(listens)] == ["a", "b", "b", "b", "c", "a"]
+    assert [content for _, content, *_ in received_by(listens)] == ["a", "b", "b", "b", "c", "a"]
 
 
 def test_a_loop_goes_on_until_it_is_stopped(ros: Ros, tmp_path: Path) -> None:
     bag = made(tmp_path / "bag", {"/a": LATCHED}, numbers("/a", 3, 20.0))
     listens = listener(ros, "/a", latched=True)
     player = ros.start(BAG, PLAY, bag, "--loop", *WAIT)
-    until(lambda: heard_so_far(listens) >= 8)
+    until(lambda: count_received(listens) >= 8)
     player.send_signal(signal.SIGINT)
     status, printed = finish(player)
     assert status == 130, printed
     assert "Traceback" not in printed
-    told = [int(told) for _, told, *_ in heard_by(listens)]
-    assert told == [i % 3 for i in range(len(told))]
+    content = [int(content) for _, content, *_ in received_by(listens)]
+    assert content == [i % 3 for i in range(len(content))]
 
 
-def test_what_cannot_be_played_is_told_and_left_out(ros: Ros, tmp_path: Path) -> None:
-    """Types that are not installed, or others by now, two on one topic, and a subscriber that cannot hear.
+def test_what_cannot_be_played_is_noted_and_left_out(ros: Ros, tmp_path: Path) -> None:
+    """Types that are not installed, or others by now, two on one topic, and an incompatible subscriber.
 
-    And 57 years without a message, of a clock that was set forward: beyond what /clock can tell.
+    And 57 years without a message, of a clock that was set forward: beyond the range of /clock.
     """
     bag = tmp_path / "bag.mcap"
     with bag.open("wb") as file:
@@ -278,14 +282,14 @@ def test_what_cannot_be_played_is_told_and_left_out(ros: Ros, tmp_path: Path) ->
                 writer.add_message(channel, later_ns, text("40"), later_ns)
         writer.finish()
     listens = listener(ros, "/fine")
-    deaf = listener(ros, "/fine", latched=True)
+    incompatible = listener(ros, "/fine", latched=True)
     printed = play(ros, bag, "--clock")
-    assert [int(told) for _, told, *_ in heard_by(listens)] == list(range(41))
+    assert [int(content) for _, content, *_ in received_by(listens)] == list(range(41))
     assert (
         "no message for 1,797,552,000 s after 0.4 s: skipped, as it is longer than --max-gap 600" in printed
     )
     assert "/two is not played: it has several types: std_msgs/msg/String, std_msgs/msg/Float64" in printed
-    assert heard_by(deaf) == []
+    assert received_by(incompatible) == []
     assert printed.count("/foreign") == printed.count("/changed") == printed.count("/odd") == 1
     assert "their_msgs/msg/Thing is not installed" in printed
     assert "another definition" in printed
@@ -294,14 +298,16 @@ def test_what_cannot_be_played_is_told_and_left_out(ros: Ros, tmp_path: Path) ->
     assert (status, "no message that can be played" in printed) == (2, True), printed
 
 
-def test_a_monitor_hears_of_a_played_mission_what_it_heard_of_the_real_one(ros: Ros, alone: Alone) -> None:
+def test_a_monitor_receives_the_same_from_a_played_mission_as_from_the_real_one(
+    ros: Ros, alone: Alone
+) -> None:
     """Its rates are those of the bag, to the last digit."""
-    recorded = [told for topic, told in read_bag(alone.bag) if topic == "/rates"]
+    recorded = [content for topic, content in read_bag(alone.bag) if topic == "/rates"]
     assert len(recorded) >= 31
     monitor = ros.start("uav_dc_ros.nodes.channel_monitor", "--ros-args", "-p", f"scenario:={alone.scenario}")
     listens = listener(ros, "/rates", latched=True)
     play(ros, alone.bag, "--topics", "/pose,/users", *WAIT)
-    again = [json.loads(told) for _, told, *_ in heard_by(listens)]
+    again = [json.loads(content) for _, content, *_ in received_by(listens)]
     monitor.terminate()
     assert finish(monitor)[0] == 0
     assert each_once(again) == each_once(recorded)
@@ -315,7 +321,7 @@ def small_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["--topics", "/a,/x"], "--topics /x: no such topic in bag .*; it has /a, /b"),
         (["--exclude", "/x"], "--exclude /x: no such topic"),
@@ -326,33 +332,33 @@ def small_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--paused"], "no terminal"),
     ],
 )
-def test_what_the_bag_has_not_is_refused(small_bag: Path, arguments: list[str], told: str) -> None:
+def test_what_the_bag_has_not_is_refused(small_bag: Path, arguments: list[str], message: str) -> None:
     parser = cli.Parser(prog="play")
     verb.add_options(parser)
-    with BagReader(small_bag) as reader, pytest.raises(ParameterError, match=told):
+    with BagReader(small_bag) as reader, pytest.raises(ParameterError, match=message):
         verb._playback_options(reader, parser.parse_args([str(small_bag), *arguments]))
 
 
 @pytest.mark.parametrize(
-    ("topics", "arguments", "told"),
+    ("topics", "arguments", "message"),
     [
         ({}, [], "holds no message; expected at least one to play"),
         ({"/a": VOLATILE}, [], "holds no message"),
         ({"/clock": VOLATILE}, ["--clock"], "--clock leaves no topic"),
     ],
 )
-def test_a_bag_that_holds_nothing_is_told(
-    tmp_path: Path, topics: dict[str, Qos], arguments: list[str], told: str
+def test_a_bag_that_holds_nothing_is_refused(
+    tmp_path: Path, topics: dict[str, Qos], arguments: list[str], message: str
 ) -> None:
     bag = made(tmp_path / "bag", topics, [("/clock", 0.0, "now")] if "/clock" in topics else [])
     parser = cli.Parser(prog="play")
     verb.add_options(parser)
-    with BagReader(bag) as reader, pytest.raises(UavDcError, match=told):
+    with BagReader(bag) as reader, pytest.raises(UavDcError, match=message):
         verb._playback_options(reader, parser.parse_args([str(bag), *arguments]))
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["--rate", "0"], "'0'; expected a number from 0.001 to 1e+06, or max"),
         (["--rate", "nan"], "'nan'; expected"),
@@ -368,18 +374,18 @@ def test_a_bag_that_holds_nothing_is_told(
     ],
 )
 def test_options_that_make_no_sense_are_refused(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     parser = cli.Parser(prog="play")
     verb.add_options(parser)
     with pytest.raises(SystemExit):
         parser.parse_args(["bag", *arguments])
     printed = capsys.readouterr().err
-    assert told in printed
+    assert message in printed
     assert printed.count("\n") == 1
 
 
-def test_nobody_listening_ends_a_play_that_waits(ros: Ros, small_bag: Path) -> None:
+def test_a_play_that_waits_ends_without_subscribers(ros: Ros, small_bag: Path) -> None:
     status, printed = ros.run_fork(BAG, PLAY, small_bag, "--wait-for-subscribers", 0.2)
     assert status == 2
     assert "no subscriber of /a within 0.2 s" in printed
@@ -399,8 +405,8 @@ def test_a_bag_that_is_larger_than_memory_is_no_problem(ros: Ros, tmp_path: Path
     player = ros.start(BAG, PLAY, tmp_path / "bag", "--rate", "max")
     peaks_kb = [0]
     while player.poll() is None:
-        told = Path(f"/proc/{player.pid}/status").read_text()
-        peaks_kb += [int(line.split()[1]) for line in told.splitlines() if line.startswith("VmHWM")]
+        status = Path(f"/proc/{player.pid}/status").read_text()
+        peaks_kb += [int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")]
         time.sleep(0.02)
     status, printed = finish(player)
     assert status == 0, printed

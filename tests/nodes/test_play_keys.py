@@ -20,11 +20,11 @@ from tests.nodes.test_play import (
     LATCHED,
     VOLATILE,
     Messages,
-    heard_by,
-    heard_so_far,
+    count_received,
     listener,
     made,
     numbers,
+    received_by,
 )
 
 # A shell that starts a command in its foreground or background, and waits for its end.
@@ -123,28 +123,28 @@ def paused(ros: Ros, bag: Path) -> Iterator[tuple[Terminal, "subprocess.Popen[st
 def test_keys_pause_step_change_the_rate_and_quit(paused: tuple[Terminal, "subprocess.Popen[str]"]) -> None:
     terminal, listens = paused
     assert terminal.settings() != terminal.before
-    assert heard_so_far(listens) == 0
+    assert count_received(listens) == 0
     terminal.press("s")
-    until(lambda: heard_so_far(listens) == 1)
+    until(lambda: count_received(listens) == 1)
     terminal.press("n\x1b[C")  # the arrow to the right
-    until(lambda: heard_so_far(listens) == 3)
+    until(lambda: count_received(listens) == 3)
     time.sleep(0.3)
-    assert heard_so_far(listens) == 3
+    assert count_received(listens) == 3
     terminal.press("+")
     terminal.wait_for("rate 1.25,")
     terminal.press("\x1b[B-")
     terminal.wait_for("rate 0.8,")
     terminal.press(" ")
-    until(lambda: heard_so_far(listens) > 20)
+    until(lambda: count_received(listens) > 20)
     terminal.press(" ")
     terminal.wait_for("paused")
-    still = heard_so_far(listens)
+    still = count_received(listens)
     time.sleep(0.3)
-    assert heard_so_far(listens) == still < 1500
+    assert count_received(listens) == still < 1500
     terminal.press("q")
     assert terminal.ended() == 0
     assert terminal.settings() == terminal.before
-    assert [int(told) for _, told, *_ in heard_by(listens)] == list(range(still))
+    assert [int(content) for _, content, *_ in received_by(listens)] == list(range(still))
     assert "space: pause" in terminal.shown
     assert "Traceback" not in terminal.shown
 
@@ -167,7 +167,7 @@ def test_a_stop_and_its_end_lose_no_time_of_the_bag(ros: Ros, bag: Path) -> None
     listens = listener(ros, "/a", latched=True)
     terminal = Terminal(ros, bag, "--wait-for-subscribers", 20)
     try:
-        until(lambda: heard_so_far(listens) > 10)
+        until(lambda: count_received(listens) > 10)
         terminal.press("\x1a")
         state = Path(f"/proc/{terminal.play}/stat")
         until(lambda: state.read_text().rsplit(")", 1)[1].split()[0] == "T")
@@ -181,16 +181,16 @@ def test_a_stop_and_its_end_lose_no_time_of_the_bag(ros: Ros, bag: Path) -> None
         assert terminal.settings() == terminal.before
     finally:
         terminal.close()
-    heard = heard_by(listens)
-    gaps_ms = [(b - a) * 1e-6 for (*_, a, _), (*_, b, _) in itertools.pairwise(heard)]
+    received = received_by(listens)
+    gaps_ms = [(b - a) * 1e-6 for (*_, a, _), (*_, b, _) in itertools.pairwise(received)]
     assert max(gaps_ms) > 1400
     went_on = gaps_ms.index(max(gaps_ms)) + 1
-    soon = [sent for *_, sent, _ in heard[went_on:] if sent - heard[went_on][2] < 0.5e9]
+    soon = [sent for *_, sent, _ in received[went_on:] if sent - received[went_on][2] < 0.5e9]
     assert len(soon) < 250  # of which 100 are due: the 300 that would have been due meanwhile were not sent
 
 
 def test_a_play_in_the_background_takes_no_keys_and_is_not_stopped(ros: Ros, bag: Path) -> None:
-    """`play bag &`: whoever touches the terminal there would be stopped by it."""
+    """`play bag &`: the terminal stops a background process that changes its settings."""
     terminal = Terminal(ros, bag, "--duration", 0.1, where="background")
     try:
         assert terminal.ended() == 0, terminal.shown
@@ -211,15 +211,15 @@ def test_what_was_latched_reaches_who_comes_late(ros: Ros, tmp_path: Path) -> No
         terminal.wait_for("paused")
         early = listener(ros, "/state", "/event")
         late = listener(ros, "/state", latched=True)
-        until(lambda: heard_so_far(late) == 2)
+        until(lambda: count_received(late) == 2)
         terminal.press("s")
-        until(lambda: heard_so_far(late) == 3)
+        until(lambda: count_received(late) == 3)
         later = listener(ros, "/state", latched=True)
-        until(lambda: heard_so_far(later) == 2)
+        until(lambda: count_received(later) == 2)
         terminal.press("s")
         assert terminal.ended() == 0
     finally:
         terminal.close()
-    assert [told for _, told, *_ in heard_by(late)] == ["3", "4", "new"]
-    assert [told for _, told, *_ in heard_by(later)] == ["4", "new"]
-    assert [told for _, told, *_ in heard_by(early)] == ["new", "end"]
+    assert [content for _, content, *_ in received_by(late)] == ["3", "4", "new"]
+    assert [content for _, content, *_ in received_by(later)] == ["4", "new"]
+    assert [content for _, content, *_ in received_by(early)] == ["new", "end"]

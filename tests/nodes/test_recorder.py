@@ -28,20 +28,20 @@ def record(ros: Ros, *options: object) -> subprocess.Popen[str]:
 
 
 def talk(ros: Ros, *rows: dict[str, Any]) -> subprocess.Popen[str]:
-    """Start a stranger who publishes."""
+    """Start a publisher outside the mission."""
     process = ros.stranger("talker", json.dumps(rows))
     assert process.stdout is not None
     wait_for(process.stdout, "publishing")
     return process
 
 
-def said(talker: subprocess.Popen[str], *, leave: bool = True) -> dict[str, int]:
-    """How many messages a stranger has published, once it has published all."""
+def published(talker: subprocess.Popen[str], *, leave: bool = True) -> dict[str, int]:
+    """Numbers of messages that it has published, once it has published all."""
     assert talker.stdout is not None
-    told: dict[str, int] = json.loads(talker.stdout.readline())
+    counts: dict[str, int] = json.loads(talker.stdout.readline())
     if leave:
         talker.communicate(timeout=90)
-    return told
+    return counts
 
 
 def stop(process: subprocess.Popen[str]) -> str:
@@ -60,11 +60,11 @@ def numbers(bag: Path, topic: str) -> list[int]:
 
 
 def custom(bag: Path) -> dict[str, str]:
-    """What metadata.yaml says of the bag."""
-    told: dict[str, str] = YAML(typ="safe").load(bag / "metadata.yaml")["rosbag2_bagfile_information"][
+    """The custom data in metadata.yaml."""
+    about: dict[str, str] = YAML(typ="safe").load(bag / "metadata.yaml")["rosbag2_bagfile_information"][
         "custom_data"
     ]
-    return told
+    return about
 
 
 def offered(bag: Path, topic: str) -> set[tuple[str, str]]:
@@ -91,12 +91,12 @@ def test_whatever_is_published_is_recorded_also_late_and_with_its_qos(ros: Ros) 
         {"topic": "/_hidden", "n": 1, "patience_s": 0.0},
         {"topic": "/unknown", "stereo": True, "n": 1, "patience_s": 0.0},
     )
-    told = said(talker, leave=False)
+    counts = published(talker, leave=False)
     output = stop(recorder)
     talker.communicate(timeout=90)
     bag = ros.folder / "bag"
     for topic in ("/reliable", "/late", "/map"):
-        assert numbers(bag, topic) == list(range(told[topic])), topic
+        assert numbers(bag, topic) == list(range(counts[topic])), topic
     assert offered(bag, "/late") == {("best_effort", "volatile")}
     assert offered(bag, "/map") == {("reliable", "transient_local")}
     assert len(numbers(bag, "/both")) >= 1
@@ -114,7 +114,7 @@ def test_whatever_is_published_is_recorded_also_late_and_with_its_qos(ros: Ros) 
 def test_poses_that_are_offered_best_effort_are_recorded_as_well(
     ros: Ros, small_scenario: Path, small_policy: Path
 ) -> None:
-    """An autopilot's bridge offers no better; of our own nodes, which do, the recorder asks for it."""
+    """An autopilot's bridge offers no better; of our own nodes, which do, the recorder requests it."""
     peers = 'peers:=["world", "channel_monitor", "policy", "recorder", "mission_monitor"]'
     given = ("-p", f"scenario:={small_scenario}", "-p", peers, "-p", "pace:=100", "-r", "/clock:=clock")
     override = "qos_overrides./pose.publisher.reliability:=best_effort"
@@ -140,7 +140,7 @@ def test_topics_by_list_and_a_namespace(ros: Ros) -> None:
     talker = talk(ros, *({"topic": t, "n": 5} for t in ("/uav1/a", "/elsewhere/b")), {
         "topic": "/uav1/c", "patience_s": 1.0
     })  # fmt: skip
-    said(talker)
+    published(talker)
     stop(recorder)
     with BagReader(ros.folder / "bag") as reader:
         assert {name: topic.count for name, topic in reader.topics.items()} == {
@@ -151,22 +151,22 @@ def test_topics_by_list_and_a_namespace(ros: Ros) -> None:
 
 
 @pytest.mark.long
-def test_a_publisher_that_offers_less_is_heard_too_and_nothing_twice(ros: Ros) -> None:
+def test_a_publisher_that_offers_less_is_recorded_and_nothing_twice(ros: Ros) -> None:
     recorder = record(ros)
     talker = talk(
         ros,
         {"topic": "/a", "n": 600, "hz": 200},
         {"topic": "/a", "n": 100, "hz": 100, "reliable": False, "after_s": 1.0, "bytes": 20},
     )
-    said(talker)
+    published(talker)
     stop(recorder)
     with BagReader(ros.folder / "bag") as reader:
-        told = [(message.data[17:18], int(message.data[8:17])) for message in reader.messages(["/a"])]
+        messages = [(message.data[17:18], int(message.data[8:17])) for message in reader.messages(["/a"])]
         assert reader.dropped == {}
-    first = [number for end, number in told if end != b"x"]
-    second = [number for end, number in told if end == b"x"]
+    first = [number for end, number in messages if end != b"x"]
+    second = [number for end, number in messages if end == b"x"]
     assert first == list(range(600))
-    # What it says before it is found, a fifth of a second at most, it says to nobody.
+    # What it publishes before its discovery, for a fifth of a second at most, reaches no subscriber.
     assert second == list(range(second[0], 100))
     assert len(second) > 50
 
@@ -178,14 +178,14 @@ def test_a_kill_takes_the_last_second_at_most(ros: Ros) -> None:
     killed_ns = time.time_ns()
     recorder.kill()
     finish(recorder)
-    said(talker)
+    published(talker)
     repair(ros.folder / "bag")
     with BagReader(ros.folder / "bag") as reader:
         published_ns = [message.publish_time_ns for message in reader.messages(["/a"])]
     assert len(published_ns) > 100
     assert published_ns[-1] > killed_ns - 2 * 10**9  # a second, and as much for a busy machine
-    told = numbers(ros.folder / "bag", "/a")
-    assert told == list(range(len(told)))
+    recorded = numbers(ros.folder / "bag", "/a")
+    assert recorded == list(range(len(recorded)))
 
 
 @pytest.mark.parametrize("reliable", [pytest.param(False, marks=pytest.mark.long), True])
@@ -201,7 +201,7 @@ def test_every_dropped_message_is_counted(ros: Ros, reliable: bool) -> None:
     recorder.send_signal(signal.SIGSTOP)
     time.sleep(1.5)
     recorder.send_signal(signal.SIGCONT)
-    told = said(talker, leave=False)
+    counts = published(talker, leave=False)
     output = stop(recorder)
     talker.communicate(timeout=90)
     with BagReader(ros.folder / "bag") as reader:
@@ -210,7 +210,7 @@ def test_every_dropped_message_is_counted(ros: Ros, reliable: bool) -> None:
     assert dropped is not None
     assert dropped.keys() == {"/a"}
     assert dropped["/a"] > 0
-    assert recorded + dropped["/a"] == told["/a"] == 12_000
+    assert recorded + dropped["/a"] == counts["/a"] == 12_000
     assert json.loads(custom(ros.folder / "bag")["dropped"]) == dropped
     assert f"dropped messages: /a {dropped['/a']}" in output
 
@@ -227,7 +227,7 @@ def test_recording_stops_before_the_disk_is_full(ros: Ros) -> None:
     least = shutil.disk_usage(ros.folder).free - 128 * MIB
     recorder = record(ros, "--min-free-bytes", least)
     talker = talk(ros, {"topic": "/a", "n": 100, "hz": 200})
-    said(talker)
+    published(talker)
     with (ros.folder / "large").open("wb") as large:
         os.posix_fallocate(large.fileno(), 0, 512 * MIB)
     try:
@@ -242,7 +242,7 @@ def test_recording_stops_before_the_disk_is_full(ros: Ros) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (("--topics", "a,,b"), "topics: 'a,,b'; expected names of topics with a comma between"),
         pytest.param(("--topics", "1a"), "topics: '1a': ", marks=pytest.mark.long),
@@ -258,10 +258,10 @@ def test_recording_stops_before_the_disk_is_full(ros: Ros) -> None:
         pytest.param(("--out", "."), "exists already; expected a new one", marks=pytest.mark.long),
     ],
 )
-def test_mistakes_are_one_line(ros: Ros, options: tuple[str, ...], told: str) -> None:
+def test_mistakes_are_one_line(ros: Ros, options: tuple[str, ...], message: str) -> None:
     status, output = ros.run_fork("uav_dc_ros.bag", "record", "--out", ros.folder / "bag", *options)
     assert status == 2, output
-    assert told in output
+    assert message in output
     assert "Traceback" not in output
     assert len(output.splitlines()) == 1, output
     assert not (ros.folder / "bag").exists()
@@ -280,7 +280,7 @@ def test_a_mission_s_bag_has_all_of_its_namespace_and_nothing_of_another_mission
         {"topic": "/uav2/camera", "n": 1, "patience_s": 1.0},
         {"topic": "/ready_or_not", "latched": True},
     )
-    said(talker, leave=False)
+    published(talker, leave=False)
     status, output = finish(flight)
     talker.communicate(timeout=90)
     assert status == 0, output

@@ -1,4 +1,4 @@
-"""The visualizer beside real nodes: what it draws is what they said."""
+"""The visualizer beside real nodes: it draws what they publish."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ WITHOUT_VISUALIZER = ("--nodes", "world,channel_monitor,policy,recorder")
 
 
 class Bag:
-    """What was said on each topic."""
+    """The messages of each topic."""
 
     def __init__(self, folder: Path, namespace: str = "") -> None:
         self.namespace, self.messages = namespace, read_bag(folder)
@@ -125,14 +125,14 @@ def test_who_joins_late_draws_the_whole_mission(ros: Ros, small_scenario: Path, 
 def test_another_world_s_mission_is_refused(
     ros: Ros, small_scenario: Path, small_policy: Path, scenario: str
 ) -> None:
-    stranger = by_hand(ros, scenario)
+    by_hand_node = by_hand(ros, scenario)
     status, output = ros.run_all(
         *("--scenario", small_scenario, "--policy", small_policy, "--pace", 100, "--no-record"),
         *("--nodes", "world,channel_monitor,policy"),
     )
     assert status == 0, output
-    stranger.terminate()
-    status, output = finish(stranger)
+    by_hand_node.terminate()
+    status, output = finish(by_hand_node)
     assert status == 0, output
     assert "the mission flies 'small'" in output
     assert "Traceback" not in output
