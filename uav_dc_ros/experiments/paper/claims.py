@@ -1,10 +1,9 @@
 """The paper's claims, C1 to C20, and their findings."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from uav_dc_ros.experiments.paper import claims_learning, claims_reward, claims_throughput
-from uav_dc_ros.experiments.paper.criteria import Assessment, Claim, Criterion, Verdict, joint
+from uav_dc_ros.experiments.paper.criteria import Claim, Criterion, Verdict, joint
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.results import Results
 
@@ -16,12 +15,12 @@ class Finding(NamedTuple):
 
     claim: Claim
     verdict: Verdict
-    assessment: Assessment
+    criteria: tuple[Criterion, ...]
 
     @property
     def decisive(self) -> Criterion | None:
         """The first criterion with the verdict of the claim."""
-        return next((one for one in self.assessment.criteria if one.verdict == self.verdict), None)
+        return next((one for one in self.criteria if one.decides and one.verdict == self.verdict), None)
 
 
 def check(results: Results) -> list[Finding]:
@@ -30,15 +29,10 @@ def check(results: Results) -> list[Finding]:
     return [finding(claim, evidence) for claim in CLAIMS]
 
 
-def count(findings: Sequence[Finding], verdict: Verdict) -> int:
-    """Number of findings with a verdict."""
-    return sum(one.verdict == verdict for one in findings)
-
-
 def finding(claim: Claim, evidence: Evidence) -> Finding:
     """Tests one claim."""
     try:
-        assessment = claim.assess(evidence)
+        criteria = tuple(claim.test(evidence))
     except NotMeasured:
-        return Finding(claim, "not tested", Assessment(()))
-    return Finding(claim, joint(assessment.criteria), assessment)
+        return Finding(claim, "not tested", ())
+    return Finding(claim, joint(criteria), criteria)

@@ -1,6 +1,6 @@
 """Claims, and the rules that test their criteria."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -41,65 +41,35 @@ some fifty parts a few come out by chance: read the effect, not only the verdict
 
 
 class Criterion(NamedTuple):
-    """One part of a claim, tested.
+    """One part of a claim, tested."""
 
-    Attributes:
-        text: the part in words.
-        effect: its size.
-        unit: of the effect.
-        rule: condition of `holds`.
-        verdict: the outcome.
-        detail: the ratios at which it holds and does not.
-    """
-
-    text: str
+    text: str  # the part in words
     effect: Interval
     unit: str
-    rule: str
+    rule: str  # condition of `holds`
     verdict: Verdict
-    detail: str = ""
-
-
-class Assessment(NamedTuple):
-    """The outcome of a claim: `criteria` decide its verdict, `secondary` ones do not."""
-
-    criteria: tuple[Criterion, ...]
-    secondary: tuple[Criterion, ...] = ()
+    detail: str = ""  # the ratios at which it holds and does not
+    decides: bool = True  # the verdict on the claim
 
 
 class Table(NamedTuple):
-    """A table beside a claim; its cells are means over environments with their intervals.
+    """A table beside a claim; its cells are means over environments with their intervals."""
 
-    Attributes:
-        setting: common to all cells.
-        rows: axes of the sweep; each combination of their values is a row.
-        measures: see `Evidence`; a column each, or a table each with `columns`.
-        columns: an axis of the sweep.
-    """
-
-    setting: Setting
-    rows: tuple[str, ...]
-    measures: tuple[str, ...]
-    columns: str | None = None
+    setting: Setting  # common to all cells
+    rows: tuple[str, ...]  # axes of the sweep; each combination of their values is a row
+    measures: tuple[str, ...]  # see `Evidence`; a column each, or a table each with `columns`
+    columns: str | None = None  # an axis
 
 
 class Claim(NamedTuple):
-    """A claim of the paper.
-
-    Attributes:
-        id: C1 to C20.
-        setting: in words.
-        text: the claim.
-        assess: tests it.
-        tables: of the report.
-        notes: contradictions with arithmetic, the paper's text or another claim; independent of the results.
-    """
+    """A claim of the paper."""
 
     id: str
-    setting: str
+    setting: str  # in words
     text: str
-    assess: Callable[[Evidence], Assessment]
+    test: Callable[[Evidence], Iterator[Criterion]]
     tables: tuple[Table, ...]
+    # Contradictions with arithmetic, the paper's text or another claim; independent of the results.
     notes: tuple[str, ...]
 
     @property
@@ -109,10 +79,15 @@ class Claim(NamedTuple):
 
 
 def claim(
-    id: str, setting: str, text: str, *tables: Table, notes: tuple[str, ...] = ()
-) -> Callable[[Callable[[Evidence], Assessment]], Claim]:
-    """Makes a claim of the function that tests it."""
-    return lambda assess: Claim(id, setting, text, assess, tables, notes)
+    id: str, setting: str, text: str, *notes: str, tables: Sequence[Table]
+) -> Callable[[Callable[[Evidence], Iterator[Criterion]]], Claim]:
+    """Makes a claim of the function that yields its criteria."""
+    return lambda test: Claim(id, setting, text, test, tuple(tables), notes)
+
+
+def beside(criterion: Criterion) -> Criterion:
+    """The criterion as one that does not decide the verdict on its claim."""
+    return criterion._replace(decides=False)
 
 
 def greater(text: str, effect: Array | Interval, unit: str) -> Criterion:
@@ -170,8 +145,8 @@ def all_within(text: str, samples: Array, ratios: Sequence[Ratio]) -> Criterion:
 
 
 def joint(criteria: Sequence[Criterion]) -> Verdict:
-    """The verdict on several criteria: all must hold, and one that does not decides."""
-    verdicts = {criterion.verdict for criterion in criteria}
+    """The verdict on a claim: all criteria that decide must hold, and one that does not decides."""
+    verdicts = {criterion.verdict for criterion in criteria if criterion.decides}
     if "does not hold" in verdicts:
         return "does not hold"
     return "holds" if verdicts == {"holds"} else "undecided"

@@ -8,27 +8,19 @@ from uav_dc_ros.experiments.paper.setting import PlannedRun, Scale, Setting
 
 
 class Panel(NamedTuple):
-    """One part of a figure.
+    """One part of a figure."""
 
-    Attributes:
-        kind: `curves` over the episodes, final levels over the `ratios`, a `grid` of final levels over
-            the two axes, or the `tracks` of greedy missions.
-        title: the setting in words.
-        metric: one of `results.METRICS`.
-        setting: common to all lines.
-        vary: the axes in which lines differ: fields of `Setting`, or `ratio`.
-    """
-
+    # `curves` over the episodes, final levels over the `ratios`, a `grid` of final levels over the two axes,
+    # or the `tracks` of greedy missions.
     kind: Literal["curves", "ratios", "grid", "tracks"]
-    title: str
-    metric: str
-    setting: Setting
-    vary: tuple[str, ...] = ()
+    title: str  # the setting in words
+    metric: str  # one of `results.METRICS`
+    setting: Setting  # common to all lines
+    vary: tuple[str, ...] = ()  # the axes in which lines differ: fields of `Setting`, or `ratio`
 
     def lines(self, scale: Scale) -> list[Setting]:
-        """A setting for each line; along the ratios, each at the first ratio."""
-        start = self.setting.with_(ratio=scale.ratios[0]) if self.kind == "ratios" else self.setting
-        return start.along(self.vary, scale)
+        """A setting for each line."""
+        return self.setting.along(self.vary, scale)
 
     def settings(self, scale: Scale) -> list[Setting]:
         """Every setting that the panel shows."""
@@ -36,13 +28,7 @@ class Panel(NamedTuple):
 
 
 class FigurePlan(NamedTuple):
-    """A figure of the paper.
-
-    Attributes:
-        caption: the paper's caption.
-        claims: the claims that it illustrates.
-        panels: where the paper leaves a setting open, the title states the choice.
-    """
+    """A figure of the paper. Where the paper leaves a setting open, the panel's title states the choice."""
 
     caption: str
     claims: tuple[str, ...]
@@ -59,7 +45,7 @@ _REWARD_KIND = ("r_plus", "form")
 _RATIO = ("ratio",)
 _RATE = "throughput_bps"
 
-# The paper does not say which form of the reward its figures with 3 clusters use, nor reward5clusters2.
+# The paper does not state the form of the reward in its figures with 3 clusters, nor in reward5clusters2.
 # They are drawn with the episode form, the best in the paper; with 3 clusters a further panel has the other.
 FIGURES: dict[str, FigurePlan] = {
     "Traj": FigurePlan(

@@ -1,5 +1,6 @@
 """The report of a sweep: figures, `claims.md` for people, `claims.json` for programs."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import msgspec
 from uav_dc_ros import files
 from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.env.trajectory import Trajectory
-from uav_dc_ros.experiments.paper.claims import Finding, check, count
+from uav_dc_ros.experiments.paper.claims import Finding, check
 from uav_dc_ros.experiments.paper.criteria import RULES, Criterion, Table, Verdict
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.figures import draw, drawable
@@ -62,12 +63,11 @@ def write(
 
 def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str]) -> str:
     """The text of `claims.md`; `drawn` are the figures beside it."""
-    counts = ", ".join(
-        f"{n} {words}" for verdict, words in _VERDICTS.items() if (n := count(findings, verdict))
-    )
+    n = Counter(finding.verdict for finding in findings)
+    counts = ", ".join(f"{n[verdict]} {words}" for verdict, words in _VERDICTS.items() if n[verdict])
     evidence = Evidence(results)
     sections = [
-        "# What came of the paper's claims",
+        "# Findings on the paper's claims",
         *_warning(results.metadata),
         f"Of {len(findings)} claims {counts}.",
         _summary(findings),
@@ -130,16 +130,16 @@ def _figure(name: str) -> str:
 
 
 def _sections(finding: Finding, evidence: Evidence, drawn: Sequence[str]) -> list[str]:
-    claim, verdict, assessment = finding
+    claim, verdict, criteria = finding
     figures = ", ".join(f"[{name}](#{name.lower()})" if name in drawn else name for name in claim.figures)
     sections = [
         f"### {claim.id}",
         f"*{claim.setting}:* {claim.text}. Figure {figures}. **{verdict[0].upper()}{verdict[1:]}.**",
     ]
     if verdict != "not tested":
-        sections.append(_criteria(assessment.criteria, "verdict"))
-        if assessment.secondary:
-            sections += ["Beside:", _criteria(assessment.secondary, "it would say")]
+        sections.append(_criteria([one for one in criteria if one.decides], "verdict"))
+        if beside := [one for one in criteria if not one.decides]:
+            sections += ["Beside:", _criteria(beside, "verdict by itself")]
         sections += [text for table in claim.tables for text in tables_md(evidence, table)]
     if claim.notes:
         sections.append("\n".join(f"- {note}" for note in claim.notes))
@@ -203,15 +203,16 @@ def _effect(effect: Interval, unit: str) -> str:
 def _plain(finding: Finding) -> dict[str, Any]:
     """A finding as JSON can hold it."""
 
-    def plain(criteria: Sequence[Criterion]) -> list[dict[str, Any]]:
-        return [one._asdict() | {"effect": one.effect._asdict()} for one in criteria]
+    def plain(decide: bool) -> list[dict[str, Any]]:
+        criteria = (one._asdict() | {"effect": one.effect._asdict()} for one in finding.criteria)
+        return [one for one in criteria if one.pop("decides") == decide]
 
-    claim, verdict, assessment = finding
+    claim, verdict, _ = finding
     return {
         "id": claim.id,
         "setting": claim.setting,
         "claim": claim.text,
         "verdict": verdict,
-        "parts": plain(assessment.criteria),
-        "beside": plain(assessment.secondary),
+        "parts": plain(True),
+        "beside": plain(False),
     }

@@ -53,20 +53,14 @@ _CURVES_SCHEMA = pa.schema(
 
 
 class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The values of a scenario that the results depend on.
+    """The values of a scenario that the results depend on."""
 
-    Attributes:
-        fingerprint: hash of the scenario's values.
-        n_users: users in the field.
-        max_steps: steps of a mission.
-        data_per_bps: the data term of r^t for a throughput of 1 bit/s over the whole mission, with beta = 1:
-            seconds of a mission / (users x data_scale_bits). A mission flies all its steps, so the
-            throughput determines the data term.
-    """
-
-    fingerprint: str
+    fingerprint: str  # hash of the scenario's values
     n_users: int
     max_steps: int
+    # The data term of r^t for a throughput of 1 bit/s over the whole mission, with beta = 1: seconds of a
+    # mission / (users x data_scale_bits). A mission flies all its steps, so the throughput determines the
+    # data term.
     data_per_bps: float
 
     @classmethod
@@ -87,44 +81,27 @@ class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The origin of results.
-
-    Attributes:
-        command: that made them.
-        scale: of the sweep.
-        worlds: by the names of the scenarios.
-        greedy_missions: number flown by each run after training.
-        wall_time_s: of an uninterrupted sweep, seconds.
-        device: in words.
-        version: of the package.
-    """
+    """The origin of results."""
 
     command: str
     scale: Scale
-    worlds: dict[str, ScenarioFacts]
-    greedy_missions: int
-    wall_time_s: float | None = None
-    device: str = ""
+    worlds: dict[str, ScenarioFacts]  # by the names of the scenarios
+    greedy_missions: int  # of each run
+    wall_time_s: float | None = None  # None for an interrupted sweep
+    device: str = ""  # in words
     version: str = __version__
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """Runs and their measures.
-
-    Attributes:
-        metadata: their origin.
-        planned: the runs.
-        episode: number of the last episode of each point, `[n_points]`.
-        curves: by `METRICS`: a mean over the episodes of each point, float32 `[n_runs, n_points]`.
-        greedy: by `GREEDY`: a mean over missions, float32 `[n_runs]`.
-    """
+    """Runs and their measures."""
 
     metadata: Metadata
     planned: tuple[PlannedRun, ...]
-    episode: Array
+    episode: Array  # number of the last episode of each point, `[n_points]`
+    # By `METRICS`: a mean over the episodes of each point, float32 `[n_runs, n_points]`.
     curves: dict[str, Array]
-    greedy: dict[str, Array]
+    greedy: dict[str, Array]  # by `GREEDY`: a mean over missions, float32 `[n_runs]`
 
     def __post_init__(self) -> None:
         """Raises TrainingError for a wrong shape or name, a number that is not finite, or a repeated run."""

@@ -36,23 +36,13 @@ ENVIRONMENTS = (0, 1, 2, 3, 4)
 
 
 class Scale(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Size of a sweep.
-
-    Attributes:
-        name: `full` or `smoke`.
-        episodes: training missions of every run.
-        episodes_per_point: consecutive missions whose mean is a point of a curve.
-        environments: layouts of the users.
-        repeats: runs of each setting in each environment.
-        ratios: beta, zeta.
-        gammas, epsilons, batch_sizes, learning_rates: the parametric study.
-    """
+    """Size of a sweep."""
 
     name: str
-    episodes: int
-    episodes_per_point: int
-    environments: tuple[int, ...]
-    repeats: int
+    episodes: int  # training missions of every run
+    episodes_per_point: int  # consecutive missions whose mean is a point of a curve
+    environments: tuple[int, ...]  # layouts of the users
+    repeats: int  # runs of each setting in each environment
     ratios: tuple[Ratio, ...]
     gammas: tuple[float, ...]
     epsilons: tuple[float, ...]
@@ -137,16 +127,10 @@ class Setting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class PlannedRun(NamedTuple):
-    """One run of the sweep.
-
-    Attributes:
-        setting: what is compared.
-        environment: layout of the users.
-        repeat: number of the run among those of the setting in the environment.
-    """
+    """One run of the sweep."""
 
     setting: Setting
-    environment: int
+    environment: int  # layout of the users
     repeat: int
 
     @property
@@ -164,19 +148,18 @@ class PlannedRun(NamedTuple):
             r_plus=setting.r_plus,
             form=setting.form,
         )
-        hyperparameters = Hyperparameters(
-            gamma=setting.gamma,
-            epsilon=setting.epsilon,
-            batch_size=setting.batch_size,
-            learning_rate=setting.learning_rate,
-            episodes=scale.episodes,
-        )
         return Run(
             seed=self.seed,
             environment=self.environment,
             algorithm=setting.algorithm,
             reward=reward,
-            hyperparameters=hyperparameters,
+            hyperparameters=Hyperparameters(
+                gamma=setting.gamma,
+                epsilon=setting.epsilon,
+                batch_size=setting.batch_size,
+                learning_rate=setting.learning_rate,
+                episodes=scale.episodes,
+            ),
         )
 
 

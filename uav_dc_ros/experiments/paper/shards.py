@@ -35,15 +35,10 @@ _ROOTS = ("uav_dc_ros.experiments.paper.shards", "uav_dc_ros.experiments.train.c
 
 
 class Shard(msgspec.Struct, frozen=True, kw_only=True):
-    """A population, and the greedy missions of its policies after training.
-
-    Attributes:
-        population: the runs.
-        greedy_seeds: first seed of the greedy missions, and their number.
-    """
+    """A population, and the greedy missions of its policies after training."""
 
     population: Population
-    greedy_seeds: tuple[int, int]
+    greedy_seeds: tuple[int, int]  # first seed of the greedy missions, and their number
 
     @property
     def name(self) -> str:
@@ -60,17 +55,11 @@ class Shard(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True)
 class ShardResult:
-    """The result of a shard of N runs.
+    """The result of a shard of N runs."""
 
-    Attributes:
-        curves: by `episode_stats.CURVES`, float32 `[T, N]`.
-        greedy: greedy missions after training, `[N, S]` each.
-        parameters: of each run's network, N of them.
-    """
-
-    curves: dict[str, Array]
-    greedy: Missions
-    parameters: list[network.Parameters]
+    curves: dict[str, Array]  # by `episode_stats.CURVES`, float32 `[T, N]`
+    greedy: Missions  # after training, `[N, S]` each
+    parameters: list[network.Parameters]  # of each run's network
 
     def to_bytes(self) -> bytes:
         """One safetensors file."""

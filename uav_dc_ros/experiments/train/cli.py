@@ -47,24 +47,15 @@ _REWARD_OPTIONS = {"beta": "beta", "zeta": "zeta", "r_plus": "r_plus", "reward_f
 
 
 class _Progress(msgspec.Struct):
-    """What a checkpoint holds beside the training; the names in the file are older than those here.
+    """What a checkpoint holds beside the training; the file keeps the older names."""
 
-    Attributes:
-        every: episodes between checkpoints.
-        selection_score: highest until now.
-        score: users that the policy with that score brought home in validation.
-        run: index of its run.
-        best: its folder's name.
-        seconds: wall time.
-        prefilled: recorded flights that the replay buffers began with.
-    """
-
-    every: int
-    selection_score: float | None = msgspec.field(default=None, name="merit")
-    score: float | None = None
-    run: int = 0
-    best: str = ""
-    seconds: float = 0.0
+    every: int  # episodes between checkpoints
+    selection_score: float | None = msgspec.field(default=None, name="merit")  # highest until now
+    score: float | None = None  # users that the policy with that score brought home in validation
+    run: int = 0  # index of its run
+    best: str = ""  # its folder's name
+    seconds: float = 0.0  # wall time
+    # Recorded flights that the replay buffers began with.
     prefilled: PrefilledReplay | None = msgspec.field(default=None, name="remembered")
 
 

@@ -27,14 +27,8 @@ def card(
 ) -> str:
     """Text of a policy's README.md.
 
-    Args:
-        policy: as loaded from its folder.
-        scenario: the one that the command names, without its overrides: evaluates the policy.
-        command: that made the policy.
-        n_runs: runs that were trained side by side.
-        seconds: wall time of the training.
-        score: users brought home in validation.
-        prefilled: recorded flights that the replay buffer began with.
+    `scenario`, without the overrides of `command`, evaluates the policy. `seconds` is the wall time of the
+    training, and `score` the number of users brought home in validation.
     """
     config, values = policy.config, policy.config.hyperparameters
     hidden = " and ".join(map(str, config.hidden))

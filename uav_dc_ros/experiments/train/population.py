@@ -16,39 +16,23 @@ from uav_dc_ros.errors import TrainingError
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """All values in which runs of a population may differ.
+    """All values in which runs of a population may differ."""
 
-    Attributes:
-        seed: of the run's own generator, the source of all its random numbers.
-        environment: seed of the mission whose initial users start every mission; None for a fresh layout
-            in every mission.
-        algorithm: `dqn` or `dueling_dqn`.
-        aggregation: what the dueling network subtracts; unused by `dqn`.
-        reward: parameters of its reward.
-        hyperparameters: of its learner.
-    """
-
-    seed: Annotated[int, Meta(ge=0)]
+    seed: Annotated[int, Meta(ge=0)]  # of the run's own generator, the source of all its random numbers
+    # Seed of the mission whose initial users start every mission; None for a fresh layout in every mission.
     environment: Annotated[int, Meta(ge=0)] | None = None
     algorithm: Algorithm
-    aggregation: network.Aggregation = "mean"
+    aggregation: network.Aggregation = "mean"  # what the dueling network subtracts; unused by `dqn`
     reward: RewardSettings
     hyperparameters: Hyperparameters
 
 
 class Population(msgspec.Struct, frozen=True, kw_only=True):
-    """Runs that train in one batch: they share what gives the arrays their shapes.
+    """Runs that train in one batch: they share what gives the arrays their shapes."""
 
-    Attributes:
-        scenario: of every run; its `reward` is not used.
-        observation: input of the agents.
-        hidden: units of each hidden layer.
-        runs: the N runs.
-    """
-
-    scenario: Scenario
+    scenario: Scenario  # of every run; its `reward` is not used
     observation: Observation
-    hidden: tuple[int, ...]
+    hidden: tuple[int, ...]  # units of each hidden layer
     runs: tuple[Run, ...]
 
     def __post_init__(self) -> None:

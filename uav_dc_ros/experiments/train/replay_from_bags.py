@@ -16,18 +16,12 @@ if TYPE_CHECKING:  # the modules that read bags are imported only when bags are 
 
 
 class PrefilledReplay(msgspec.Struct, frozen=True, kw_only=True):
-    """The recorded flights in the replay buffers.
+    """The recorded flights in the replay buffers."""
 
-    Attributes:
-        bags: paths as given.
-        missions, transitions: number in the bags.
-        held: transitions in each run's replay buffer: the latest, if not all fit.
-    """
-
-    bags: tuple[str, ...]
+    bags: tuple[str, ...]  # paths as given
     missions: int
     transitions: int
-    held: int
+    held: int  # transitions in each run's replay buffer: the latest, if not all fit
 
     def __str__(self) -> str:
         bags = ", ".join(Path(bag).name for bag in self.bags)

@@ -39,15 +39,11 @@ def roll_out_greedily(training: Training, seeds: range) -> Missions:
 
 
 class Validation(NamedTuple):
-    """Scores of each run's policy, `[N]` each.
+    """Scores of each run's policy, `[N]` each."""
 
-    Attributes:
-        brought_home: mean number of users collected; 0 for a mission that does not land.
-        selection_score: selects the policy: the share of users brought home, less a tenth of the share of
-            the battery spent on arrival. A hundredth of the users weighs as much as a tenth of the battery.
-    """
-
-    brought_home: np.ndarray
+    brought_home: np.ndarray  # mean number of users collected; 0 for a mission that does not land
+    # Selects the policy: the share of users brought home, less a tenth of the share of the battery spent on
+    # arrival. A hundredth of the users weighs as much as a tenth of the battery.
     selection_score: np.ndarray
 
 
