@@ -79,8 +79,9 @@ def check_parameters(asker: Asker, name: str) -> None:
     told = asker.ask(node=f"/{name}")
     for row in (*COMMON, *NODES[name].parameters):
         unit = f" [{row.unit}]" if row.unit else ""
+        choices = f"; one of {', '.join(row.choices)}" if row.choices else ""
         assert told[row.name] == {
-            "description": f"{row.description}{unit}",
+            "description": f"{row.description}{unit}{choices}",
             "expected": row.expected,
             "read_only": row.read_only,
             "range": [] if row.min is None else [[row.min, row.max]],

@@ -183,10 +183,6 @@ class WorldNode(MissionNode):
             self._begin(0)
         else:
             self._publish_step()
-        self._start_clocks()
-
-    def _start_clocks(self) -> None:
-        """Start the timers of steps, on the steady clock or that of `use_sim_time`, and of `clock`."""
         use_sim_time = self.get_parameter("use_sim_time").value
         self._period_s = pace.period_s(self.scenario, self.pace)
         self._step_began_s = time.monotonic()

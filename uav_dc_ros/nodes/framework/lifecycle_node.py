@@ -208,7 +208,7 @@ def _typed(given: rclpy.Parameter, row: Parameter) -> rclpy.Parameter:
 
 def _descriptor(row: Parameter) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
-        description=row.description_with_unit,
+        description=row.help,
         additional_constraints=row.expected,
         read_only=row.read_only,
         dynamic_typing=True,  # `Parameter.value` rejects a wrong type, by the parameter's name

@@ -172,8 +172,8 @@ class MissionNode(ManagedNode):
         if data.startswith(self._given_run, CDR_HEADER):
             return False
         other = messages.read_run(data[CDR_HEADER:].rstrip(b"\0"))
-        if other is None:
-            return False  # malformed: its decoder rejects it
+        if other is None:  # malformed: its decoder rejects it
+            return False
         try:
             self.check_run(topic, other)
         except MessageError as error:

@@ -33,7 +33,7 @@ def parser(name: str, description: str) -> cli.Parser:
 def _line(row: Parameter) -> str:
     value = str(row.default).lower() if isinstance(row.default, bool) else row.default  # as ROS reads it
     default = "" if value == "" else f" (default: {value})"
-    return f"  {row.name:<20}  {row.description_with_unit}{default}"
+    return f"  {row.name:<20}  {row.help}{default}"
 
 
 def ros_arguments(description: str) -> list[str]:

@@ -21,7 +21,7 @@ from uav_dc_ros.nodes.framework import node_cli, process_control
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.process_control import SUPERVISED
 from uav_dc_ros.nodes.ros import environment, fastdds, rclpy_private
-from uav_dc_ros.nodes.ros.executor import DirectExecutor
+from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.2  # a lost message is sent again within a tenth of a second
@@ -105,14 +105,9 @@ def main(
     if batch_scheduling:
         use_batch_scheduling()
     status = _run(makes, arguments)
-    # All is logged and written. The middleware may hang while several of its participants leave at once: a
-    # forced exit keeps the status, and costs a leftover in shared memory at most.
-    threading.Timer(EXIT_TIMEOUT_S, os._exit, (status,)).start()
     gc.unfreeze()
-    gc.collect()  # the middleware's part of a node ends with the last reference to it, and not before
-    rclpy.try_shutdown()
-    rclpy.get_default_context().destroy()
-    os._exit(status)
+    shut_down(rclpy.get_default_context(), EXIT_TIMEOUT_S)
+    os._exit(status)  # all is logged and written; a hanging middleware costs a leftover in shared memory
 
 
 def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> int:
@@ -139,7 +134,9 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> in
         for node in nodes:
             node.prepare()
         nodes[0].create_timer(process_control.PERIOD_S, reporter.report, clock=nodes[0].steady)
-        if _start([node for node in nodes if node.values["autostart"]]):
+        to_start = [node for node in nodes if node.values["autostart"]]
+        transitions = ((node, name) for name in process_control.STATES for node in to_start)
+        if all(process_control.make_transition(node, name) for node, name in transitions):
             gc.freeze()  # these objects stay: the collector need not scan them again
             if pause_s:
                 os.nice(BACKGROUND_NICENESS)
@@ -151,19 +148,6 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> in
     for node in nodes:
         node.destroy_node()
     return status
-
-
-def _start(nodes: Sequence[MissionNode]) -> bool:
-    """Configure and activate nodes; whether all are active."""
-    for node in nodes:
-        node.trigger_configure()
-        if node.state != "inactive":
-            return False
-    for node in nodes:
-        node.trigger_activate()
-        if node.state != "active":
-            return False
-    return True
 
 
 def _spin(

@@ -26,6 +26,7 @@ class Parameter:
     Attributes:
         unit: unit of the value; empty for names, counts and switches.
         min, max: range of a number.
+        choices: allowed texts; empty: any.
         read_only: the value is fixed when the node starts.
         parse: returns the value that the node uses; raises ParameterError.
     """
@@ -37,17 +38,21 @@ class Parameter:
     min: float | None = None
     max: float | None = None
     _: KW_ONLY
+    choices: tuple[str, ...] = ()
     read_only: bool = False
     parse: Callable[[Any], Any] | None = None
 
     @property
-    def description_with_unit(self) -> str:
-        """The description, as ROS and `--help` show it."""
-        return f"{self.description} [{self.unit}]" if self.unit else self.description
+    def help(self) -> str:
+        """Description, unit and choices, as ROS and `--help` show them."""
+        choices = f"; {self.expected}" if self.choices else ""
+        return f"{self.description}{f' [{self.unit}]' if self.unit else ''}{choices}"
 
     @property
     def expected(self) -> str:
         """Type and range of the value, in words."""
+        if self.choices:
+            return f"one of {', '.join(self.choices)}"
         if self.min is None:
             return {bool: "true or false", list: "a list of texts"}.get(type(self.default), "text")
         kind = "a whole number" if isinstance(self.default, int) else "a number"
@@ -67,8 +72,8 @@ class Parameter:
     def value(self, given: Any) -> Any:
         """Check a value and return what the node uses; raises ParameterError for an invalid one."""
         value = self.typed(given)
-        has_type = type(value) is type(self.default)
-        if not has_type or (self.min is not None and not self.min <= value <= (self.max or 0)):
+        is_valid = type(value) is type(self.default) and (not self.choices or value in self.choices)
+        if not is_valid or (self.min is not None and not self.min <= value <= (self.max or 0)):
             raise ParameterError(f"{self.name}: {value!r}; expected {self.expected}")
         if self.parse is None:
             return value
@@ -83,17 +88,6 @@ def _names(text: str) -> list[str]:
     if "" in names:
         raise ParameterError(f"{text!r}; expected names of topics with a comma between")
     return names
-
-
-def _one_of(*choices: str) -> Callable[[str], str]:
-    """A check that a text is one of these."""
-
-    def check(text: str) -> str:
-        if text not in choices:
-            raise ParameterError(f"{text!r}; expected one of {', '.join(choices)}")
-        return text
-
-    return check
 
 
 def _run(text: str) -> str:
@@ -143,14 +137,11 @@ JOURNAL = Parameter(
 VEHICLE_OF_WORLD = Parameter(
     "vehicle",
     SIMULATED,
-    f"'{SIMULATED}': this node flies the vehicle; '{EXTERNAL}': a bridge does, and this node moves the users",
-    parse=_one_of(SIMULATED, EXTERNAL),
+    "vehicle that flies; external: a bridge flies it, and this node only moves the users",
+    choices=(SIMULATED, EXTERNAL),
 )
 RECORDED_VEHICLE = Parameter(
-    "vehicle",
-    SIMULATED,
-    f"vehicle that flies: '{SIMULATED}', or the interface of a real one: one of {', '.join(VEHICLES)}",
-    parse=_one_of(SIMULATED, *VEHICLES),
+    "vehicle", SIMULATED, "vehicle that flies, or its interface", choices=(SIMULATED, *VEHICLES)
 )
 RATE_HZ = Parameter("rate", 5.0, "maximum rate of path and markers", "Hz", 0.1, 60.0)
 PORT = Parameter("port", 8765, "TCP port of the Foxglove WebSocket server; 0: any that is free", "", 0, 65535)
@@ -169,12 +160,7 @@ SPLIT_BYTES = Parameter(
     "split_bytes", 0, "size at which a bag's next file begins; 0: never", "bytes", 0, INTEGER_MAX
 )
 SPLIT_S = Parameter("split_s", 0.0, "time after which a bag's next file begins; 0: never", "s", 0.0, 1e9)
-COMPRESSION = Parameter(
-    "compression",
-    "zstd",
-    f"how a bag's chunks are compressed: one of {', '.join(COMPRESSIONS)}",
-    parse=_one_of(*COMPRESSIONS),
-)
+COMPRESSION = Parameter("compression", "zstd", "compression of a bag's chunks", choices=COMPRESSIONS)
 MIN_FREE_BYTES = Parameter(
     "min_free_bytes", 2**28, "free disk space below which recording stops", "bytes", 0, INTEGER_MAX
 )
@@ -196,12 +182,7 @@ def _safety(name: str, description: str, unit: str, min: float, max: float) -> P
 
 # Of the bridge: the interface of the vehicle, and how carefully the bridge flies it.
 BRIDGE = (
-    Parameter(
-        "vehicle",
-        "mavlink",
-        f"interface of the autopilot: one of {', '.join(VEHICLES)}",
-        parse=_one_of(*VEHICLES),
-    ),
+    Parameter("vehicle", "mavlink", "interface of the autopilot", choices=VEHICLES),
     Parameter(
         "connect",
         "",
@@ -239,14 +220,14 @@ BRIDGE = (
     Parameter(
         "failsafe_action",
         str(SafetySettings.failsafe_action),
-        "failsafe action of the bridge: return or land",
-        parse=_one_of("return", "land"),
+        "failsafe action of the bridge",
+        choices=("return", "land"),
     ),
     Parameter(
         "flying_at_start",
         SafetySettings.flying_at_start,
-        "action when the bridge starts beside a vehicle in the commanded mode: resume or land",
-        parse=_one_of("resume", "land"),
+        "action when the bridge starts beside a vehicle in the commanded mode",
+        choices=("resume", "land"),
     ),
     _safety("command_retry_s", "pause before a request is repeated, vehicle time", "s", 0.5, 60.0),
     _safety("max_return_attempts", "requests to return before the bridge requests land", "", 1, 100),

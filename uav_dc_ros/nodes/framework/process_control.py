@@ -18,6 +18,7 @@ SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this process h
 REPORTS = "UAV_DC_ROS_REPORTS"  # set by run_all: the file descriptor for the reports
 PERIOD_S = 0.25  # of the reports
 CONFIGURE, ACTIVATE = "configure", "activate"
+STATES = {CONFIGURE: "inactive", ACTIVATE: "active"}  # after each transition
 FINALIZED = "finalized"  # the state in which a node publishes no more
 REASON_MAX = 1000  # characters; a report is shorter than what a pipe writes atomically
 
@@ -40,6 +41,15 @@ def command(transition: str, node: str) -> bytes:
 def decode(line: bytes) -> Mapping[str, NodeReport]:
     """Decode a line of reports, by name of the node."""
     return _decoder.decode(line)
+
+
+def make_transition(node: "ManagedNode", transition: str) -> bool:
+    """Make a transition of a node; returns whether it succeeded."""
+    if transition == CONFIGURE:
+        node.trigger_configure()
+    else:
+        node.trigger_activate()
+    return node.state == STATES[transition]
 
 
 class Reporter:
@@ -72,10 +82,6 @@ class Reporter:
         transition, name = line.split()
         node = self._nodes[name]
         self._refused.pop(name, None)
-        if transition == CONFIGURE:
-            node.trigger_configure()
-        else:
-            node.trigger_activate()
-        if node.state != {CONFIGURE: "inactive", ACTIVATE: "active"}[transition]:
+        if not make_transition(node, transition):
             self._refused[name] = str(node.failure or "it failed; see its log")[:REASON_MAX]
         self.report()

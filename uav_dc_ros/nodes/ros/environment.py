@@ -12,7 +12,7 @@ from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.nodes.ros import fastdds
 
 LINES = "RCUTILS_CONSOLE_OUTPUT_FORMAT"
-LINE_OF_NODE = "{severity}: {message}"  # whoever passes it on adds the node's name
+LINE_OF_NODE = "{severity}: {message}"  # run_all adds the node's name
 LINE_OF_ONE_OF_MANY = "{severity}: {name}: {message}"
 DOMAIN_MAX = 232  # the ports of higher ones do not exist
 NUMBER = re.compile(r"(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*")  # as C's strtoul reads it, and so rcl

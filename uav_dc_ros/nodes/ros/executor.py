@@ -6,6 +6,7 @@ EventsExecutor is experimental, and called no callback in the wheels of 7.1.6. `
 compares this executor with rclpy's own.
 """
 
+import contextlib
 import gc
 import threading
 import time
@@ -26,6 +27,7 @@ TURN_MAX, TURN_MAX_S = 100, 0.2
 QUIET_TURNS = 10
 BUSY_S = 0.003  # while messages keep coming, timers and services are checked this often
 BUSY_NS = round(BUSY_S * 1e9)
+_Entity = tuple[str, Any, Callable[[Any], None]]  # kind (as in the wait set), entity, and what handles it
 
 
 class DirectExecutor:
@@ -49,8 +51,8 @@ class DirectExecutor:
         self._nodes: list[Node] = []
         self._wait_set: Any = None
         self._subscriptions_wait_set: Any = None
-        self._subscriptions: list[Any] = []  # as of the last full wait
-        self._capacity: tuple[int, ...] = ()
+        self._subscriptions: list[_Entity] = []  # as of the last full wait
+        self._capacity: tuple[int, ...] = (0,) * 5  # of the wait set
         self._full_wait_s = 0.0  # time of the last full wait
         self._received_s = 0.0  # time of the last message
 
@@ -87,61 +89,47 @@ class DirectExecutor:
         """Wait for at most `timeout_s` seconds, and run all callbacks that are ready.
 
         Each entity in a wait set costs time, and most of a node's are services that are rarely called. So
-        while messages keep coming, it waits for subscriptions alone, for at most `BUSY_S`.
+        while messages keep coming, it waits for subscriptions only, for at most `BUSY_S`.
         """
         is_busy = self._subscriptions and time.monotonic() - self._full_wait_s < BUSY_S
-        if is_busy and self._wait_for_messages():
+        if is_busy and self._wait(self._subscriptions_wait_set, self._subscriptions, BUSY_NS):
             return
-        self._wait_for_all(timeout_s)
+        timers = self._entities("timer", _call_timer)
+        subscriptions = self._entities("subscription", self._take_messages)
+        services = self._entities("service", _serve)
+        clients = self._entities("client", _complete)
+        capacity = len(subscriptions), 1, len(timers), len(clients), len(services)
+        if any(has < needed for has, needed in zip(self._capacity, capacity, strict=True)):
+            self._capacity = capacity
+            self._wait_set = rclpy_private.wait_set(self._context, *capacity)
+        timeout_ns = -1 if timeout_s is None else round(timeout_s * 1e9)
+        self._wait(self._wait_set, [*timers, *subscriptions, *services, *clients], timeout_ns)
         self._full_wait_s = time.monotonic()
-        subscriptions = [entity for node in self._nodes for entity in node.subscriptions]
+        subscriptions = self._entities("subscription", self._take_messages)
         if len(subscriptions) > len(self._subscriptions):
-            size = len(subscriptions)
-            self._subscriptions_wait_set = rclpy_private.wait_set(self._context, size, 1, 0, 0, 0)
+            capacity = len(subscriptions), 1, 0, 0, 0
+            self._subscriptions_wait_set = rclpy_private.wait_set(self._context, *capacity)
         self._subscriptions = subscriptions
 
-    def _wait_for_messages(self) -> bool:
-        """Wait for messages and handle them; False if none came within `BUSY_S`.
+    def _entities(self, kind: str, handle: Callable[[Any], None]) -> list[_Entity]:
+        return [(kind, entity, handle) for node in self._nodes for entity in getattr(node, f"{kind}s")]
 
-        True also after `wake`, which ends this wait: `spin` has to check its condition before the next one.
+    def _wait(self, wait_set: Any, entities: list[_Entity], timeout_ns: int) -> bool:
+        """Wait for entities and handle those that are ready; False after the timeout.
+
+        True also after `wake`: then `spin` has to check its condition.
         """
-        wait_set = self._subscriptions_wait_set
         wait_set.clear_entities()
-        for subscription in self._subscriptions:
-            wait_set.add_subscription(subscription.handle)
+        at = [getattr(wait_set, f"add_{kind}")(entity.handle) for kind, entity, _ in entities]
         wait_set.add_guard_condition(self._guard.handle)
-        wait_set.wait(BUSY_NS)
-        ready = [
-            entity for at, entity in enumerate(self._subscriptions) if wait_set.is_ready("subscription", at)
-        ]
-        for subscription in ready:
-            self._take_messages(subscription)
-        return bool(ready) or wait_set.is_ready("guard_condition", 0)
-
-    def _wait_for_all(self, timeout_s: float | None) -> None:
-        timers = [timer for node in self._nodes for timer in node.timers]
-        subscriptions = [subscription for node in self._nodes for subscription in node.subscriptions]
-        services = [service for node in self._nodes for service in node.services]
-        clients = [client for node in self._nodes for client in node.clients]
-        wait_set = self._empty_wait_set(len(subscriptions), 1, len(timers), len(clients), len(services))
-        added = [
-            *(("timer", wait_set.add_timer(one.handle), one, _call_timer) for one in timers),
-            *(
-                ("subscription", wait_set.add_subscription(one.handle), one, self._take_messages)
-                for one in subscriptions
-            ),
-            *(("service", wait_set.add_service(one.handle), one, _serve) for one in services),
-            *(("client", wait_set.add_client(one.handle), one, _complete) for one in clients),
-        ]
-        wait_set.add_guard_condition(self._guard.handle)
-        wait_set.wait(-1 if timeout_s is None else round(timeout_s * 1e9))
+        wait_set.wait(timeout_ns)
         # All that is ready is listed before a callback may create or destroy entities.
-        ready = [(handle, entity) for kind, at, entity, handle in added if wait_set.is_ready(kind, at)]
-        for handle, entity in ready:
-            try:
+        ready = [one for one, index in zip(entities, at, strict=True) if wait_set.is_ready(one[0], index)]
+        is_woken: bool = wait_set.is_ready("guard_condition", 0)
+        for _, entity, handle in ready:
+            with contextlib.suppress(InvalidHandle):  # destroyed by an earlier callback of this turn
                 handle(entity)
-            except InvalidHandle:  # destroyed by an earlier callback of this turn
-                continue
+        return bool(ready) or is_woken
 
     def _take_messages(self, subscription: Any) -> None:
         handle = subscription.handle
@@ -160,14 +148,6 @@ class DirectExecutor:
                 if self._received_s > until_s:
                     break
         self._is_behind = True
-
-    def _empty_wait_set(self, *capacity: int) -> Any:
-        """The wait set, emptied, with room for subscriptions, guards, timers, clients, services."""
-        if any(has < needed for has, needed in zip(self._capacity or (0,) * 5, capacity, strict=True)):
-            self._capacity = capacity
-            self._wait_set = rclpy_private.wait_set(self._context, *capacity)
-        self._wait_set.clear_entities()
-        return self._wait_set
 
 
 def _call_timer(timer: Any) -> None:
