@@ -2,7 +2,7 @@
 
 import pytest
 
-from uav_dc_ros.recordings.pages.diagnostics import NodeHistory, NodeStatus
+from uav_dc_ros.recordings.pages.health import NodeHistory, NodeStatus
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from uav_dc_ros import bag as command
 from uav_dc_ros import messages
 from uav_dc_ros.core.grid import ACTION_LABELS, Action
 from uav_dc_ros.env.gym_env import DataCollectionEnv
-from uav_dc_ros.recordings.export.rows import TABLES
+from uav_dc_ros.recordings.export.tables import TABLES
 
 TINY = tiny()
 MISSIONS, STEPS, SEED = 3, TINY.mission.max_steps, 4

@@ -25,7 +25,7 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.recordings.info.missions import survey_missions
+from uav_dc_ros.recordings.info.survey import survey_missions
 from uav_dc_ros.recordings.pages import missions as pages
 from uav_dc_ros.recordings.pages.vehicle import PATH_MAX, VehiclePath
 from uav_dc_ros.recordings.recorded_step import PHASE_REPORTS_MAX, RecordedPose

@@ -407,7 +407,7 @@ def test_a_paced_flight_may_hover_where_a_move_came_too_late(tmp_path, capsys):
     told = [late(message) for message in told]
     status, out = verify(capsys, write(tmp_path / "paced", told, about(TINY, pace="10.0")))
     assert status == 0
-    assert "1 moves were not flown: they came too late, and the vehicle hovered" in out
+    assert "1 moves came too late and were not flown: the vehicle hovered" in out
     status, out = verify(capsys, write(tmp_path / "lockstep", told, about(TINY)))
     assert status == 1
     assert "mission: mission 0, step 3, cell: recorded [0, 0, 0], recomputed [1, 0, 0]" in out

@@ -1,4 +1,4 @@
-"""One step of a recorded mission: the messages that a bag holds of it."""
+"""Steps of a recorded mission: the messages that a bag holds of each, and the totals of all."""
 
 from bisect import insort
 from dataclasses import dataclass, field
@@ -7,13 +7,16 @@ from operator import attrgetter
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
-from uav_dc_ros import messages
+from uav_dc_ros import messages, payloads
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.messages import FaultKind, Mission, Phase
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.messages import FaultKind, Mission, Phase, Rates
 from uav_dc_ros.phases import BEFORE_START
 
 STEP_POSES_MAX = 64
+UNFINISHED = "unfinished"  # outcome of a mission whose end is not in the bag
 PHASE_REPORTS_MAX = 1000  # of a step: a vehicle that waits for hours reports again and again
 
 
@@ -47,37 +50,26 @@ class PhaseReport(NamedTuple):
 class RecordedStep:
     """One step of a mission; None for what the bag does not hold.
 
-    Attributes:
-        flight: counts the runs in a bag from 0.
-        mission, step: index of the mission in its flight, steps flown.
-        position_m: x, y, altitude of the first pose of the step's own time, metres, `[3]`.
-        users, rates, status, move: the payloads; of repeated ones the first. Of several statuses the end of
-            the mission counts most, then the first with phase `ready`, then the newest.
-        phase_reports: phases and reasons in the order of publication, at most `PHASE_REPORTS_MAX`.
-        n_dropped_reports: phase reports beyond that; the middle ones are dropped.
-        order: index of the step's latest message among all received ones.
-        clock_resets: times that the recorder's clock had been set back when the users were received.
-        log_ns, publish_ns: when each payload was received and published, since the epoch, by topic.
-        poses: the first poses of the step's own time, by stamp, at most `STEP_POSES_MAX`.
-        conflicts: the first differing repetition of a payload, by topic. Users that differ in their time only
-            count least.
+    Of repeated payloads the first counts. Of several statuses the end of the mission counts most, then the
+    first with phase `ready`, then the newest.
     """
 
-    flight: int
-    mission: int
-    step: int
-    position_m: Array | None = None
+    flight: int  # counts the runs in a bag from 0
+    mission: int  # index in the flight
+    step: int  # steps flown
+    position_m: Array | None = None  # first pose of the step's own time: x, y, altitude, `[3]`
     users: messages.Users | None = None
     rates: messages.Rates | None = None
     status: messages.Mission | None = None
     move: messages.Move | None = None
-    phase_reports: list[PhaseReport] = field(default_factory=list)
-    n_dropped_reports: int = 0
-    order: int = 0
-    clock_resets: int = 0
-    log_ns: dict[str, int] = field(default_factory=dict)
-    publish_ns: dict[str, int] = field(default_factory=dict)
-    poses: list[RecordedPose] = field(default_factory=list)
+    phase_reports: list[PhaseReport] = field(default_factory=list)  # by publish time
+    n_dropped_reports: int = 0  # beyond `PHASE_REPORTS_MAX`, from the middle
+    order: int = 0  # index of the latest message among all received ones
+    clock_resets: int = 0  # times that the clock had been set back when the users were received
+    log_ns: dict[str, int] = field(default_factory=dict)  # log times since the epoch, by topic
+    publish_ns: dict[str, int] = field(default_factory=dict)  # publish times likewise
+    poses: list[RecordedPose] = field(default_factory=list)  # of the step's own time, by stamp
+    # First differing repetition of a payload, by topic. Users that differ in time only count least.
     conflicts: dict[str, messages.Stepped] = field(default_factory=dict)
 
     @property
@@ -101,6 +93,19 @@ class RecordedStep:
         key = self.flight, self.mission, self.step - 1
         return before is not None and (before.flight, before.mission, before.step) == key
 
+    def observed(self, scenario: Scenario) -> dict[str, Array] | None:
+        """Arguments of `core.observations.encode`; None without status or rates.
+
+        Raises MessageError if they are of another world.
+        """
+        if self.status is None or self.rates is None:
+            return None
+        payloads.check(self.status, scenario)
+        data_bits, collected = payloads.collection(self.rates, scenario)
+        cell, left = np.asarray(self.status.cell), self.status.remaining_steps
+        step = np.asarray(scenario.mission.max_steps - left)
+        return {"cell": cell, "step": step, "data_bits": data_bits, "collected": collected}
+
     @property
     def phase_changes(self) -> list[PhaseReport]:
         """The first report of each phase."""
@@ -122,6 +127,39 @@ class RecordedStep:
             del self.phase_reports[PHASE_REPORTS_MAX // 2]
             self.n_dropped_reports += 1
         return True
+
+
+@dataclass(kw_only=True)
+class MissionTotals:
+    """Result of a mission; None where no rates, or no status, are recorded."""
+
+    steps: int = 0  # flown
+    outcome: str = UNFINISHED  # or landed, timeout, aborted
+    reason: str = ""  # of the last phase; empty in simulation
+    steps_not_reached: int = 0  # flown steps whose cell a real vehicle did not reach
+    collected: int | None = None  # users collected at the last rates
+    users: int | None = None  # all users
+    data_bits: float | None = None  # from all users at the last rates
+    seed: int | None = None
+    scenario: str | None = None
+    fingerprint: str | None = None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the bag holds the end of the mission."""
+        return self.outcome != UNFINISHED
+
+    def add(self, step: int, status: Mission | None, rates: Rates | None) -> None:
+        """Add the next step."""
+        self.steps = max(self.steps, step)
+        if rates is not None:
+            self.collected, self.users = sum(rates.collected), len(rates.collected)
+            self.data_bits = float(np.sum(rates.data_bits))
+        if status is not None:
+            self.seed, self.scenario, self.fingerprint = status.seed, status.scenario, status.fingerprint
+            self.reason, self.steps_not_reached = status.reason, status.steps_not_reached
+            if status.phase.is_over:
+                self.outcome = status.phase.value
 
 
 def mission_name(mission: int, flight: int) -> str:

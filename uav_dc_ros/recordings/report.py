@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from uav_dc_ros.recordings.pages.health import Health
 from uav_dc_ros.recordings.pages.missions import read_missions
 from uav_dc_ros.recordings.pages.page import Page, world_data
 from uav_dc_ros.recordings.pages.vehicle import read_path
-from uav_dc_ros.recordings.recorded_step import RecordedStep, printable
+from uav_dc_ros.recordings.recorded_step import printable
 from uav_dc_ros.topics import SIMULATED
 
 SUMMARIES_MAX = 2_000  # rows in the list of missions
@@ -71,13 +70,7 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
         summaries: list[dict[str, Any]] = []
         shown: list[int] = []
         total = 0
-
-        def steps() -> Iterator[RecordedStep]:
-            for step in recorded:
-                health.add_step(step)
-                yield step
-
-        for mission in read_missions(steps(), scenario, real):
+        for mission in read_missions(map(health.add_step, recorded), scenario, real):
             if options.mission is not None and mission.index not in options.mission:
                 continue
             total += 1
@@ -86,12 +79,9 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
                 continue
             summaries.append(mission.summary())
             # The first missions are shown: a later and smaller one fills no gap.
-            if len(shown) == len(summaries) - 1:
-                data = {"stride": mission.stride, "steps": mission.steps(), "table": mission.table()}
-                if path is not None and mission.timeline is not None:
-                    data["timeline"] = mission.timeline.data(path)
-                if page.add(f"mission-{total - 1}", data, SYSTEM_ROOM):
-                    shown.append(total - 1)
+            is_next = len(shown) == len(summaries) - 1
+            if is_next and page.add(f"mission-{total - 1}", mission.data(path), SYSTEM_ROOM):
+                shown.append(total - 1)
         if not total:
             raise BagError(compare.no_step(options.bag, options.mission, recorded))
         health.add_losses(recorded)
@@ -118,11 +108,7 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
 
 
 def _check_out(out: Path) -> None:
-    """Refuse to replace a file that is no report, such as one of a bag.
-
-    Raises:
-        ParameterError: the file exists and is no report, or its folder does not exist.
-    """
+    """Raises ParameterError if the file exists and is no report, or its folder does not exist."""
     if not out.absolute().parent.is_dir():
         raise ParameterError(f"--out {out}: expected a file in an existing folder")
     if not out.exists() or not (out.is_dir() or files.is_replaced(out)):

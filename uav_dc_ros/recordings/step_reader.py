@@ -53,11 +53,7 @@ def namespaces(reader: BagReader) -> list[str]:
 
 
 def namespace(reader: BagReader, wanted: str | None = None) -> str:
-    """The namespace `wanted`, or the only one.
-
-    Raises:
-        BagError: no mission was recorded there, or there are several and none is wanted.
-    """
+    """The namespace `wanted`, or the only one; raises BagError if there is none such."""
     found = namespaces(reader)
     listed = ", ".join(name or "/" for name in found)
     if wanted is not None:
@@ -80,9 +76,7 @@ def namespace(reader: BagReader, wanted: str | None = None) -> str:
 def scenario(reader: BagReader, namespace: str, wanted: str | Path | None = None) -> Scenario:
     """The scenario `wanted`, or the one that the bag holds, or the shipped one of the missions' fingerprint.
 
-    Raises:
-        BagError: the bag holds no scenario, and no shipped one has the fingerprint.
-        ScenarioError: the scenario cannot be read.
+    Raises BagError if there is none, and ScenarioError if it cannot be read.
     """
     if wanted is not None:
         return scenarios.load(wanted)
@@ -133,17 +127,12 @@ class Steps:
 
     Raises:
         BagError: a topic has another type.
-
-    Attributes:
-        rejected: messages that cannot be decoded, by topic and reason.
-        orphans: messages that came after their step was released without them, by topic.
-        repeated: repeated messages, by topic. Poses are not counted.
     """
 
     def __init__(self, reader: BagReader, namespace: str, step_ns: int = 2**63) -> None:
-        self.rejected = Unreadable()
-        self.orphans: Counter[str] = Counter()
-        self.repeated: Counter[str] = Counter()
+        self.rejected = Unreadable()  # messages that cannot be decoded, by topic and reason
+        self.orphans: Counter[str] = Counter()  # messages that came too late for their step, by topic
+        self.repeated: Counter[str] = Counter()  # repeated messages, by topic; poses are not counted
         self._reader = reader
         self._step_ns = step_ns
         self._topics = {
@@ -224,13 +213,7 @@ class Steps:
         return topic != "rates" and _identity(payload) != _identity(before)
 
     def _add(
-        self,
-        key: Key,
-        topic: str,
-        payload: messages.Stepped,
-        message: BagMessage,
-        order: int,
-        clock_resets: int,
+        self, key: Key, topic: str, payload: messages.Stepped, message: BagMessage, order: int, resets: int
     ) -> None:
         """Add a payload to its open step, or count it as a repetition or conflict."""
         flight, mission, number = key
@@ -241,7 +224,7 @@ class Steps:
         before = getattr(step, name)
         if before is not None:
             if isinstance(payload, Mission) and with_progress_of(payload, before) == before:
-                if not step.add_report(payload, log_ns, publish_ns, clock_resets):
+                if not step.add_report(payload, log_ns, publish_ns, resets):
                     self.repeated[topic] += 1
                     return
                 if not supersedes(payload, before, step.phase_reports[-1].publish_ns == publish_ns):
@@ -257,12 +240,12 @@ class Steps:
                     step.conflicts[topic] = payload
                 return
         elif isinstance(payload, Mission):
-            step.add_report(payload, log_ns, publish_ns, clock_resets)
+            step.add_report(payload, log_ns, publish_ns, resets)
         setattr(step, name, payload)
         step.log_ns[topic], step.publish_ns[topic] = log_ns, publish_ns
         step.order = max(step.order, order)
         if topic == "users":
-            step.clock_resets = clock_resets
+            step.clock_resets = resets
             for pose in self._poses:
                 self._assign(step, pose)
 
@@ -344,11 +327,7 @@ def _check_type(reader: BagReader, topic: RecordedTopic, type: str) -> None:
 
 
 def read_pose(message: BagMessage) -> RecordedPose:
-    """Read a pose.
-
-    Raises:
-        MessageError: the message holds no pose in the frame `map`.
-    """
+    """Read a pose; raises MessageError if the message holds none in the frame `map`."""
     pose = cdr.Pose(message.data)
     position_m = np.asarray(pose.position_m, dtype=np.float64)
     return RecordedPose(pose.stamp_ns, position_m, message.log_time_ns, message.publish_time_ns)

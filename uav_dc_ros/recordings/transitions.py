@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uav_dc_ros import payloads
 from uav_dc_ros.core import observations, world
 from uav_dc_ros.core import reward as core_reward
 from uav_dc_ros.core.arrays import Array
@@ -22,33 +21,22 @@ from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
 class Transition(NamedTuple):
-    """One step of a mission as an agent observes it.
-
-    Attributes:
-        flight, mission, step: source; `step` is that of s.
-        observation: s, float32 `[D]`.
-        action: the action flown, value of a `core.grid.Action`.
-        reward: r.
-        next_observation: s', float32 `[D]`.
-        terminated, truncated: whether the episode ended, or was cut off, at s'.
-    """
+    """One step of a mission as an agent observes it; flight, mission and step are those of s."""
 
     flight: int
     mission: int
     step: int
-    observation: Array
-    action: int
+    observation: Array  # s, float32 `[D]`
+    action: int  # flown, value of a `core.grid.Action`
     reward: float
-    next_observation: Array
-    terminated: bool
-    truncated: bool
+    next_observation: Array  # s', float32 `[D]`
+    terminated: bool  # at s'
+    truncated: bool  # at s'
 
 
 class _State(NamedTuple):
-    flight: int
-    mission: int
-    step: int
-    cell: tuple[int, int, int]
+    source: tuple[int, int, int]  # flight, mission, step
+    cell: Array
     observation: Array
     total_reward: float  # r^t (eq. 7)
 
@@ -56,15 +44,9 @@ class _State(NamedTuple):
 class RecordedTransitions:
     """Iterates over the transitions of recorded steps, in order, with one step in memory.
 
-    Args:
-        steps: as `Steps` releases them.
-        scenario: the world and the reward.
-        observation: what the agent observes.
-
     Attributes:
         skipped: steps without a transition, by reason.
-        deduced: transitions whose action is deduced from the cells, since no move was recorded, or one that
-            was not flown.
+        deduced: transitions without a recorded move that was flown: the action follows from the cells.
     """
 
     def __init__(self, steps: Iterable[RecordedStep], scenario: Scenario, observation: Observation) -> None:
@@ -78,7 +60,7 @@ class RecordedTransitions:
         move: Action | None = None
         for step in self._steps:
             after = self._state(step)
-            if after and before and (step.flight, step.mission, step.step - 1) == before[:3]:
+            if after and before and before.source == (step.flight, step.mission, step.step - 1):
                 action = self._action(before.cell, after.cell, move)
                 if action is not None:
                     yield self._transition(before, after, action)
@@ -87,55 +69,37 @@ class RecordedTransitions:
             before, move = after, Action[step.move.action.upper()] if step.move else None
 
     def _state(self, step: RecordedStep) -> _State | None:
-        if step.status is None or step.rates is None:
-            return None
-        scenario = self._scenario
         try:
-            payloads.check(step.status, scenario)
-            data_bits, collected = payloads.collection(step.rates, scenario)
+            observed = step.observed(self._scenario)
         except MessageError as error:
             self.skipped[f"a step of another world ({error.reason})"] += 1
             return None
-        cell = np.asarray(step.status.cell)
-        observation = observations.encode(
-            self._observation,
-            scenario,
-            cell=cell,
-            step=np.asarray(scenario.mission.max_steps - step.status.remaining_steps),
-            data_bits=data_bits,
-            collected=collected,
-        )
-        # A mission starts from r = 0, whatever R_plus its start cell has.
-        total = float(world.total_reward(scenario, cell, data_bits)) if step.step else 0.0
-        return _State(step.flight, step.mission, step.step, step.status.cell, observation, total)
+        if observed is None:
+            return None
+        observation = observations.encode(self._observation, self._scenario, **observed)
+        cell, total = observed["cell"], 0.0
+        if step.step:  # a mission starts from r = 0, whatever R_plus its start cell has
+            total = float(world.total_reward(self._scenario, cell, observed["data_bits"]))
+        return _State((step.flight, step.mission, step.step), cell, observation, total)
 
-    def _action(
-        self, cell: tuple[int, int, int], after: tuple[int, int, int], move: Action | None
-    ) -> Action | None:
+    def _action(self, cell: Array, after: Array, move: Action | None) -> Action | None:
         """The action between two cells: the recorded move if it leads there."""
         others = (Action.HOVER, *Action)
         for action in others if move is None else (move, *others):
-            reached = self._scenario.grid.move(np.asarray(cell), np.asarray(int(action)))
-            if reached.tolist() == list(after):
+            if np.array_equal(self._scenario.grid.move(cell, np.asarray(int(action))), after):
                 self.deduced += action is not move
                 return action
         self.skipped["a step between cells that are not adjacent"] += 1
         return None
 
     def _transition(self, before: _State, after: _State, action: Action) -> Transition:
-        scenario = self._scenario
-        terminated, truncated, _ = world.end_of_mission(
-            scenario, np.asarray(after.step), np.asarray(after.cell)
-        )
+        step, form = np.asarray(after.source[2]), self._scenario.reward.form
+        terminated, truncated, _ = world.end_of_mission(self._scenario, step, after.cell)
         return Transition(
-            flight=before.flight,
-            mission=before.mission,
-            step=before.step,
+            *before.source,
             observation=before.observation,
             action=int(action),
-            reward=float(
-                core_reward.step_reward(after.total_reward, before.total_reward, scenario.reward.form)
-            ),
+            reward=float(core_reward.step_reward(after.total_reward, before.total_reward, form)),
             next_observation=after.observation,
             terminated=bool(terminated),
             truncated=bool(truncated),

@@ -17,7 +17,7 @@ from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.step_synchronizer import StepSynchronizer
-from uav_dc_ros.recordings.mission_totals import MissionTotals
+from uav_dc_ros.recordings.recorded_step import MissionTotals
 
 # A mission begins after this time without another one, ...
 ALONE_S = 1.0  # ... from the activation of the monitor on, and ...

@@ -22,14 +22,12 @@ from uav_dc_ros.core.reward import RewardForm
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.recordings import step_reader
-from uav_dc_ros.recordings.export import rows
-from uav_dc_ros.recordings.export.rows import MissionRows
-from uav_dc_ros.recordings.export.tables import Format, new_table
+from uav_dc_ros.recordings.export.tables import Format, MissionRows, new_table, table_columns
 from uav_dc_ros.recordings.recorded_step import printable
 from uav_dc_ros.recordings.step_reader import EXTERNAL, Steps
-from uav_dc_ros.recordings.transitions import RecordedTransitions
+from uav_dc_ros.recordings.transitions import RecordedTransitions, Transition
 
-ALL = tuple(rows.tables(EXTERNAL))
+ALL = tuple(table_columns(EXTERNAL))
 EPILOG = f"""\
 Tables go into a new folder, one file each, one observation a row:
   steps     a row per step: pose, cell, phase, action, sum-rate, data, rewards
@@ -73,12 +71,7 @@ def _tables(text: str) -> list[str]:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Export; the exit status.
-
-    Raises:
-        BagError: the result exists, or the bag holds nothing to export.
-        ParameterError: options exclude each other.
-    """
+    """Export; the exit status."""
     for name in ("format", "tables") if options.transitions else ("observation",):
         if getattr(options, name) is not None:
             which = "without" if options.transitions else "with"
@@ -94,12 +87,10 @@ def run(options: argparse.Namespace) -> int:
             scenario = msgspec.structs.replace(scenario, reward=reward)
         recorded = Steps(reader, namespace, scenario.step_ns)
         if options.transitions:
-            observation: Observation = options.observation or "mission"
-            write_transitions(options.out, recorded, scenario, observation, printable(options.bag.name))
+            _write_transitions(options, recorded, scenario)
         else:
             vehicle = step_reader.vehicle(reader, namespace)
-            format: Format = options.format or "parquet"
-            write_tables(options.out, recorded, scenario, reader.about, options.tables, format, vehicle)
+            _write_tables(options, recorded, scenario, reader.about, vehicle)
         for line in recorded.losses():
             print(f"  {line}")
     return 0
@@ -125,27 +116,17 @@ def _new(path: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def write_tables(
-    folder: Path,
-    recorded: Steps,
-    scenario: Scenario,
-    about: dict[str, str],
-    names: list[str] | None,
-    format: Format,
-    vehicle: str,
+def _write_tables(
+    options: argparse.Namespace, recorded: Steps, scenario: Scenario, about: dict[str, str], vehicle: str
 ) -> None:
-    """Write all tables, or those named, into a new folder, with one piece of each in memory.
-
-    Raises:
-        BagError: the folder exists or cannot be written; the bag holds no step, or one of another world.
-        ParameterError: a table that exists for real vehicles only.
-    """
-    columns = rows.tables(vehicle)
-    names = names or list(columns)
+    """Write tables into a new folder, with one piece of each in memory."""
+    columns = table_columns(vehicle)
+    names: list[str] = options.tables or list(columns)
+    format: Format = options.format or "parquet"
     for name in names:
         if name not in columns:
             raise ParameterError(f"--tables {name}: for real vehicles only; expected {', '.join(columns)}")
-    with _new(folder) as scratch:
+    with _new(options.out) as scratch:
         (result := scratch / "result").mkdir()
         n_missions = 0
         with ExitStack() as stack:
@@ -165,44 +146,30 @@ def write_tables(
             if not n_missions:
                 raise BagError(f"the bag holds no step of any mission; {_reason(recorded)}")
     counts = ", ".join(f"{table.count} rows of {name}" for name, table in tables.items())
-    print(f"{folder}: {n_missions} mission{'s' * (n_missions != 1)}: {counts}")
+    print(f"{options.out}: {n_missions} mission{'s' * (n_missions != 1)}: {counts}")
 
 
-def write_transitions(
-    file: Path, recorded: Steps, scenario: Scenario, observation: Observation, source: str
-) -> None:
-    """Write transitions into a new .npz file, with one transition in memory.
-
-    Raises:
-        BagError: the file exists or cannot be written, or there is no transition.
-    """
+def _write_transitions(options: argparse.Namespace, recorded: Steps, scenario: Scenario) -> None:
+    """Write transitions into a new .npz file, with one in memory."""
+    observation: Observation = options.observation or "mission"
     transitions = RecordedTransitions(recorded, scenario, observation)
-    size = observations.size(observation, scenario)
-    kinds: dict[str, np.dtype[Any]] = {
-        "observation": np.dtype((np.float32, (size,))),
-        "action": np.dtype(np.int64),
-        "reward": np.dtype(np.float64),
-        "next_observation": np.dtype((np.float32, (size,))),
-        "terminated": np.dtype(np.bool_),
-        "truncated": np.dtype(np.bool_),
-        "flight": np.dtype(np.int64),
-        "mission": np.dtype(np.int64),
-        "step": np.dtype(np.int64),
-    }
-    with _new(file) as scratch:
-        n = 0
+    n = 0
+    with _new(options.out) as scratch:
+        kinds: dict[str, np.dtype[Any]] = {}
         with ExitStack() as stack:
-            columns = {name: stack.enter_context((scratch / name).open("wb")) for name in kinds}
+            columns = {name: stack.enter_context((scratch / name).open("wb")) for name in Transition._fields}
             for transition in transitions:
                 for name, column in columns.items():
-                    column.write(np.asarray(getattr(transition, name), kinds[name].base).tobytes())
+                    value = np.asarray(getattr(transition, name))
+                    kinds[name] = np.dtype((value.dtype, value.shape))
+                    column.write(value.tobytes())
                 n += 1
         if not n:
             why = dict(transitions.skipped) or f"no step; {_reason(recorded)}"
             raise BagError(f"the bag holds no transition: {why}")
         metadata = {
             "version": __version__,
-            "bag": source,
+            "bag": printable(options.bag.name),
             "scenario": scenario.name,
             "scenario_fingerprint": scenario.fingerprint,
             "observation": observation,
@@ -211,8 +178,8 @@ def write_transitions(
         arrays: dict[str, Any] = {name: np.memmap(scratch / name, kind, "r") for name, kind in kinds.items()}
         with (scratch / "result").open("wb") as result:
             np.savez_compressed(result, **arrays, metadata=np.asarray(json.dumps(metadata)))
-    form = scenario.reward.form
-    print(f"{file}: {n} transitions of {size} numbers ({observation!r}), reward form {form!r}")
+    size, form = observations.size(observation, scenario), scenario.reward.form
+    print(f"{options.out}: {n} transitions of {size} numbers ({observation!r}), reward form {form!r}")
     if transitions.deduced:
         print(
             f"  {transitions.deduced} actions are deduced from the cells: no move was recorded, or not flown"

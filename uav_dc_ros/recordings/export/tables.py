@@ -1,4 +1,7 @@
-"""Tables written in pieces, with one piece in memory: CSV with the standard library, Parquet with pyarrow."""
+"""Recorded missions as tidy tables: one observation a row, units in the names of columns.
+
+Tables are written in pieces, with one piece in memory: CSV with the standard library, Parquet with pyarrow.
+"""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -6,7 +9,17 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from uav_dc_ros.errors import UavDcError
+import numpy as np
+
+from uav_dc_ros import payloads
+from uav_dc_ros.core import reward as core_reward
+from uav_dc_ros.core import world
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import BagError, MessageError, UavDcError
+from uav_dc_ros.messages import Phase
+from uav_dc_ros.phases import BEFORE_START
+from uav_dc_ros.recordings.recorded_step import MissionTotals, RecordedStep
+from uav_dc_ros.topics import SIMULATED
 
 Kind: TypeAlias = Literal["int", "float", "bool", "text"]
 Format: TypeAlias = Literal["parquet", "csv"]
@@ -14,6 +27,197 @@ Columns: TypeAlias = Mapping[str, Kind]
 Rows: TypeAlias = Mapping[str, Sequence[Any]]  # values by column, all of one length; None is an empty field
 
 ROWS = 50_000  # of a piece: a row group of Parquet
+# Columns of each table. Values of a step are those at its end; `action` is decided there.
+# fmt: off
+_SOURCE: Columns = {"flight": "int", "mission": "int", "step": "int"}
+TABLES: dict[str, Columns] = {
+    "steps": {
+        **_SOURCE,
+        "time_s": "float",  # of the users, ROS time; in simulation mission time
+        "received_ns": "int",  # the first of its messages, since the epoch
+        "x_m": "float", "y_m": "float", "altitude_m": "float",
+        "cell_x": "int", "cell_y": "int", "cell_z": "int",
+        "phase": "text", "remaining_steps": "int", "action": "text",
+        "sum_rate_bps": "float", "users_served": "int", "users_collected": "int",
+        "data_bits": "float",  # of all users
+        "total_reward": "float", "reward": "float",  # r^t (eq. 7), and the reward of the step
+    },
+    "users": {
+        **_SOURCE,
+        "user": "int", "cluster": "int", "x_m": "float", "y_m": "float",
+        "sinr": "float", "rate_bps": "float", "data_bits": "float",  # SINR is linear
+        "served": "bool", "collected": "bool",
+    },
+    "missions": {
+        "flight": "int", "mission": "int", "seed": "int",
+        "scenario": "text", "scenario_fingerprint": "text", "policy": "text", "policy_sha256": "text",
+        "outcome": "text",  # landed, timeout, aborted; unfinished: the bag does not hold the end
+        "steps_flown": "int", "steps_recorded": "int", "first_received_ns": "int", "last_received_ns": "int",
+        "users_total": "int", "users_collected": "int", "data_bits": "float",
+        "mean_sum_rate_bps": "float",  # over the flown steps that have one
+        "total_reward": "float",
+    },
+}
+# Further columns of flights with a real vehicle.
+REAL: dict[str, Columns] = {
+    "steps": {
+        "reason": "text",  # of the phase
+        "flown_s": "float",  # from the start of the move to this step until the vehicle reported the step
+    },
+    "missions": {"vehicle": "text", "reason": "text", "steps_not_reached": "int"},
+    "phases": {
+        **_SOURCE,
+        "time_s": "float",  # of publication, since the epoch
+        "phase": "text", "reason": "text", "held": "bool", "fault": "text",
+    },
+}
+# fmt: on
+
+
+def table_columns(vehicle: str) -> dict[str, Columns]:
+    """Columns of each table for flights with this vehicle, as `step_reader.vehicle` names it."""
+    if vehicle == SIMULATED:
+        return TABLES
+    return {name: {**TABLES.get(name, {}), **REAL.get(name, {})} for name in (*TABLES, "phases")}
+
+
+class MissionRows:
+    """Rows of one mission, step by step; `about`: metadata of the bag."""
+
+    def __init__(self, scenario: Scenario, about: Mapping[str, str], vehicle: str) -> None:
+        self._scenario, self._about, self._vehicle = scenario, about, vehicle
+        self._total: tuple[int, float] | None = None  # step, and r^t there
+        self._last: RecordedStep | None = None
+        self._totals = MissionTotals()
+        self._recorded = 0
+        self._sum_rates: list[float] = []
+        self._first_ns = 2**63 - 1
+        self._last_ns = 0
+
+    def add(self, step: RecordedStep) -> dict[str, Rows]:
+        """The rows of a step, by table. Raises BagError for a step of another world."""
+        try:
+            for payload in filter(None, (step.status, step.users, step.rates)):
+                payloads.check(payload, self._scenario)
+        except MessageError as error:
+            raise BagError(f"{step.name}: {error}") from None
+        before, self._last = self._last, step
+        self._recorded += 1
+        self._totals.add(step.step, step.status, step.rates)
+        self._first_ns = min(self._first_ns, *step.log_ns.values())
+        self._last_ns = max(self._last_ns, *step.log_ns.values())
+        if step.rates is not None and step.step > 0:
+            self._sum_rates.append(step.rates.sum_rate_bps)
+        row = self._step(step) | {"flown_s": _flown_s(before, step)}
+        return {"steps": _as_rows(row), "users": self._users(step), "phases": _phases(step)}
+
+    def _step(self, step: RecordedStep) -> dict[str, Any]:
+        users, rates, status = step.users, step.rates, step.status
+        position_m = [None] * 3 if step.position_m is None else step.position_m.tolist()
+        total, reward = self._rewards(step)
+        return {
+            **_source(step),
+            "time_s": None if users is None else users.stamp_ns / 1e9,
+            "received_ns": min(step.log_ns.values()),
+            **dict(zip(("x_m", "y_m", "altitude_m"), position_m, strict=True)),
+            **dict(zip(("cell_x", "cell_y", "cell_z"), status.cell if status else [None] * 3, strict=True)),
+            "phase": status and status.phase.value,
+            "reason": status and status.reason,
+            "remaining_steps": status and status.remaining_steps,
+            "action": step.move and step.move.action,
+            "sum_rate_bps": rates and rates.sum_rate_bps,
+            "users_served": rates and sum(rates.served),
+            "users_collected": rates and sum(rates.collected),
+            "data_bits": rates and float(np.sum(rates.data_bits)),
+            "total_reward": total,
+            "reward": reward,
+        }
+
+    def _rewards(self, step: RecordedStep) -> tuple[float | None, float | None]:
+        """r^t and the reward of the step; None where unknown. A mission starts from r = 0."""
+        before, self._total = self._total, None
+        total = 0.0
+        if step.step > 0:
+            if step.rates is None or step.status is None:
+                return None, None
+            cell = np.asarray(step.status.cell)
+            total = float(world.total_reward(self._scenario, cell, np.asarray(step.rates.data_bits)))
+        self._total = step.step, total
+        if before is None or before[0] != step.step - 1:
+            return total, None
+        return total, float(core_reward.step_reward(total, before[1], self._scenario.reward.form))
+
+    def _users(self, step: RecordedStep) -> Rows:
+        if step.users is None and step.rates is None:
+            return {name: [] for name in TABLES["users"]}
+        n = self._scenario.n_users
+        rows: dict[str, Sequence[Any]] = {name: [value] * n for name, value in _source(step).items()}
+        rows |= {"user": range(n), "cluster": self._scenario.user_cluster.tolist()}
+        for name in ("x_m", "y_m"):
+            rows[name] = getattr(step.users, name, [None] * n)
+        for name in ("sinr", "rate_bps", "data_bits", "served", "collected"):
+            rows[name] = getattr(step.rates, name, [None] * n)
+        return rows
+
+    def summary(self) -> Rows:
+        """The row of the mission, after its last step."""
+        last, totals = self._last, self._totals
+        assert last is not None, "a mission has a step"
+        known = totals.seed is not None  # a status is recorded
+        row = {
+            "flight": last.flight,
+            "mission": last.mission,
+            "seed": totals.seed,
+            "scenario": self._scenario.name,
+            "scenario_fingerprint": self._scenario.fingerprint,
+            "policy": self._about.get("policy"),
+            "policy_sha256": self._about.get("policy_sha256"),
+            "outcome": totals.outcome,
+            "steps_flown": last.step,
+            "steps_recorded": self._recorded,
+            "first_received_ns": self._first_ns,
+            "last_received_ns": self._last_ns,
+            "users_total": self._scenario.n_users,
+            "users_collected": totals.collected,
+            "data_bits": totals.data_bits,
+            "mean_sum_rate_bps": float(np.mean(self._sum_rates)) if self._sum_rates else None,
+            "total_reward": self._total and self._total[1],
+            "vehicle": self._vehicle,
+            "reason": totals.reason if known else None,
+            "steps_not_reached": totals.steps_not_reached if known else None,
+        }
+        return _as_rows(row)
+
+
+def _flown_s(before: RecordedStep | None, step: RecordedStep) -> float | None:
+    """Duration of the move to a step by publish times, seconds; None where unknown."""
+    if before is None or before.step != step.step - 1:
+        return None
+    start = next((one for one in before.phase_reports if one.phase is Phase.MOVING), None)
+    end = next((one for one in step.phase_reports if one.phase not in BEFORE_START), None)
+    if start is None or end is None or start.clock_resets != end.clock_resets:
+        return None
+    return (end.publish_ns - start.publish_ns) / 1e9
+
+
+def _phases(step: RecordedStep) -> Rows:
+    reports = step.phase_reports
+    return {
+        **{name: [value] * len(reports) for name, value in _source(step).items()},
+        "time_s": [one.publish_ns / 1e9 for one in reports],
+        "phase": [one.phase.value for one in reports],
+        "reason": [one.reason for one in reports],
+        "held": [one.held for one in reports],
+        "fault": [one.fault for one in reports],
+    }
+
+
+def _source(step: RecordedStep) -> dict[str, Any]:
+    return {name: getattr(step, name) for name in _SOURCE}
+
+
+def _as_rows(row: Mapping[str, Any]) -> Rows:
+    return {name: [value] for name, value in row.items()}
 
 
 class Table:
@@ -43,12 +247,7 @@ class Table:
 def new_table(
     folder: Path, name: str, columns: Columns, format: Format, about: Mapping[str, str]
 ) -> Iterator[Table]:
-    """Write a table into `folder/NAME.FORMAT`. Parquet keeps `about` beside its schema.
-
-    Raises:
-        UavDcError: pyarrow is not installed.
-        OSError: the file cannot be written.
-    """
+    """Write a table into `folder/NAME.FORMAT`. Parquet keeps `about` beside its schema."""
     path = folder / f"{name}.{format}"
     with closing(_Csv(path, columns) if format == "csv" else _Parquet(path, columns, about)) as file:
         table = Table(file, columns)

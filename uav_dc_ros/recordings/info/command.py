@@ -14,8 +14,7 @@ from rich.text import Text
 
 from uav_dc_ros import files
 from uav_dc_ros.bags.storage import RECOVER
-from uav_dc_ros.recordings.info.missions import MissionSurvey
-from uav_dc_ros.recordings.info.survey import Survey, survey
+from uav_dc_ros.recordings.info.survey import MissionSurvey, Survey, survey
 from uav_dc_ros.recordings.recorded_step import mission_name, printable
 
 WIDTH = 80  # without a terminal

@@ -3,8 +3,9 @@
 Bags of any recorder, torn ones included, in two passes: one over all messages, one over the steps.
 """
 
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,9 @@ from uav_dc_ros.bags.metadata import LOST_BYTES_KEY, METADATA_FILE, Part, matche
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.records import TIME_MAX_NS
 from uav_dc_ros.bags.storage import Storage
-from uav_dc_ros.errors import BagDamagedError, BagError
-from uav_dc_ros.recordings.info.missions import MissionSurvey, mission_problems, survey_missions
-from uav_dc_ros.recordings.recorded_step import printable
-from uav_dc_ros.recordings.step_reader import namespaces
+from uav_dc_ros.errors import BagDamagedError, BagError, UavDcError
+from uav_dc_ros.recordings.recorded_step import MissionTotals, RecordedStep, mission_name, printable
+from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps, namespaces, scenario
 
 HARDWARE_ID = "uav_dc_ros"  # of our nodes' diagnostics
 DAMAGES_MAX = 3  # damaged places of a file that are listed one by one
@@ -25,90 +25,67 @@ DAMAGES_MAX = 3  # damaged places of a file that are listed one by one
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """A topic.
-
-    Attributes:
-        other_types: further types of its messages; ROS 2 allows one only.
-        dropped: messages that the recorder received and lost, by its own count.
-        first_s, last_s: log times after the bag's first message, seconds; None without messages.
-        mean_hz: messages per second between the first and the last; None below two.
-        gap_s, gap_at_s: longest time between two messages and when it started, seconds; None below two.
-    """
+    """A topic; None where it has too few messages."""
 
     name: str
     type: str
-    other_types: list[str]
+    other_types: list[str]  # further types of its messages; ROS 2 allows one only
     messages: int = 0
-    dropped: int
-    first_s: float | None = None
+    dropped: int  # messages that the recorder received and lost, by its own count
+    first_s: float | None = None  # log times after the bag's first message
     last_s: float | None = None
-    mean_hz: float | None = None
-    gap_s: float | None = None
-    gap_at_s: float | None = None
+    mean_hz: float | None = None  # between the first and the last message
+    gap_s: float | None = None  # longest time between two messages
+    gap_at_s: float | None = None  # start of that gap
 
 
 @dataclass(kw_only=True)
 class PartSurvey:
-    """A file of a bag.
-
-    Attributes:
-        messages: all messages in the file.
-        repeated: messages among them that repeat latched ones of earlier parts; not counted in the bag.
-        library: the writer, as it names itself.
-        has_end: whether the file is finished.
-        has_index: whether the file has an index of its messages; optional in MCAP.
-        lost_bytes: unusable bytes.
-    """
+    """A file of a bag."""
 
     name: str
-    messages: int
-    repeated: int
-    library: str
-    has_end: bool
-    has_index: bool
-    lost_bytes: int
+    messages: int  # all messages in the file
+    repeated: int  # messages that repeat latched ones of earlier parts; not counted in the bag
+    library: str  # the writer, as it names itself
+    has_end: bool  # whether the file is finished
+    has_index: bool  # whether the file has an index of its messages; optional in MCAP
+    lost_bytes: int  # unusable bytes
+
+
+@dataclass(kw_only=True)
+class MissionSurvey(MissionTotals):
+    """A mission. Before its end, `reason` is that of the latest phase report."""
+
+    namespace: str  # without a slash at its end
+    flight: int  # counts runs in the bag from 0
+    mission: int
+    missing: Counter[str] = field(default_factory=Counter)  # messages that the bag lacks, by topic
 
 
 @dataclass(kw_only=True)
 class Survey:
-    """A bag.
-
-    Attributes:
-        complete: whether nothing is known to be missing.
-        problems: what is missing, a line each.
-        recoverable: whether `recover` makes a whole bag of it.
-        start_ns: log time of the first message, nanoseconds since the epoch.
-        set_back_s: largest step back of the recorder's clock; 0: none.
-        compressed: topics whose messages rosbag2 compressed one by one.
-        restarts: restarts of nodes during the recording, by node.
-        ros_distro: of metadata.yaml; None without one.
-        about: metadata that our recorder wrote.
-    """
+    """A bag."""
 
     path: str
-    complete: bool
-    problems: list[str]
-    recoverable: bool
+    complete: bool  # whether nothing is known to be missing
+    problems: list[str]  # what is missing, a line each
+    recoverable: bool  # whether `recover` makes a whole bag of it
     size_bytes: int
-    start_ns: int
+    start_ns: int  # log time of the first message, since the epoch
     duration_s: float
-    set_back_s: float
-    compressed: list[str]
+    set_back_s: float  # largest step back of the recorder's clock; 0: none
+    compressed: list[str]  # topics whose messages rosbag2 compressed one by one
     messages: int
     parts: list[PartSurvey]
     topics: list[TopicSurvey]
     missions: list[MissionSurvey]
-    restarts: dict[str, int]
-    ros_distro: str | None
-    about: dict[str, str]
+    restarts: dict[str, int]  # restarts of nodes during the recording
+    ros_distro: str | None  # of metadata.yaml
+    about: dict[str, str]  # metadata that our recorder wrote
 
 
 def survey(path: Path) -> Survey:
-    """Survey a bag.
-
-    Raises:
-        BagError: there is no bag, or nothing in it can be read.
-    """
+    """Survey a bag; raises BagError if there is none, or nothing in it can be read."""
     try:
         with BagReader(path) as reader:
             return _survey(reader, None)
@@ -146,7 +123,6 @@ def _survey(reader: BagReader, error: BagDamagedError | None) -> Survey:
     if reader.last_ns == TIME_MAX_NS:
         problems.append("some message times exceed the limit of ROS 2 (2^63 ns): shown as the limit")
     missions = [one for name in namespaces(reader) for one in survey_missions(reader, name, problems)]
-    problems += mission_problems(reader, missions)
     distro = metadata.get("ros_distro")
     return Survey(
         path=printable(str(reader.path)),
@@ -272,3 +248,63 @@ def _restarts(message: BagMessage) -> Iterator[tuple[str, int]]:
                 yield prefix + status.name, int(pair.value)
             elif pair.key.startswith("restarts of "):
                 yield prefix + pair.key.removeprefix("restarts of "), int(pair.value)
+
+
+def survey_missions(reader: BagReader, namespace: str, problems: list[str]) -> list[MissionSurvey]:
+    """The missions of a namespace; adds what they lack to `problems`."""
+    where = f" in {namespace}" if namespace else ""
+    found: list[MissionSurvey] = []
+    try:
+        step_ns = scenario(reader, namespace).step_ns
+    except UavDcError:
+        step_ns = 2**63  # unknown scenario, in a bag of another recorder
+    try:
+        steps = Steps(reader, namespace, step_ns)
+        before: RecordedStep | None = None
+        for step in steps:
+            if before is None or (before.flight, before.mission) != (step.flight, step.mission):
+                found.append(MissionSurvey(namespace=namespace, flight=step.flight, mission=step.mission))
+                next_step = 0
+            else:
+                next_step = before.step + 1
+                found[-1].missing.update(_missing(before, last=False))
+            mission = found[-1]
+            if step.step > next_step:
+                mission.missing.update(dict.fromkeys(STEP_TOPICS, step.step - next_step))
+            mission.add(step.step, step.status, step.rates)
+            if step.status is not None and not mission.is_over:
+                mission.reason = step.phase_reports[-1].reason if step.phase_reports else ""
+            before = step
+            if step.status is not None and step.status.phase.is_over:
+                mission.missing.update(_missing(step, last=True))
+        problems += (f"{line}{where}" for line in steps.rejected.lines())
+    except BagDamagedError:
+        raise
+    except BagError as error:
+        problems.append(str(error))
+    missing = sum((mission.missing for mission in found), Counter())
+    if missing:
+        problems.append(
+            f"steps{where} lack messages: {', '.join(f'{n:,} {topic}' for topic, n in missing.items())}"
+        )
+    for mission in found:
+        if not mission.is_over:
+            name = mission_name(mission.mission, mission.flight)
+            problems.append(f"{name}{where} has no end; its last step is {mission.steps}")
+    wanted = reader.about.get("missions", "")
+    n_over = len({mission.mission for mission in found if mission.is_over})
+    if found and wanted.isdecimal() and n_over < int(wanted):
+        problems.append(f"{n_over:,} of {int(wanted):,} missions{where} have an end")
+    return found
+
+
+def _missing(step: RecordedStep, *, last: bool) -> list[str]:
+    """Topics without a message of this step. The last step has no move."""
+    has = {
+        "pose": step.position_m is not None or not step.is_measured,
+        "users": step.users is not None or not step.is_measured,
+        "rates": step.rates is not None or not step.is_measured,
+        "mission": step.status is not None,
+        "move": step.move is not None or last,
+    }
+    return [topic for topic, recorded in has.items() if not recorded]

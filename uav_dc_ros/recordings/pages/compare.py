@@ -113,16 +113,9 @@ class Group:
 def page(
     bags: list[Path], missions: list[int] | None, scenario: str | None, namespace: str | None
 ) -> tuple[Page, str]:
-    """The page, and its content in a few words.
+    """The page, and its content in a few words; of all missions, or of those with these indices.
 
-    Args:
-        bags: one, for its missions side by side; or several.
-        missions: indices of missions; None: all.
-        scenario, namespace: as `step_reader.scenario` and `step_reader.namespace` take them.
-
-    Raises:
-        BagError: a bag cannot be read, or holds none of these missions.
-        ParameterError: more than `GROUPS_MAX` groups.
+    Raises ParameterError for more than `GROUPS_MAX` groups.
     """
     if len(bags) > GROUPS_MAX:
         raise ParameterError(f"--compare: {len(bags)} bags; expected at most {GROUPS_MAX}")

@@ -1,7 +1,9 @@
 """State of the system that recorded a bag: latencies, node diagnostics, faults."""
 
+import math
+import re
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,43 +11,50 @@ from uav_dc_ros import topics
 from uav_dc_ros.bags.message_definitions import typestore
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TEXT_MAX, Phase
-from uav_dc_ros.recordings.mission_totals import UNFINISHED
-from uav_dc_ros.recordings.pages.diagnostics import NodeHistory, NodeStatus
 from uav_dc_ros.recordings.pages.missions import MissionData
-from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
+from uav_dc_ros.recordings.recorded_step import UNFINISHED, RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps
 from uav_dc_ros.recordings.thinning import EveryNth
 
 SAMPLES_MAX = 100_000  # of a latency, for its percentiles
 FAULTS_MAX = 300  # rows
 NODES_MAX = 100  # more names than any graph of ours has
+SERIES_MAX = 400  # points of a curve, and values for a median
+COUNTERS = ("restarts", "rejected", "step overruns", "hovered steps")  # values that only increase
+# `handling` is missing in older bags, where the latency of some nodes ends at the receipt.
+LATENCY = re.compile(r"(?P<topic>\S+)(?: handling)? latency (?P<percentile>p50|p99) \[ms\]")
+LATENCIES_MAX = 50  # topics of a node: more than any node of ours has
 CHAIN = (("users", "rates"), ("rates", "move"), ("users", "move"))  # publications within a step
 
 
 class Samples:
-    """Durations, nanoseconds, evenly thinned when there are many; the maximum is exact."""
+    """Numbers, evenly thinned when there are many; `count` and `max` are of all of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_kept: int = SAMPLES_MAX) -> None:
         self.count = 0
-        self._max_ns: int | None = None
-        self._values_ns: EveryNth[int] = EveryNth(SAMPLES_MAX)
+        self.max: float | None = None
+        self._values: EveryNth[float] = EveryNth(max_kept)
 
-    def add(self, value_ns: int) -> None:
-        """Add a duration."""
-        self._values_ns.add(self.count, value_ns)
+    def add(self, value: float) -> None:
+        """Add a number."""
+        self._values.add(self.count, value)
         self.count += 1
-        self._max_ns = value_ns if self._max_ns is None else max(self._max_ns, value_ns)
+        self.max = value if self.max is None else max(self.max, value)
+
+    def median(self) -> float | None:
+        """Median; None without numbers."""
+        return float(np.median(self._values.kept)) if self.count else None
 
     def row(self) -> dict[str, Any]:
-        """Count, median, 99th percentile and maximum, milliseconds; None without any."""
-        if self._max_ns is None:
+        """Of durations in nanoseconds: count, median, 99th percentile and maximum, milliseconds."""
+        if self.max is None:
             return {"count": 0, "p50_ms": None, "p99_ms": None, "max_ms": None}
-        p50, p99 = np.percentile(np.asarray(self._values_ns.kept), (50, 99)) * 1e-6
+        p50, p99 = np.percentile(np.asarray(self._values.kept), (50, 99)) * 1e-6
         return {
             "count": self.count,
             "p50_ms": round(float(p50), 3),
             "p99_ms": round(float(p99), 3),
-            "max_ms": round(self._max_ns * 1e-6, 3),
+            "max_ms": round(self.max * 1e-6, 3),
         }
 
 
@@ -69,15 +78,100 @@ class _Topic:
 
     def row(self, name: str) -> dict[str, Any]:
         duration_s = (self.last_ns - self.first_ns) * 1e-9
-        gap = self.gap.row()
         return {
             "name": name,
             **self.latency.row(),
             "count": self.gap.count + 1,
             "rate_hz": round(self.gap.count / duration_s, 2) if duration_s > 0 else None,
-            "gap_ms": gap["p50_ms"],
-            "longest_gap_ms": gap["max_ms"],
+            "longest_gap_ms": self.gap.row()["max_ms"],
         }
+
+
+class NodeStatus(NamedTuple):
+    """One status of a diagnostic_msgs/DiagnosticArray; levels above 0 are warnings and errors."""
+
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+class NodeHistory:
+    """The statuses of a node."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._reports = 0
+        self._warnings = 0
+        self._last = NodeStatus(0, "", {})
+        self._cpu = Samples(SERIES_MAX)
+        self._cpu_curve: EveryNth[tuple[float, float]] = EveryNth(SERIES_MAX)  # time, load
+        self._latencies: dict[str, dict[str, Samples]] = {}
+
+    def add(self, at_s: float, status: NodeStatus) -> list[str]:
+        """Add the next status; returns what has become worse, as text."""
+        news = self._news(status)
+        self._reports += 1
+        self._warnings += status.level > 0
+        self._last = status
+        for key, text in status.values.items():
+            value = _number(text)
+            latency = LATENCY.fullmatch(key)
+            if value is None:
+                continue
+            if key == "cpu [%]":
+                self._cpu_curve.add(self._cpu.count, (round(at_s, 2), value))
+                self._cpu.add(value)
+            elif latency and (latency["topic"] in self._latencies or len(self._latencies) < LATENCIES_MAX):
+                percentiles = self._latencies.setdefault(latency["topic"], {})
+                percentiles.setdefault(latency["percentile"], Samples(SERIES_MAX)).add(value)
+        return news
+
+    def data(self) -> dict[str, Any]:
+        """Page data: last state and counters, median and worst latencies, CPU load over time."""
+        values = self._last.values
+        return {
+            "name": self.name,
+            "state": self._last.message,
+            "reports": self._reports,
+            "warnings": self._warnings,
+            "cpu_median": self._cpu.median(),
+            "cpu_max": self._cpu.max,
+            "cpu": self._cpu_curve.kept,
+            "restarts": values.get("restarts"),
+            "counters": {key: text for key, text in values.items() if _is_counter(key) and text != "0"},
+            "latencies": [
+                {
+                    "topic": topic,
+                    "p50_ms": series["p50"].median() if "p50" in series else None,
+                    "p99_ms": series["p99"].max if "p99" in series else None,
+                }
+                for topic, series in self._latencies.items()
+            ],
+        }
+
+    def _news(self, status: NodeStatus) -> list[str]:
+        news = []
+        if status.level > 0 and (status.level, status.message) != self._last[:2]:
+            news.append(status.message)
+        for key, text in status.values.items():
+            before = _number(self._last.values.get(key, "0")) or 0.0
+            now = _number(text)
+            if _is_counter(key) and now is not None and now > before:
+                news.append(f"{key}: {text}" + (f" (+{now - before:.0f})" if before else ""))
+        return news
+
+
+def _is_counter(key: str) -> bool:
+    """Whether a key is a counter, such as `restarts`, `restarts of world` or `pose rejected: malformed`."""
+    return key.partition(":")[0].partition(" of ")[0].endswith(COUNTERS)
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
 
 
 class Health:
@@ -93,11 +187,12 @@ class Health:
         self._faults: list[tuple[int, str, str]] = []  # time since the epoch, source, text
         self._n_faults = 0
 
-    def add_step(self, step: RecordedStep) -> None:
-        """Add the times between the publications of a step."""
+    def add_step(self, step: RecordedStep) -> RecordedStep:
+        """Add the times between the publications of a step; returns the step."""
         for (before, after), samples in self._chain.items():
             if before in step.publish_ns and after in step.publish_ns:
                 samples.add(step.publish_ns[after] - step.publish_ns[before])
+        return step
 
     def add_mission(self, mission: MissionData) -> None:
         """Add the faults of a mission."""
@@ -141,7 +236,6 @@ class Health:
         # Topics of a step first, in their order.
         names = [name for name in steps if name in self._topics] + sorted(set(self._topics) - set(steps))
         return {
-            "start_ns": start_ns,
             "duration_s": (self._reader.last_ns - start_ns) * 1e-9,
             "chain": [{"name": " → ".join(pair)} | samples.row() for pair, samples in self._chain.items()],
             "topics": [self._topics[name].row(name) for name in names],

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import payloads
 from uav_dc_ros.core import mission, radio, reward, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.recordings.mission_totals import MissionTotals
-from uav_dc_ros.recordings.pages.vehicle import VehicleTimeline
-from uav_dc_ros.recordings.recorded_step import RecordedStep
+from uav_dc_ros.messages import Mission, Rates, Users
+from uav_dc_ros.recordings.pages.vehicle import VehiclePath, VehicleTimeline
+from uav_dc_ros.recordings.recorded_step import MissionTotals, RecordedStep
 from uav_dc_ros.recordings.thinning import EveryNth, spread
 
 STEPS_MAX = 400  # shown of a mission: the resolution of a slider
@@ -29,21 +29,7 @@ WAITING, SERVED, COLLECTED = "012"  # state of a user in the page data
 
 
 class MissionData:
-    """A mission as page data.
-
-    Args:
-        scenario: the world.
-        flight, index: see `RecordedStep`.
-        real: whether a real vehicle flew it.
-
-    Attributes:
-        totals: the mission in numbers.
-        data_bits, collected: of each user at the end, `[U]`.
-        distance_m: length of the path flown.
-        faults: missing or contradictory messages, counted by text.
-        last_ns: log time of the latest message.
-        timeline: phases of a real vehicle; None in simulation.
-    """
+    """A mission as page data; `real`: whether a real vehicle flew it."""
 
     def __init__(self, scenario: Scenario, flight: int, index: int, real: bool = False) -> None:
         n_users = scenario.n_users
@@ -51,13 +37,13 @@ class MissionData:
         self.flight, self.index = flight, index
         self.totals = MissionTotals()
         self.timeline = VehicleTimeline(scenario) if real else None
-        self.data_bits: Array = np.zeros(n_users)
-        self.collected: Array = np.zeros(n_users, dtype=bool)
-        self.distance_m = 0.0
-        self.faults: Counter[str] = Counter()
-        self.last_ns = 0
-        self.shown_users = spread(n_users, USERS_MAX)
-        max_kept = max(min(STEPS_MAX, VALUES_MAX // len(self.shown_users)), 20)
+        self.faults: Counter[str] = Counter()  # missing or contradictory messages, by text
+        self.last_ns = 0  # log time of the latest message
+        self._data_bits: Array = np.zeros(n_users)
+        self._collected: Array = np.zeros(n_users, dtype=bool)
+        self._distance_m = 0.0  # length of the path flown
+        self._shown = spread(n_users, USERS_MAX)
+        max_kept = max(min(STEPS_MAX, VALUES_MAX // len(self._shown)), 20)
         self._steps: EveryNth[dict[str, Any]] = EveryNth(max_kept)
         self._last: dict[str, Any] | None = None  # the newest step, kept or not
         self._position_m: Array | None = None
@@ -106,11 +92,11 @@ class MissionData:
             "seed": totals.seed,
             "outcome": totals.outcome,
             "steps": totals.steps,
-            "users_collected": int(self.collected.sum()),
+            "users_collected": int(self._collected.sum()),
             "users_total": self.scenario.n_users,
-            "data_bits": float(self.data_bits.sum()),
+            "data_bits": float(self._data_bits.sum()),
             "sum_rate_bps": total / max(n, 1),
-            "distance_m": self.distance_m,
+            "distance_m": self._distance_m,
             "reward": self._rewards()[2] if totals.steps else 0.0,
         }
 
@@ -118,7 +104,7 @@ class MissionData:
         """The data and trajectory terms of r^t (eq. 7), and r^t; NaN without a cell."""
         if self._cell is None:
             return math.nan, math.nan, math.nan
-        weights, data_bits = self.scenario.reward, self.data_bits
+        weights, data_bits = self.scenario.reward, self._data_bits
         distance = mission.dock_distance_cells(self._cell, self.scenario.dock_cell, like=data_bits)
         trajectory = weights.zeta * reward.r_plus(distance, weights.r_plus)
         data = reward.total(data_bits, np.zeros(()), weights.beta, weights.zeta, weights.data_scale_bits)
@@ -129,14 +115,14 @@ class MissionData:
         kept = self._steps.kept
         return kept if self._last is None or self._last is kept[-1] else [*kept, self._last]
 
-    @property
-    def stride(self) -> int:
-        """Distance between two steps shown."""
-        return self._steps.stride
+    def data(self, path: VehiclePath | None) -> dict[str, Any]:
+        """Page data, with the timeline of a real vehicle."""
+        data = {"stride": self._steps.stride, "steps": self.steps(), "table": self._table()}
+        return data if path is None or not self.timeline else data | {"timeline": self.timeline.data(path)}
 
-    def table(self) -> dict[str, list[Any]]:
+    def _table(self) -> dict[str, list[Any]]:
         """Columns, an entry per user shown; SINR and rate are means over the steps in which it was served."""
-        shown = self.shown_users
+        shown = self._shown
         served = self._served_steps[shown]
         sinr, rate_bps = (sums[shown] / np.maximum(served, 1) for sums in self._served_sums)
         with np.errstate(divide="ignore"):
@@ -144,7 +130,7 @@ class MissionData:
         return {
             "user": shown.tolist(),
             "cluster": self.scenario.user_cluster[shown].tolist(),
-            "data_bits": self.data_bits[shown].tolist(),
+            "data_bits": self._data_bits[shown].tolist(),
             "collected_at": [step if step >= 0 else None for step in self._collected_at[shown].tolist()],
             "served_steps": served.tolist(),
             "sinr_db": _finite(np.round(sinr_db, 2)),
@@ -160,12 +146,12 @@ class MissionData:
             return None
         return payload
 
-    def _add_rates(self, step: int, rates: messages.Rates) -> None:
+    def _add_rates(self, step: int, rates: Rates) -> None:
         data_bits, collected = payloads.collection(rates, self.scenario)
-        if (data_bits < self.data_bits).any() or (self.collected & ~collected).any():
+        if (data_bits < self._data_bits).any() or (self._collected & ~collected).any():
             self.faults["steps with less collected data than before"] += 1
         self._collected_at[collected & (self._collected_at < 0)] = step
-        self.data_bits, self.collected = data_bits, collected
+        self._data_bits, self._collected = data_bits, collected
         if step == 0:
             return  # nothing is collected before the first move
         self._sum_rates_bps[0] += rates.sum_rate_bps
@@ -174,26 +160,22 @@ class MissionData:
         self._served_steps += served
         self._served_sums += served * np.asarray([rates.sinr, rates.rate_bps])
 
-    def _move(self, position_m: Array | None, status: messages.Mission | None) -> Array | None:
+    def _move(self, position_m: Array | None, status: Mission | None) -> Array | None:
         """Position of the UAV: its pose, or else the centre of its cell; metres `[3]`, or None."""
         if position_m is None and status is not None:
             position_m = self.scenario.grid.centre_m(np.asarray(status.cell), like=np.zeros(1))
         if position_m is not None:
             if self._position_m is not None:
-                self.distance_m += math.dist(position_m, self._position_m)
+                self._distance_m += math.dist(position_m, self._position_m)
             self._position_m = position_m
         return position_m
 
     def _keep(
-        self,
-        step: RecordedStep,
-        position_m: Array | None,
-        users: messages.Users | None,
-        rates: messages.Rates | None,
+        self, step: RecordedStep, position_m: Array | None, users: Users | None, rates: Rates | None
     ) -> None:
-        shown = self.shown_users
-        served = np.asarray(rates.served, dtype=bool) if rates else np.zeros(len(self.collected), dtype=bool)
-        state = np.where(self.collected, COLLECTED, np.where(served, SERVED, WAITING))[shown]
+        shown = self._shown
+        served = np.asarray(rates.served, dtype=bool) if rates else np.zeros(len(self._collected), dtype=bool)
+        state = np.where(self._collected, COLLECTED, np.where(served, SERVED, WAITING))[shown]
         reach_m = 0.0
         if position_m is not None:
             reach_m = radio.ground_reach_m(self.scenario.mission.d_cons_m, max(float(position_m[2]), 0.0))
@@ -204,9 +186,9 @@ class MissionData:
             "reach_m": round(reach_m, 1),
             "action": step.move.action if step.move else None,
             "users_m": None if users_m is None else np.round(users_m, 1).tolist(),
-            "data_bits": None if rates is None else significant(self.data_bits[shown]),
+            "data_bits": None if rates is None else significant(self._data_bits[shown]),
             "state": "".join(state.tolist()),
-            "n_collected": int(self.collected.sum()),
+            "n_collected": int(self._collected.sum()),
             "sum_rate_bps": rates.sum_rate_bps if rates and step.step else None,
             "reward": _finite(np.asarray(self._rewards())),
         }

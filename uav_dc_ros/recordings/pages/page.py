@@ -22,11 +22,7 @@ FOLDER = importlib.resources.files("uav_dc_ros.recordings.pages")
 
 
 class Page:
-    """A page with a title; `kind`, `mission` or `compare`, names the script that draws it.
-
-    Raises:
-        ParameterError: Plotly is not installed.
-    """
+    """A page with a title; `kind`, `mission` or `compare`, names the script that draws it."""
 
     def __init__(self, kind: str, title: str) -> None:
         scripts = ("common", "system", "vehicle", kind) if kind == "mission" else ("common", kind)
@@ -56,28 +52,18 @@ class Page:
 
 def world_data(scenario: Scenario) -> dict[str, Any]:
     """The world as page data."""
-    grid, mission, reward = scenario.grid, scenario.mission, scenario.reward
+    grid, mission = scenario.grid, scenario.mission
     return {
+        **msgspec.to_builtins(grid),
+        **msgspec.to_builtins(mission),
+        **msgspec.to_builtins(scenario.reward),
         "name": scenario.name,
         "fingerprint": scenario.fingerprint,
         "users": scenario.n_users,
         "clusters": scenario.users.cluster_centres_m,
         "cluster_radius_m": scenario.users.cluster_radius_m,
-        "n_x": grid.n_x,
-        "n_y": grid.n_y,
-        "cell_m": grid.cell_m,
         "top_m": grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m,
-        "start_m": mission.start_m,
-        "dock_m": mission.dock_m,
-        "step_s": mission.step_s,
-        "max_steps": mission.max_steps,
-        "d_cons_m": mission.d_cons_m,
         "reach_m": radio.ground_reach_m(mission.d_cons_m, grid.altitude_min_m),
-        "r_min_bits": mission.r_min_bits,
-        "beta": reward.beta,
-        "zeta": reward.zeta,
-        "r_plus": reward.r_plus,
-        "data_scale_bits": reward.data_scale_bits,
     }
 
 

@@ -21,8 +21,7 @@ from uav_dc_ros.errors import BagError, ParameterError, PolicyError
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import Steps
-from uav_dc_ros.recordings.verify.differences import Check
-from uav_dc_ros.recordings.verify.recompute import ChannelCheck, DecisionCheck, WorldCheck
+from uav_dc_ros.recordings.verify.recompute import ChannelCheck, Check, DecisionCheck, WorldCheck
 from uav_dc_ros.recordings.verify.vehicle_flights import VehicleCheck
 from uav_dc_ros.topics import SIMULATED
 
@@ -61,11 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Verify; the exit status.
-
-    Raises:
-        BagError: nothing in the bag can be recomputed.
-    """
+    """Verify; the exit status. Raises BagError if nothing in the bag can be recomputed."""
     with BagReader(options.bag) as reader:
         namespace = step_reader.namespace(reader, options.namespace)
         _check_topics(reader, namespace)
@@ -83,19 +78,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 class Verification(NamedTuple):
-    """Result of a verification.
+    """Result of a verification."""
 
-    Attributes:
-        flown: missions, steps, scenario and policy, as text.
-        lines: results of the checks, as text.
-        differs: whether a recorded value differs from the recomputed one.
-        gaps: whether something could not be recomputed.
-    """
-
-    flown: str
-    lines: list[str]
-    differs: bool
-    gaps: bool
+    flown: str  # missions, steps, scenario and policy
+    lines: list[str]  # results of the checks
+    differs: bool  # whether a recorded value differs from the recomputed one
+    gaps: bool  # whether something could not be recomputed
 
 
 class OtherPolicy(DecisionCheck):
@@ -141,16 +129,7 @@ def verify(
     policy_dir: Path | None = None,
     tolerance: float = 0.0,
 ) -> Verification:
-    """Recompute the missions in a namespace, as `step_reader.namespace` returns it.
-
-    Args:
-        reader: of the bag.
-        namespace: of the missions.
-        scenario: the world.
-        other: another policy to compare.
-        policy_dir: folder of the policy that flew, or of policies.
-        tolerance: greatest relative difference of two equal numbers.
-    """
+    """Recompute the missions in a namespace; raises BagError if nothing can be recomputed."""
     about = reader.about
     vehicle = step_reader.vehicle(reader, namespace)
     policy, missing_policy = _policy(about, scenario, policy_dir)
@@ -197,9 +176,9 @@ def verify(
 
 
 def _check_topics(reader: BagReader, namespace: str) -> None:
-    """Raises BagError for a bag without a whole topic, of which nothing can be recomputed.
+    """Raises BagError for a bag without a needed topic.
 
-    Users around a real vehicle are not measured in a mission that ends before takeoff.
+    A real vehicle's mission that ends before takeoff has no users and no rates.
     """
     needed = NEEDED if step_reader.vehicle(reader, namespace) == SIMULATED else ("mission",)
     counts = {name.removeprefix(f"{namespace}/"): topic.count for name, topic in reader.topics.items()}
@@ -212,11 +191,7 @@ def _check_topics(reader: BagReader, namespace: str) -> None:
 
 
 def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> tuple[Policy | None, str]:
-    """The policy that flew, by the hash in the bag; or why there is none.
-
-    Raises:
-        ParameterError: `folder` is none.
-    """
+    """The policy that flew, by the hash in the bag, or why there is none."""
     if folder is not None and not folder.is_dir():
         raise ParameterError(f"--policy-dir {folder}: no such folder")
     name, sha256 = about.get("policy"), about.get("policy_sha256")

@@ -1,19 +1,16 @@
 """Recompute a recorded mission with the functions of the nodes, and compare bit for bit.
 
-Three checks, each over the steps of one namespace in order:
-
-ChannelCheck   SINR, rates, data and collected flags from recorded users and poses, as in the channel monitor
-WorldCheck     cells from recorded moves, remaining steps, users from the seed; in simulation poses, too
-DecisionCheck  moves from recorded observations, by the policy that flew
-
-A step whose inputs the bag lacks is counted with its reason. The next step starts from recorded values.
+A check compares the steps of one namespace in order. A step whose inputs the bag lacks is counted with its
+reason. The next step starts from recorded values.
 """
 
-from typing import Any, TypeAlias
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
-from uav_dc_ros import messages, payloads
+from uav_dc_ros import payloads
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
@@ -21,30 +18,97 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.messages import Mission, Phase, Rates, Stepped
 from uav_dc_ros.recordings.recorded_step import RecordedStep, differ_in_time_only, with_progress_of
-from uav_dc_ros.recordings.verify.differences import Check, Difference, difference
 
 COLUMNS = ("sinr", "rate_bps", "served", "sum_rate_bps", "data_bits", "collected")  # causes before effects
 FIELDS = {"users": "users", "rates": "rates", "mission": "status", "move": "move"}
 Collection: TypeAlias = tuple[Array, Array]  # data of each user, bit, and whether it is collected, `[U]` each
 
 
+class Difference(NamedTuple):
+    """A recorded value that is not the recomputed one."""
+
+    column: str
+    text: str
+
+
+def difference(
+    step: RecordedStep, topic: str, column: str, recorded: Any, recomputed: Any, user: int | None = None
+) -> Difference:
+    """A difference in a step; `user`: index in a column with an entry per user."""
+    flight = f"flight {step.flight}, " if step.flight else ""
+    of_user = "" if user is None else f", user {user}"
+    where = f"{topic}: {flight}mission {step.mission}, step {step.step}{of_user}, {column}"
+    return Difference(column, f"{where}: recorded {recorded!r}, recomputed {recomputed!r}")
+
+
+@dataclass(kw_only=True)
+class Check:
+    """One aspect of a bag, compared step by step."""
+
+    title: ClassVar[str]
+    tolerance: float = 0.0  # greatest relative difference of two equal numbers
+    compared: int = 0  # recomputed steps
+    differing: int = 0  # recomputed steps with a difference
+    skipped: Counter[str] = field(default_factory=Counter)  # steps that cannot be recomputed, by reason
+    first: Difference | None = None
+    within: int = 0  # values that are equal only within the tolerance
+
+    def count(self, found: list[Difference]) -> None:
+        """Count a recomputed step with its differences."""
+        self.compared += 1
+        self.differing += bool(found)
+        if found and self.first is None:
+            self.first = found[0]
+
+    def compare(
+        self, step: RecordedStep, topic: str, name: str, recorded: Any, recomputed: Any
+    ) -> list[Difference]:
+        """Compare a column with an entry per user, or one value; the first difference, if any."""
+        ours, theirs = np.atleast_1d(recomputed), np.atleast_1d(recorded)
+        if ours.shape != theirs.shape:
+            return [difference(step, topic, f"length of {name}", theirs.shape[0], ours.shape[0])]
+        floats = ours.dtype == np.float64
+        wrong = ours.view(np.uint64) != theirs.view(np.uint64) if floats else ours != theirs
+        if floats and self.tolerance and wrong.any():
+            near = np.abs(ours - theirs) <= self.tolerance * np.abs(ours)
+            self.within += int((wrong & near).sum())
+            wrong &= ~near
+        if not wrong.any():
+            return []
+        i = int(wrong.argmax())
+        user = i if np.ndim(recorded) > 0 else None
+        return [difference(step, topic, name, theirs[i].item(), ours[i].item(), user)]
+
+    def lines(self) -> list[str]:
+        """The result as text."""
+        total = self.compared + self.skipped.total()
+        if not total:
+            return [f"{self.title}: the bag holds no step to recompute"]
+        summary = f"{self.title}: {self.compared} of {total} steps recomputed"
+        if self.first:
+            lines = [f"{summary}, {self.differing} differ; first:", f"  {self.first.text}"]
+        else:
+            lines = [f"{summary}, equal {'within the tolerance' if self.within else 'to the last bit'}"]
+        if self.within:
+            lines.append(f"  {self.within} values are equal within the tolerance only")
+        return lines + [f"  {n} not recomputed: {reason}" for reason, n in self.skipped.most_common()]
+
+
 class ChannelCheck(Check):
     """Recomputes rates as the channel monitor does.
 
     Where rates are missing, the monitor may have counted the step or missed it. The next step is compared
-    with both. If neither fits, only the columns that do not depend on the collected data are compared.
-
-    `later_poses`: steps that fit a later pose than the first of their time, since the monitor may miss a pose
-    that the recorder receives.
+    with both. If neither fits, only the columns that do not depend on the collected data are compared. The
+    monitor may miss a pose that the recorder receives, so rates may fit a later pose of a step.
     """
 
     title = "channel"
 
     def __init__(self, scenario: Scenario, tolerance: float = 0.0) -> None:
         super().__init__(tolerance=tolerance)
-        self.later_poses = 0
+        self._later_poses = 0  # steps that fit a later pose than the first
         self._scenario = scenario
         self._last = (-1, -1, -1)  # flight, mission and number of the last step
         self._possible: list[Collection] = []  # after it
@@ -58,7 +122,7 @@ class ChannelCheck(Check):
         except MessageError:
             users_m = None  # WorldCheck reports the difference
         if step.rates is None:
-            self.skip("no rates recorded")
+            self.skipped["no rates recorded"] += 1
             measured = []
             if users_m is not None and step.poses:
                 uav_m = step.poses[0].position_m
@@ -73,9 +137,10 @@ class ChannelCheck(Check):
         except MessageError:
             self._possible, self._certain = [], False
         if users_m is None or not step.poses:
-            self.skip("no pose recorded" if users_m is not None else "no users of this scenario recorded")
+            missing = "pose" if users_m is not None else "users of this scenario"
+            self.skipped[f"no {missing} recorded"] += 1
         elif not possible:
-            self.skip("its mission is not recorded from the start")
+            self.skipped["its mission is not recorded from the start"] += 1
         else:
             self._compare(step, step.rates, users_m, possible, certain)
 
@@ -98,16 +163,11 @@ class ChannelCheck(Check):
         return link, world.collect(self._scenario, link, *before) if step.step else before
 
     def _compare(
-        self,
-        step: RecordedStep,
-        rates: messages.Rates,
-        users_m: Array,
-        possible: list[Collection],
-        certain: bool,
+        self, step: RecordedStep, rates: Rates, users_m: Array, known: list[Collection], certain: bool
     ) -> None:
         first: list[Difference] | None = None
         for i, pose in enumerate(step.poses):
-            for before in possible:
+            for before in known:
                 link, after = self._measure(step, pose.position_m, users_m, before)
                 ours = payloads.rates(link, *after, mission=step.mission, step=step.step)
                 within = self.within
@@ -117,7 +177,7 @@ class ChannelCheck(Check):
                     for one in self.compare(step, "rates", name, getattr(rates, name), getattr(ours, name))
                 ]
                 if not found:
-                    self.later_poses += i > 0
+                    self._later_poses += i > 0
                     self.count([])
                     return
                 self.within = within
@@ -127,32 +187,24 @@ class ChannelCheck(Check):
             independent = self._scenario.radio.interference != "associated"
             first = [one for one in first if independent and one.column in ("sinr", "rate_bps")]
             if not first:
-                self.skip("what was collected before it is not recorded")
+                self.skipped["what was collected before it is not recorded"] += 1
                 return
         self.count(first)
 
     def lines(self) -> list[str]:
         """The result as text."""
         lines = super().lines()
-        if self.later_poses:
-            lines.append(f"  {self.later_poses} steps fit a later pose than the first one recorded")
+        if self._later_poses:
+            lines.append(f"  {self._later_poses} steps fit a later pose than the first one recorded")
         return lines
 
 
 class WorldCheck(Check):
-    """Recomputes the cell of the vehicle, the state of the mission, and the users.
+    """Recomputes the cell of the vehicle, the state of the mission, the users, and poses in simulation.
 
-    Args:
-        scenario: the world.
-        seed: seed in the bag's metadata; None: no simulated world made the users. Otherwise they follow from
-            the seed, and the seeds of a flight's missions from that of its first one.
-        real: whether the vehicle is real. A simulated one has the pose of its cell and the time of its step.
-        lockstep: whether the vehicle waits for each move. Otherwise a simulated one hovers without a move.
-        tolerance: see `Check`.
-
-    Attributes:
-        hovered: steps whose move was not flown.
-        seeds: of mission 0, by flight.
+    `seed` is that of the bag's metadata; without it, no simulated world made the users. The seeds of a
+    flight's missions follow from that of its first one. Without `lockstep`, a simulated vehicle hovers if no
+    move comes in time.
     """
 
     title = "world"
@@ -161,8 +213,8 @@ class WorldCheck(Check):
         self, scenario: Scenario, *, seed: str | None, lockstep: bool, real: bool, tolerance: float = 0.0
     ) -> None:
         super().__init__(tolerance=tolerance)
-        self.hovered = 0
-        self.seeds: dict[int, int] = {}
+        self._hovered = 0  # steps whose move was not flown
+        self._seeds: dict[int, int] = {}  # of mission 0, by flight
         self._scenario, self._seed, self._real = scenario, seed, real
         self._lockstep = lockstep or real
         self._before: RecordedStep | None = None
@@ -187,10 +239,10 @@ class WorldCheck(Check):
         if found or not reason:
             self.count(found)
         else:
-            self.skip(reason)
+            self.skipped[reason] += 1
 
     def _status(
-        self, step: RecordedStep, status: messages.Mission, before: RecordedStep | None
+        self, step: RecordedStep, status: Mission, before: RecordedStep | None
     ) -> tuple[list[Difference], str]:
         """Differences, and why the cell cannot be recomputed."""
         scenario = self._scenario
@@ -222,14 +274,14 @@ class WorldCheck(Check):
         ]
         wrong = _cell(step, cell, reached)
         if not wrong and reached[0] != cell and before.move:
-            self.hovered += 1
+            self._hovered += 1
         hovers = not self._lockstep and list(before.status.cell) == cell  # as without a move in time
         return found + wrong, "" if before.move or hovers else "the move before it is not recorded"
 
-    def _simulation(self, step: RecordedStep, status: messages.Mission) -> list[Difference]:
+    def _simulation(self, step: RecordedStep, status: Mission) -> list[Difference]:
         """Differences of seed, poses and users from those of the simulated world."""
         scenario = self._scenario
-        first = self.seeds.setdefault(step.flight, status.seed - step.mission)
+        first = self._seeds.setdefault(step.flight, status.seed - step.mission)
         found = self.compare(step, "mission", "seed", status.seed, first + step.mission)
         time_ns = scenario.time_ns(step.mission, step.step)
         if not self._real:
@@ -255,15 +307,13 @@ class WorldCheck(Check):
     def lines(self) -> list[str]:
         """The result as text."""
         lines = super().lines()
-        if self.hovered:
-            lines.append(
-                f"  {self.hovered} moves were not flown: they came too late, and the vehicle hovered"
-            )
+        if self._hovered:
+            lines.append(f"  {self._hovered} moves came too late and were not flown: the vehicle hovered")
         if self._seed is None:
             what = "users" if self._real else "poses and users"
             lines.append(f"  the bag names no seed of a simulated world: {what} are not recomputed")
-        elif any(str(seed) != self._seed for seed in self.seeds.values()):
-            seeds = ", ".join(map(str, self.seeds.values()))
+        elif any(str(seed) != self._seed for seed in self._seeds.values()):
+            seeds = ", ".join(map(str, self._seeds.values()))
             lines.append(f"  flown with seed {seeds}; the bag's metadata names seed {self._seed}")
         return lines
 
@@ -286,24 +336,17 @@ class DecisionCheck(Check):
             return None
         if move is None:
             if status.phase is Phase.READY:
-                self.skip("no move recorded")
-            return None
-        if step.rates is None:
-            self.skip("no rates recorded")
+                self.skipped["no move recorded"] += 1
             return None
         try:
-            data_bits, collected = payloads.collection(step.rates, self._scenario)
-            payloads.check(status, self._scenario)
+            observed = step.observed(self._scenario)
         except MessageError:
-            self.skip("rates or mission of another world")
+            self.skipped["rates or mission of another world"] += 1
             return None
-        observation = self.policy.observe(
-            self._scenario,
-            cell=np.asarray(status.cell),
-            step=np.asarray(self._scenario.mission.max_steps - status.remaining_steps),
-            data_bits=data_bits,
-            collected=collected,
-        )
+        if observed is None:
+            self.skipped["no rates recorded"] += 1
+            return None
+        observation = self.policy.observe(self._scenario, **observed)
         q_values = self.policy.q_values(observation)
         action = Action(int(self.policy.act(observation))).label
         found = [difference(step, "move", "action", move.action, action)] if action != move.action else []
@@ -315,9 +358,9 @@ def _cell(step: RecordedStep, cell: list[int], reached: list[list[int]]) -> list
     return [] if cell in reached else [difference(step, "mission", "cell", cell, reached[0])]
 
 
-def _first_unequal(one: messages.Stepped, other: messages.Stepped) -> tuple[str, Any, Any]:
+def _first_unequal(one: Stepped, other: Stepped) -> tuple[str, Any, Any]:
     """Name of the first field in which a payload and its repetition differ, and both values."""
-    if isinstance(one, messages.Mission) and isinstance(other, messages.Mission):
+    if isinstance(one, Mission) and isinstance(other, Mission):
         other = with_progress_of(other, one)
     for name in one.__struct_fields__:
         a, b = getattr(one, name), getattr(other, name)
