@@ -66,7 +66,7 @@ class MissionController:
         self.policy_lost = False
         self._on_change = on_change
         self._telemetry = Telemetry()
-        self._now = self._entered = Instant(0.0, 0.0)  # last tick; begin of the phase
+        self._now = self._entered = Instant(0.0, 0.0)  # last tick; start of the phase
         self._entered_step = self.step
         before = self.progress.checkpoint
         self._released = before.released  # another controller has the vehicle

@@ -35,7 +35,7 @@ class SafetySettings:
     flying_at_start: Literal["resume", "land"] = "resume"  # for a vehicle in the air in the commanded mode
     command_retry_s: float = 2.0  # pause before a command that was not executed is sent again
     max_return_attempts: int = 3  # then the bridge requests land
-    takeoff_timeout_s: float = 300.0  # from the begin of the phase to the start position
+    takeoff_timeout_s: float = 300.0  # of the phase, until the start is reached
     max_offset_cells: float = 0.5  # a step may end there late; 0.5: the goal is the nearest cell
     progress_timeout_s: float = 5.0  # time to come nearer to the goal, in a step that is late
     target_timeout_s: float = 5.0  # for which the autopilot may report another target than the setpoint
