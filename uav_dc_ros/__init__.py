@@ -56,27 +56,7 @@ _PUBLIC = {
     "rollout": "uav_dc_ros.api:rollout",
     "scenario_names": "uav_dc_ros.scenarios:names",
 }
-__all__ = [  # noqa: PLE0604, RUF100
-    "Action",
-    "DataCollectionEnv",
-    "DataCollectionVectorEnv",
-    "Evaluation",
-    "Missions",
-    "Policy",
-    "RecordedStep",
-    "RunConfig",
-    "Scenario",
-    "Summary",
-    "UavDcError",
-    "evaluate_policy",
-    "fly",
-    "load_policy",
-    "load_scenario",
-    "policy_names",
-    "read_steps",
-    "rollout",
-    "scenario_names",
-]
+__all__ = list(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:

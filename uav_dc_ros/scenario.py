@@ -3,8 +3,6 @@
 python -m uav_dc_ros.scenario check my_field.toml
 """
 
-from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from uav_dc_ros import cli
@@ -44,9 +42,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             return 0
         scenario = scenarios.load(options.scenario)
         if options.verb == "show":
-            shipped = options.scenario in scenarios.names()
-            text = files(scenarios) / f"{options.scenario}.toml" if shipped else Path(options.scenario)
-            print(text.read_text("utf-8"), end="")
+            print(scenarios.find(options.scenario).read_text("utf-8"), end="")
             return 0
         print(f"{options.scenario}: {_description(scenario)}")
         fitting = []

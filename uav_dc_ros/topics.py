@@ -21,30 +21,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Topic:
-    """A topic.
+    """A topic and its quality of service."""
 
-    Attributes:
-        name: relative name.
-        type: ROS 2 message type; `std_msgs/msg/String` holds a JSON payload, see messages.PAYLOADS.
-        reliable: reliability that publishers offer.
-        requests_reliable: reliability that subscriptions request.
-        latched: durability transient local, offered and requested; otherwise volatile.
-        depth: messages that a publisher keeps.
-        lease_s: liveliness lease duration that publishers offer, seconds; see `nodes.ros.liveliness`. Without
-            one, a killed publisher is detected after tens of seconds.
-        recorded: whether the recorder writes it.
-        exclusive: whether a mission has exactly one publisher of it.
-    """
-
-    name: str
-    type: str
-    reliable: bool = True
-    requests_reliable: bool = True
-    latched: bool = False
-    depth: int = 1000
+    name: str  # relative
+    type: str  # ROS 2 message type; `std_msgs/msg/String` holds a JSON payload, see messages.PAYLOADS
+    reliable: bool = True  # offered by publishers
+    requests_reliable: bool = True  # requested by subscriptions
+    latched: bool = False  # durability transient local, offered and requested; otherwise volatile
+    depth: int = 1000  # messages that a publisher keeps
+    # Liveliness lease duration that publishers offer, see `nodes.ros.liveliness`. Without one, a killed
+    # publisher is detected after tens of seconds.
     lease_s: float | None = None
-    recorded: bool = True
-    exclusive: bool = False
+    recorded: bool = True  # by the recorder
+    exclusive: bool = False  # a mission has exactly one publisher of it
 
 
 # The world node's simulated vehicle, and the interfaces to a real one.

@@ -25,14 +25,8 @@ from uav_dc_ros.agents.replay import TransitionBatch
 def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float | Tensor) -> Tensor:
     """The target y (eq. 22): `r` when the episode terminated at s', else `r + gamma max_a' Q'(s', a')`.
 
-    Args:
-        reward: r, `[...]`.
-        terminated: bool `[...]`; truncation is not termination, and does bootstrap.
-        next_q: Q'(s', .) of the target network, `[..., A]`.
-        gamma: discount, a number or `[...]`.
-
-    Returns:
-        y, `[...]`.
+    `next_q` is Q'(s', .) of the target network, `[..., A]`; everything else is `[...]`. A truncated episode
+    has not terminated.
     """
     return reward + gamma * next_q.amax(dim=-1).masked_fill_(terminated, 0.0)
 
@@ -110,10 +104,7 @@ class Learner:
     def act(self, observation: Tensor, explore: Tensor, choice: Tensor) -> Tensor:
         """Epsilon-greedy actions (eq. 18), integers `[N]`: greedy with probability epsilon, else random.
 
-        Args:
-            observation: `[N, D]`.
-            explore: uniform draws in [0, 1), `[N]`; below epsilon the action is greedy.
-            choice: uniform draws in [0, 1), `[N]`, of the random action.
+        `explore` and `choice` are uniform draws `[N]`: greedy or not, and the random action.
         """
         random = (choice * self._architectures[0].n_actions).to(torch.int64)
         return torch.where(explore < self._epsilon, self.greedy(observation[:, None])[:, 0], random)

@@ -20,19 +20,13 @@ Width: TypeAlias = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 
 class Architecture(msgspec.Struct, frozen=True, kw_only=True):
-    """Sizes of a Q-network.
+    """Sizes of a Q-network."""
 
-    Attributes:
-        n_inputs: length D of the observation.
-        hidden: units of each hidden layer.
-        n_actions: number of actions A.
-        dueling: subtracted from the advantage: its `mean` (eq. 30) or its `max` (eq. 29); None for the plain
-            network of the paper's first algorithm.
-    """
-
-    n_inputs: int
-    hidden: tuple[Width, ...]
+    n_inputs: int  # length D of the observation
+    hidden: tuple[Width, ...]  # units of each hidden layer
     n_actions: int
+    # Subtracted from the advantage: its `mean` (eq. 30) or its `max` (eq. 29); None for the plain network of
+    # the paper's first algorithm.
     dueling: Aggregation | None
 
 
@@ -62,12 +56,9 @@ def initial(architecture: Architecture, rng: np.random.Generator) -> Parameters:
 
 
 def q_values(architecture: Architecture, parameters: Parameters, observation: Array) -> Array:
-    """Q(s, a) of every action, `[..., B, A]`.
+    """Q(s, a) of every action, `[..., B, A]`, for observations `[..., B, D]`.
 
-    Args:
-        architecture: the sizes.
-        parameters: arrays as named by `shapes`, each with the same leading dimensions `[...]`.
-        observation: `[..., B, D]`, of the parameters' library and dtype.
+    The parameters are named as by `shapes`, with equal leading dimensions, and have the observation's dtype.
     """
 
     def layer(name: str, inputs: Array) -> Array:

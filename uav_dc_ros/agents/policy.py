@@ -218,12 +218,8 @@ def save(
 ) -> None:
     """Write a policy's folder, completely or not at all.
 
-    Args:
-        folder: the folder to make.
-        config: everything except the parameters.
-        parameters: arrays as named by `network.shapes`.
-        card: returns the text of README.md for the policy, as loaded from the new folder.
-        draw: draws pictures of the policy into the folder.
+    `card` returns the text of README.md, and `draw` draws pictures, of the policy as loaded from the new
+    folder.
 
     Raises:
         PolicyError: `folder` exists or cannot be written, or the new policy cannot be loaded.

@@ -7,21 +7,13 @@ from torch import Tensor
 
 
 class TransitionBatch(NamedTuple):
-    """Transitions (s, a, r, s') of N runs, `[N, ...]`, or a mini-batch, `[N, B, ...]`.
+    """Transitions (s, a, r, s') of N runs, `[N, ...]`, or a mini-batch, `[N, B, ...]`."""
 
-    Attributes:
-        observation: s, float32 `[..., D]`.
-        action: integers `[...]`.
-        reward: float32 `[...]`.
-        next_observation: s', float32 `[..., D]`.
-        terminated: the episode ended at s', bool `[...]`. A truncated one has not ended.
-    """
-
-    observation: Tensor
-    action: Tensor
-    reward: Tensor
-    next_observation: Tensor
-    terminated: Tensor
+    observation: Tensor  # s, float32 `[..., D]`
+    action: Tensor  # integers `[...]`
+    reward: Tensor  # float32 `[...]`
+    next_observation: Tensor  # s', float32 `[..., D]`
+    terminated: Tensor  # the episode ended at s' and was not truncated, bool `[...]`
 
 
 class ReplayBuffer:

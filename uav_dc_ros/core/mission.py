@@ -11,18 +11,9 @@ def served(distance_m: Array, collected: Array, d_cons_m: float) -> Array:
 def collect(
     data_bits: Array, collected: Array, served: Array, rate_bps: Array, step_s: float, r_min_bits: float
 ) -> tuple[Array, Array]:
-    """Data of each user after a step (eq. 4, with the rate constant over a step).
+    """`data_bits` and `collected` after a step (eq. 4, the rate constant over a step), all `[..., U]`.
 
-    Args:
-        data_bits: data before the step, bit, `[..., U]`.
-        collected: bool `[..., U]`; a collected user stays collected for the mission.
-        served: P of this step, bool `[..., U]`.
-        rate_bps: rate in this step, bit/s, `[..., U]`.
-        step_s: duration of a step, seconds.
-        r_min_bits: data at which a user counts as collected, bit.
-
-    Returns:
-        `data_bits` and `collected` after the step.
+    `served` is P of this step. A user counts as collected from `r_min_bits` to the end of the mission.
     """
     data_bits = data_bits + rate_bps * step_s * served
     return data_bits, collected | (data_bits >= r_min_bits)

@@ -9,12 +9,9 @@ from uav_dc_ros.core.scenario import Scenario
 
 
 def scatter(centres_m: Array, radius_m: float, draws: Array) -> Array:
-    """Start positions, metres, `[..., U, 2]`: uniform by area in the disc around each user's cluster centre.
+    """Start positions, metres, `[..., U, 2]`, from uniform draws `[..., U, 2]`.
 
-    Args:
-        centres_m: centre of each user's cluster, metres, `[U, 2]`.
-        radius_m: radius C of a cluster, metres.
-        draws: uniform in [0, 1), `[..., U, 2]`.
+    They are uniform by area in a disc of radius C around the centre of each user's cluster, `[U, 2]`.
     """
     xp = array_namespace(draws)
     # The square root makes equal areas, not equal radii, equally likely.
@@ -22,13 +19,9 @@ def scatter(centres_m: Array, radius_m: float, draws: Array) -> Array:
 
 
 def walk(users_m: Array, v_max_mps: float, step_s: float, draws: Array) -> Array:
-    """Positions after one step of the unbounded random walk, metres, `[..., U, 2]`.
+    """Positions after one step of the unbounded random walk, metres, `[..., U, 2]`, from uniform draws.
 
-    Args:
-        users_m: positions x, y, metres, `[..., U, 2]`.
-        v_max_mps: maximum speed v, m/s; speeds are uniform, directions too.
-        step_s: duration of a step, seconds.
-        draws: uniform in [0, 1), `[..., U, 2]`.
+    Speeds (up to v) and directions are uniform. `users_m` and `draws` are `[..., U, 2]`.
     """
     return users_m + _polar(v_max_mps * step_s * draws[..., 0], draws[..., 1])
 

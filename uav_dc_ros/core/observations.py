@@ -48,13 +48,7 @@ def encode(
 ) -> Array:
     """The observation of a mission, float32 `[..., D]` with D = `size(kind, scenario)`.
 
-    Args:
-        kind: encoding.
-        scenario: the world's values.
-        cell: the UAV's cell, integers `[..., 3]`.
-        step: steps flown, integers `[...]`.
-        data_bits: data collected from each user, bit, `[..., U]`.
-        collected: bool `[..., U]`.
+    `cell` `[..., 3]`, `step` `[...]`, `data_bits` and `collected` `[..., U]` are those of `world.State`.
     """
     xp = array_namespace(cell)
     cell_f = xp.astype(cell, xp.float32)

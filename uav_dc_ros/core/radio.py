@@ -13,11 +13,9 @@ Interference: TypeAlias = Literal["all", "associated", "none"]
 
 
 def distance(uav_m: Array, users_m: Array) -> Array:
-    """3D distance between the UAV and users on the ground (eq. 1), metres, `[..., U]`.
+    """3D distance `[..., U]` (eq. 1) between the UAV `[..., 3]` and users on the ground `[..., U, 2]`.
 
-    Args:
-        uav_m: UAV position x, y, altitude, metres, `[..., 3]`.
-        users_m: user positions x, y, metres, `[..., U, 2]`. Integers become float64.
+    Integers become float64.
     """
     xp = array_namespace(uav_m, users_m)
     uav_m, users_m = _floating(xp, uav_m), _floating(xp, users_m)
@@ -35,10 +33,7 @@ def ground_reach_m(distance_m: float, altitude_m: float) -> float:
 def path_gain(distance_m: Array, ref_gain: float, exponent: float = 2.0) -> Array:
     """Channel power gain of a line-of-sight link, `beta_0 d^-exponent` (eq. 2), linear.
 
-    Args:
-        distance_m: metres, any shape, above zero.
-        ref_gain: gain at 1 m, linear.
-        exponent: path-loss exponent; the paper's free space is 2.
+    `ref_gain` is beta_0, the linear gain at 1 m; the exponent of the paper's free space is 2.
     """
     return ref_gain / distance_m**exponent
 
@@ -54,8 +49,8 @@ def sinr(
 
     Args:
         gain: channel power gain, linear, `[..., U]`.
-        power_w: transmit power, watts, a number or `[..., U]`.
-        noise_w: noise power, watts.
+        power_w: transmit power, a number or `[..., U]`.
+        noise_w: noise power.
         interference: transmitting users. `all`: every user, at every step (the paper's equation as
             written). `associated`: only the users in `served`; the others have SINR 0. `none`: orthogonal
             channels, noise only.

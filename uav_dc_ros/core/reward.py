@@ -11,19 +11,12 @@ RewardForm: TypeAlias = Literal["immediate", "episode"]
 
 @dataclass(frozen=True, kw_only=True)
 class Rewards:
-    """Reward settings of many worlds that differ in them, each `[...]`.
-
-    Attributes:
-        beta, zeta: weights of the data and of R_plus.
-        r_plus: whether R_plus is exponential, bool; otherwise binary.
-        form: whether the form is the episode's, bool; otherwise immediate.
-        data_scale_bits: data of a user that counts as 1, bit.
-    """
+    """Reward settings of many worlds that differ in them, each `[...]`; see `scenario.RewardSettings`."""
 
     beta: Array
     zeta: Array
-    r_plus: Array
-    form: Array
+    r_plus: Array  # whether R_plus is exponential, bool; otherwise binary
+    form: Array  # whether the form is the episode's, bool; otherwise immediate
     data_scale_bits: Array
 
 
@@ -33,9 +26,7 @@ def r_plus(dock_distance_cells: Array, shape: RPlus | Array) -> Array:
     `binary` (eq. 8): 1 at the dock, else 0. `exponential` (eq. 9): `exp(-distance)`. The distance is in
     cells: in metres the exponential of any relevant distance is zero in floating point.
 
-    Args:
-        dock_distance_cells: horizontal distance to the dock, cells, `[...]`.
-        shape: `binary` or `exponential`, or for each world whether it is exponential, bool `[...]`.
+    `shape` is its name, or for each world whether it is exponential, bool `[...]`.
     """
     xp = array_namespace(dock_distance_cells)
     if isinstance(shape, str):
@@ -50,14 +41,11 @@ def total(
 ) -> Array:
     """The reward r^t (eq. 7), `[...]`: `beta / (M K) sum(data) / data_scale_bits + zeta R_plus`.
 
-    `data_scale_bits` brings the first term to order one; the paper leaves its unit open.
-
-    Args:
-        data_bits: data collected while P(m, k) was 1, bit, `[..., U]` with U = M K users.
-        r_plus: `[...]`.
-        beta: weight of the data, a number or `[...]`.
-        zeta: weight of the trajectory, a number or `[...]`.
-        data_scale_bits: data of a user that counts as 1, bit, a number or `[...]`.
+    `data_bits` `[..., U]` is data collected while P(m, k) was 1, of U = M K users. `data_scale_bits` is the
+    data of
+    a user that counts as 1: it brings the first term to order one; the paper leaves its unit open. It,
+        `beta` and
+    `zeta` are numbers or `[...]`.
     """
     return beta * (array_namespace(data_bits).mean(data_bits, axis=-1) / data_scale_bits) + zeta * r_plus
 
@@ -68,10 +56,7 @@ def step_reward(total: Array, previous_total: Array, form: RewardForm | Array) -
     `immediate` (r_1, eq. 23) is the difference `r^t - r^(t-1)`. `episode` (r_2, eq. 24) is the sum of
     all differences so far; that sum telescopes to r^t itself, since a mission starts from r = 0.
 
-    Args:
-        total: r^t, `[...]`.
-        previous_total: r^(t-1), `[...]`; 0 at the first step.
-        form: `immediate` or `episode`, or for each world whether it is the episode's, bool `[...]`.
+    `form` is its name, or for each world whether it is the episode's, bool `[...]`. `total` is r^t, `[...]`.
     """
     if isinstance(form, str):
         return total - previous_total if form == "immediate" else total

@@ -198,11 +198,7 @@ class Scenario(_Table, frozen=True, dict=True):
 
 
 def parse(text: str, source: str) -> Scenario:
-    """A scenario from the text of a TOML file.
-
-    Args:
-        text: content of the file.
-        source: name of the file for errors.
+    """A scenario from the text of a TOML file; `source` names the file in errors.
 
     Raises:
         ScenarioError: not TOML, an unknown key, a wrong type, a value out of range, or inconsistent values.

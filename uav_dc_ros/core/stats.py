@@ -24,12 +24,9 @@ class Interval(NamedTuple):
 def interval(
     values: Array, statistic: Callable[[Array], Array] = lambda means: means, level: float = 0.95
 ) -> Interval:
-    """The mean of a sample, or a statistic of means, with its interval (somewhat too narrow for small n).
+    """The mean of a sample `[n, ...]`, or a statistic (`[R, ...]` to `[R]`) of means, with its interval.
 
-    Args:
-        values: the sample, finite numbers for each independent unit, `[n, ...]` with n >= 1.
-        statistic: from means `[R, ...]` to numbers `[R]`.
-        level: probability that the interval is meant to cover.
+    Values are finite, n >= 1. For small n the interval is somewhat too narrow.
     """
     values = np.asarray(values, np.float64)
     low, high = np.quantile(statistic(_resampled_means(values)), [(1 - level) / 2, (1 + level) / 2])

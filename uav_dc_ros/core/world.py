@@ -146,7 +146,7 @@ def step(
         state: the world before the step.
         action: value of a `grid.Action`, integers `[...]`.
         draws: uniform in [0, 1), `[..., U, 2]`.
-        rewards: reward settings of each world, `[...]`; default: the scenario's.
+        rewards: of each world, `[...]`; default: the scenario's.
     """
     cell = scenario.grid.move(state.cell, action)
     users_m = mobility.walk(state.users_m, scenario.users.v_max_mps, scenario.mission.step_s, draws)
@@ -176,14 +176,13 @@ def step(
 
 def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
     """The observation of a state, float32 `[..., D]`; see `observations.encode`."""
-    return observations.encode(
-        kind,
-        scenario,
-        cell=state.cell,
-        step=state.step,
-        data_bits=state.data_bits,
-        collected=state.collected,
-    )
+    seen = {
+        "cell": state.cell,
+        "step": state.step,
+        "data_bits": state.data_bits,
+        "collected": state.collected,
+    }
+    return observations.encode(kind, scenario, **seen)
 
 
 def select(where: Array, chosen: State, other: State) -> State:

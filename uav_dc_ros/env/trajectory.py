@@ -8,22 +8,14 @@ from uav_dc_ros.core.scenario import Scenario
 
 
 class Trajectory:
-    """One mission, step by step; every list begins with the start.
-
-    Attributes:
-        scenario: the world's values.
-        cells: the UAV's cell after each step.
-        n_collected: users collected after each step.
-        sum_rate_bps: sum-rate of each step, 0 for the start.
-        state: the latest state.
-    """
+    """One mission, step by step; every list begins with the start."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.cells: list[Array] = []
-        self.n_collected: list[int] = []
-        self.sum_rate_bps: list[float] = []
-        self.state: world.State | None = None
+        self.cells: list[Array] = []  # the UAV's, `[3]` each
+        self.n_collected: list[int] = []  # users
+        self.sum_rate_bps: list[float] = []  # 0 for the start
+        self.state: world.State | None = None  # the latest
 
     def add(self, state: world.State, link: world.Link | None = None) -> None:
         """Append the start, or the next step, of one mission without batch dimensions."""

@@ -1,37 +1,37 @@
-"""Scenario files that come with the package, and the way to any other."""
+"""The shipped scenario files, and the loader of any scenario."""
 
-from importlib.resources import files
 from pathlib import Path
 
 from uav_dc_ros.core.scenario import Scenario, parse
 from uav_dc_ros.errors import ScenarioError
 
+FOLDER = Path(__file__).parent
+
 
 def names() -> list[str]:
     """Names of the shipped scenarios."""
-    return sorted(
-        entry.name.removesuffix(".toml")
-        for entry in files(__package__).iterdir()
-        if entry.name.endswith(".toml")
-    )
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def find(name_or_path: str | Path) -> Path:
+    """The TOML file of the scenario with a shipped name or a path; raises ScenarioError if there is none."""
+    path = FOLDER / f"{name_or_path}.toml" if str(name_or_path) in names() else Path(name_or_path)
+    if not path.is_file():
+        raise ScenarioError(
+            f"scenario {str(name_or_path)!r}: no such name or file; expected one of {', '.join(names())}, "
+            "or the path of a TOML file"
+        )
+    return path
 
 
 def load(name_or_path: str | Path) -> Scenario:
     """The scenario with a shipped name, or in the TOML file at a path.
 
     Raises:
-        ScenarioError: no such name or file, or a file that `parse` refuses.
+        ScenarioError: no such name or file, or a file that `parse` rejects.
     """
-    wanted = str(name_or_path)
-    if wanted in names():
-        return parse((files(__package__) / f"{wanted}.toml").read_text("utf-8"), wanted)
-    path = Path(name_or_path)
     try:
-        if path.is_file():
-            return parse(path.read_text("utf-8"), wanted)
+        text = find(name_or_path).read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{wanted}: cannot be read: {error}") from None
-    raise ScenarioError(
-        f"scenario {wanted!r}: no such name or file; expected one of {', '.join(names())}, "
-        "or the path of a TOML file"
-    )
+        raise ScenarioError(f"{name_or_path}: cannot be read: {error}") from None
+    return parse(text, str(name_or_path))

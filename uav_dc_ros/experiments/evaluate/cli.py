@@ -40,19 +40,12 @@ _MAIN_FIGURES = ("landing_rate", "users_collected", "arrival_step", "sum_rate_bp
 
 
 class Candidate(NamedTuple):
-    """A policy or a planner to evaluate.
+    """A policy or a planner to evaluate."""
 
-    Attributes:
-        name: name in the results.
-        sha256: hash of a policy's config and model.
-        home: name of the scenario that a policy was trained in.
-        act_in: its actions in a scenario; raises PolicyError where it does not fit.
-    """
-
-    name: str
-    sha256: str | None
-    home: str | None
-    act_in: Callable[[Scenario], Act]
+    name: str  # in the results
+    sha256: str | None  # of a policy's config and model
+    home: str | None  # name of the scenario that a policy was trained in
+    act_in: Callable[[Scenario], Act]  # raises PolicyError where the policy does not fit
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -21,27 +21,16 @@ from uav_dc_ros.env.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class Missions:
-    """Results of missions, one entry per seed, each `[..., S]`.
-
-    Attributes:
-        users_collected: users collected.
-        landed: the mission ended over the dock.
-        steps: steps flown.
-        arrival_step: step after which the UAV stayed over the dock; NaN when it did not land.
-        sum_rate_bps: sum-rate of the served users, mean over the steps, bit/s.
-        data_bits: data collected from all users, bit.
-        reward: r^t at the end (eq. 7).
-        episode_return: undiscounted sum of the agent's rewards.
-    """
+    """Results of missions, one entry per seed, each `[..., S]`."""
 
     users_collected: Array
-    landed: Array
-    steps: Array
-    arrival_step: Array
-    sum_rate_bps: Array
-    data_bits: Array
-    reward: Array
-    episode_return: Array
+    landed: Array  # whether the mission ended over the dock
+    steps: Array  # flown
+    arrival_step: Array  # step after which the UAV stayed over the dock; NaN when it did not land
+    sum_rate_bps: Array  # of the served users, mean over the steps
+    data_bits: Array  # collected from all users
+    reward: Array  # r^t at the end (eq. 7)
+    episode_return: Array  # undiscounted sum of the agent's rewards
 
 
 def rollout_steps(
