@@ -105,7 +105,7 @@ class Storage:
     Attributes:
         messages: those of some topics (None: all) from a log time on and before another, sorted by log time.
         recorded: those of some topics, or all, in the order of recording.
-        goes_back_ns: the longest step back in log time between messages of a topic; reads the file.
+        goes_back_ns: the longest step back in log time within a topic; reads the file.
         about, dropped, repeated: as in `metadata.Part`; repeated messages are those left out.
         library: name of the software that wrote the file.
         damages: unusable places; only known of a file that was scanned.

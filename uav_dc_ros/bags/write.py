@@ -15,7 +15,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Self
 
 from rosbags.rosbag2.metadata import dump_qos_v9
@@ -136,7 +135,7 @@ class BagWriter:
 
         A new subscription receives latched messages again; those that are not newer are in the bag.
         """
-        return MappingProxyType(self._resumed.published_ns)
+        return self._resumed.published_ns
 
     @property
     def _parts(self) -> list[Part]:
