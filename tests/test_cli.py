@@ -56,12 +56,12 @@ def run(*arguments: object, env: dict[str, str] | None = None, **options: Any) -
 @pytest.mark.parametrize("verb", uav_dc.VERBS)
 def test_both_forms_of_a_command_print_the_same_help(verb: str, tmp_path: Path) -> None:
     module = {"fly": "run_all"}.get(verb, verb)
-    told = [
+    outputs = [
         run("-m", f"uav_dc_ros.{name}", *given, "--help", cwd=tmp_path)
         for name, given in ((module, ()), ("uav_dc", (verb,)))
     ]
-    assert told[0] == told[1]
-    assert told[0][0] == 0
+    assert outputs[0] == outputs[1]
+    assert outputs[0][0] == 0
 
 
 def test_scenarios_are_listed_shown_and_checked(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def closing(*descriptors: int) -> Callable[[], None]:
     return close
 
 
-def test_streams_that_are_closed_are_nobody_else_s(tmp_path: Path) -> None:
+def test_streams_that_are_closed_are_not_reused(tmp_path: Path) -> None:
     """Otherwise the next file that is opened, such as a bag, gets what others print."""
     program = (
         "import os, sys\nfrom uav_dc_ros import cli\n"
@@ -160,7 +160,7 @@ def test_streams_that_are_closed_are_nobody_else_s(tmp_path: Path) -> None:
     assert (tmp_path / "x").read_bytes() == b""
 
 
-def test_a_working_directory_that_was_deleted_is_said(tmp_path: Path) -> None:
+def test_a_working_directory_that_was_deleted_is_reported(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
     program = (
@@ -194,5 +194,5 @@ def test_a_bag_may_have_any_name(tmp_path: Path, env: dict[str, str]) -> None:
     for verb in (("info", "--json", "info.json"), ("verify",), ("report", "--out", "page.html")):
         status, _, err = run("-m", "uav_dc_ros.bag", verb[0], name, *verb[1:], env=env, cwd=tmp_path)
         assert (status, err) == (0, ""), verb
-    told = json.loads((tmp_path / "info.json").read_bytes())["path"]
-    assert told == ("b\\udcc3\\udca4g\\udcff" if env else "bäg\\udcff")
+    path = json.loads((tmp_path / "info.json").read_bytes())["path"]
+    assert path == ("b\\udcc3\\udca4g\\udcff" if env else "bäg\\udcff")

@@ -1,4 +1,4 @@
-"""The JSON contract: what travels, what is refused, and that msgs_json/ tells the same."""
+"""The JSON contract: what travels, what is refused, and that msgs_json/ is the same."""
 
 import json
 import math
@@ -73,22 +73,22 @@ def test_a_payload_arrives_as_it_was_sent(topic: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "held"),
+    ("fields", "held"),
     [
-        ({"reason": "holds: no position for 0.5 s"}, True),  # as version 0.1 said it
+        ({"reason": "holds: no position for 0.5 s"}, True),  # as in version 0.1
         ({"reason": "goes on after: holds: no position for 0.5 s"}, False),
         ({}, False),
         ({"reason": "no position for 0.5 s", "held": True, "fault": "position"}, True),
         ({"reason": "no position for 0.5 s", "held": False, "fault": None}, False),
     ],
 )
-def test_held_is_a_field_and_in_an_old_payload_a_prefix(told: dict[str, Any], held: bool) -> None:
+def test_held_is_a_field_and_in_an_old_payload_a_prefix(fields: dict[str, Any], held: bool) -> None:
     payload = json.loads(messages.encode(EXAMPLES["mission"]))
     for name in ("reason", "held", "fault"):
         del payload[name]
-    mission = messages.decode(json.dumps(payload | told), Mission)
-    assert (mission.held, mission.fault) == (held, told.get("fault"))
-    assert mission.reason == told.get("reason", ""), "as it was recorded"
+    mission = messages.decode(json.dumps(payload | fields), Mission)
+    assert (mission.held, mission.fault) == (held, fields.get("fault"))
+    assert mission.reason == fields.get("reason", ""), "as it was recorded"
     assert mission.state == ("ready (held)" if held else "ready")
 
 

@@ -133,12 +133,12 @@ def test_epsilon_is_the_probability_of_the_greedy_action_of_each_run():
 def test_the_extreme_draws_stay_inside():
     made = Learner(members(), CPU)
     observation = torch.zeros((len(MIXED), 3))
-    least, greatest = torch.zeros(len(MIXED)), torch.full((len(MIXED),), 1.0 - 2.0**-24)
-    assert made.act(observation, greatest, greatest)[4] == 3
-    assert made.act(observation, greatest, least)[4] == 0
+    lowest, highest = torch.zeros(len(MIXED)), torch.full((len(MIXED),), 1.0 - 2.0**-24)
+    assert made.act(observation, highest, highest)[4] == 3
+    assert made.act(observation, highest, lowest)[4] == 0
     greedy = made.greedy(observation[:, None])[:, 0]
-    assert made.act(observation, greatest, least)[3] == greedy[3], "epsilon 1 is always greedy"
-    assert made.act(observation, least, greatest)[4] == 3, "epsilon 0 is never greedy"
+    assert made.act(observation, highest, lowest)[3] == greedy[3], "epsilon 1 is always greedy"
+    assert made.act(observation, lowest, highest)[4] == 3, "epsilon 0 is never greedy"
 
 
 KINDS = {

@@ -65,7 +65,7 @@ def test_it_is_what_the_paper_writes():
 
 
 def test_dueling_identities():
-    """Of Q = V + A - mean A the mean is V (eq. 30), of Q = V + A - max A the greatest is V (eq. 29)."""
+    """Of Q = V + A - mean A the mean is V (eq. 30), of Q = V + A - max A the maximum is V (eq. 29)."""
     seen = np.random.default_rng(9).normal(size=(20, 5))
     parameters = network.initial(architecture("mean"), np.random.default_rng(0))
     only_value = dict(parameters)

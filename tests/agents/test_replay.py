@@ -52,7 +52,7 @@ def test_it_holds_the_latest(n, held):
 def test_sampling_is_uniform_and_stays_inside():
     buffer = filled(8)
     draws = torch.rand((2, 80_000), generator=torch.Generator().manual_seed(1))
-    draws[:, 0], draws[:, 1] = 0.0, 1.0 - 2.0**-24  # the least and the greatest draw there is
+    draws[:, 0], draws[:, 1] = 0.0, 1.0 - 2.0**-24  # the minimum and maximum draw
     counts = torch.bincount(buffer.sample(draws).reward[0].to(torch.int64), minlength=8)
     # 10 000 expected in each of 8 slots; chi-squared with 7 degrees of freedom is below 24.3 in 999 of 1000.
     assert ((counts - 10_000.0) ** 2 / 10_000.0).sum() < 24.3

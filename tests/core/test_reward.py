@@ -38,7 +38,7 @@ def test_forms(array):
 
 
 def test_each_world_may_have_its_own_shape_and_form(array):
-    """As the word says it, world by world, and with the dtype of the numbers."""
+    """As with the names, world by world, and with the dtype of the numbers."""
     for dtype in (np.float32, np.float64):
         cells = array([0.0, 0.0, 2.0, 2.0, 0.5], dtype)
         exponential = array([True, False, True, False, False])
@@ -63,21 +63,21 @@ def test_immediate_rewards_sum_to_the_episode_reward(three, changed, array, r_pl
     first = rng.random((4, three.n_users, 2))
     states = {form: world.initial(scenario, array(first)) for form, scenario in scenarios.items()}
     so_far = np.zeros(4)
-    seen_fall = False
+    has_fallen = False
     for _ in range(three.mission.max_steps):
         draws = rng.random(first.shape)
         # Mostly towards the dock, so that data and R_plus both come in.
         actions = rng.choice(
             [Action.RIGHT, Action.FORWARD, Action.LEFT, Action.DOWNWARD], 4, p=[0.4, 0.4, 0.1, 0.1]
         )
-        paid = {}
+        rewards = {}
         for form, scenario in scenarios.items():
             states[form], outcome = world.step(scenario, states[form], array(actions), array(draws))
-            paid[form] = np.asarray(outcome.reward)
-        so_far = so_far + paid["immediate"]
-        seen_fall |= bool((paid["immediate"] < 0.0).any())
-        np.testing.assert_allclose(so_far, paid["episode"], rtol=1e-12, atol=1e-12)
-        np.testing.assert_array_equal(paid["episode"], states["episode"].total_reward)
+            rewards[form] = np.asarray(outcome.reward)
+        so_far = so_far + rewards["immediate"]
+        has_fallen |= bool((rewards["immediate"] < 0.0).any())
+        np.testing.assert_allclose(so_far, rewards["episode"], rtol=1e-12, atol=1e-12)
+        np.testing.assert_array_equal(rewards["episode"], states["episode"].total_reward)
         np.testing.assert_array_equal(states["immediate"].total_reward, states["episode"].total_reward)
     assert so_far.max() > 0.5
-    assert seen_fall, "a step away from the dock should have cost something"
+    assert has_fallen, "a step away from the dock should have cost something"

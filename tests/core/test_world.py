@@ -303,7 +303,7 @@ def test_shapes_and_types(three, array, batch, dtype):
 
 
 # Numbers that float32 holds exactly.
-PAID = [
+REWARD_SETTINGS = [
     {"beta": 1.0, "zeta": 4.0, "r_plus": "binary", "form": "immediate", "data_scale_bits": 6e6},
     {"beta": 2.5, "zeta": 0.0, "r_plus": "exponential", "form": "episode", "data_scale_bits": 1e6},
     {"beta": 0.0, "zeta": 0.5, "r_plus": "exponential", "form": "immediate", "data_scale_bits": 2e6},
@@ -311,18 +311,18 @@ PAID = [
 ]
 
 
-def paid(array, dtype, shape=(-1,)):
-    """`PAID` as the core takes it."""
+def reward_settings(array, dtype, shape=(-1,)):
+    """`REWARD_SETTINGS` as arrays of the core."""
 
     def column(name, kind):
-        return array(np.array([one[name] for one in PAID]).reshape(shape), kind)
+        return array(np.array([one[name] for one in REWARD_SETTINGS]).reshape(shape), kind)
 
     return Rewards(
         beta=column("beta", dtype),
         zeta=column("zeta", dtype),
         data_scale_bits=column("data_scale_bits", dtype),
-        r_plus=array(np.array([one["r_plus"] == "exponential" for one in PAID]).reshape(shape)),
-        form=array(np.array([one["form"] == "episode" for one in PAID]).reshape(shape)),
+        r_plus=array(np.array([one["r_plus"] == "exponential" for one in REWARD_SETTINGS]).reshape(shape)),
+        form=array(np.array([one["form"] == "episode" for one in REWARD_SETTINGS]).reshape(shape)),
     )
 
 
@@ -331,10 +331,10 @@ def paid(array, dtype, shape=(-1,)):
 def test_worlds_that_are_paid_in_different_ways_are_each_paid_as_alone(three, changed, array, batch, dtype):
     """Nothing but the pay differs; each is what a scenario with that reward gives, to the last bit."""
     draws, actions = flight(three, batch, seed=6)
-    rewards = paid(array, dtype, (4,) + (1,) * (len(batch) - 1))
+    rewards = reward_settings(array, dtype, (4,) + (1,) * (len(batch) - 1))
     together = world.initial(three, array(draws[0], dtype))
     alone = [world.initial(three, array(draws[0, i], dtype)) for i in range(4)]
-    scenarios = [changed(three, reward=own) for own in PAID]
+    scenarios = [changed(three, reward=own) for own in REWARD_SETTINGS]
     arrived = False
     for now, action in zip(draws[1:], actions, strict=True):
         together, outcome = world.step(three, together, array(action), array(now, dtype), rewards)
@@ -361,7 +361,7 @@ def test_everything_follows_the_device_of_the_draws(three, changed, device):
     draws = torch.rand((4, scenario.n_users, 2), device=device)
     actions = torch.zeros(4, dtype=torch.int64, device=device)
     state = world.initial(scenario, draws)
-    rewards = paid(
+    rewards = reward_settings(
         lambda values, dtype=None: torch.from_numpy(np.array(values, dtype)).to(device), np.float32
     )
     for how in (None, rewards):

@@ -15,7 +15,7 @@ from uav_dc_ros.env import registration
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import ScenarioError
 
-# Nothing that Gymnasium has to say about the environment may go unheard.
+# Every warning of Gymnasium about the environment is an error.
 pytestmark = pytest.mark.filterwarnings("error")
 
 
@@ -47,19 +47,19 @@ def test_it_is_the_core_with_the_draws_of_its_seed():
     env = DataCollectionEnv("three_clusters", "map")
     scenario = env.scenario
     rng, actions = np.random.default_rng(7), np.random.default_rng(8)
-    _, told = env.reset(seed=7)
+    _, info = env.reset(seed=7)
     state = world.initial(scenario, rng.random((scenario.n_users, 2)))
     for step in range(scenario.mission.max_steps):
         for key in ("cell", "users_m", "data_bits", "collected", "step"):
-            np.testing.assert_array_equal(told[key], getattr(state, key))
+            np.testing.assert_array_equal(info[key], getattr(state, key))
         action = actions.integers(7)
-        _, reward, terminated, truncated, told = env.step(action)
+        _, reward, terminated, truncated, info = env.step(action)
         state, outcome = world.step(scenario, state, action, rng.random((scenario.n_users, 2)))
         assert reward == outcome.reward
         assert (terminated, truncated) == (step + 1 == scenario.mission.max_steps, False)
         for key in ("served", "sinr", "rate_bps", "sum_rate_bps"):
-            np.testing.assert_array_equal(told[key], getattr(outcome.link, key))
-        assert told["landed"] == outcome.landed
+            np.testing.assert_array_equal(info[key], getattr(outcome.link, key))
+        assert info["landed"] == outcome.landed
 
 
 def test_one_seed_gives_one_mission_and_two_give_two():
@@ -77,9 +77,9 @@ def test_distance_to_the_dock_and_landing():
     env = DataCollectionEnv(tiny(mission={"max_steps": 4}))
     assert env.reset(seed=0)[1]["dock_distance_m"] == pytest.approx(200.0 * np.sqrt(2.0))
     for action, landed in ((1, False), (1, False), (2, False), (2, True)):
-        told = env.step(action)[4]
-        assert told["landed"] == landed
-    assert told["dock_distance_m"] == 0.0
+        info = env.step(action)[4]
+        assert info["landed"] == landed
+    assert info["dock_distance_m"] == 0.0
 
 
 @pytest.mark.parametrize("action", [-1, 7, 1.0, "left", None])
@@ -115,7 +115,7 @@ def test_observations_stay_within_their_space_for_a_centre_off_the_grid():
         "three_clusters", users={"cluster_centres_m": [[-100.0, 1100.0], [0.0, 0.0], [1100.0, 5.0]]}
     )
     env = DataCollectionEnv(scenario, "map")
-    seen, _ = env.reset(seed=0)
-    assert env.observation_space.contains(seen)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
     for action in [0, 3, 1, 1, 1, 2, 2, 2] * 5:
         assert env.observation_space.contains(env.step(action)[0])

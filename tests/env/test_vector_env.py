@@ -16,19 +16,19 @@ pytestmark = pytest.mark.filterwarnings("error")
 
 @pytest.mark.parametrize("end", ["at_time_limit", "on_arrival"])
 def test_it_equals_single_environments_to_the_last_bit(end):
-    """Also over the ends of missions: an environment that has ended starts afresh at the next step."""
+    """Also over the ends of missions: an environment that has ended restarts at the next step."""
     scenario = tiny(mission={"episode_end": end, "max_steps": 12})
     vector, singles = DataCollectionVectorEnv(5, scenario), [DataCollectionEnv(scenario) for _ in range(5)]
     results = [env.reset(seed=40 + i) for i, env in enumerate(singles)]
-    seen, told = vector.reset(seed=40)
+    observation, infos = vector.reset(seed=40)
     actions, over, ended = np.random.default_rng(0), np.zeros(5, bool), 0
     for _ in range(60):
         for i, result in enumerate(results):
-            np.testing.assert_array_equal(seen[i], result[0])
+            np.testing.assert_array_equal(observation[i], result[0])
             for key, value in result[-1].items():
-                np.testing.assert_array_equal(told[key][i], value, err_msg=key)
+                np.testing.assert_array_equal(infos[key][i], value, err_msg=key)
         action = actions.integers(0, 7, 5)
-        seen, reward, terminated, truncated, told = vector.step(action)
+        observation, reward, terminated, truncated, infos = vector.step(action)
         results = []
         for i, env in enumerate(singles):
             first, info = env.reset() if over[i] else (None, None)
@@ -43,8 +43,8 @@ def test_make_vec_finds_it():
     made = gymnasium.make_vec(ENV_ID, num_envs=3, scenario="three_clusters", observation="position")
     assert isinstance(made, DataCollectionVectorEnv)
     assert made.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    seen, _ = made.reset(seed=[1, 2, 1])
-    assert made.observation_space.contains(seen)
+    observation, _ = made.reset(seed=[1, 2, 1])
+    assert made.observation_space.contains(observation)
     np.testing.assert_array_equal(
         made.reset(seed=[1, None, 1])[1]["users_m"][0], made.reset(seed=1)[1]["users_m"][0]
     )

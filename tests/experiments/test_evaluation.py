@@ -41,15 +41,15 @@ def command(*arguments):
 
 
 def by_hand(env, act, seed):
-    """One mission in the Gymnasium environment: all that `info` told, and the rewards."""
-    seen, told = env.reset(seed=seed)
-    course, rewards = [told], []
+    """One mission in the Gymnasium environment: every `info`, and the rewards."""
+    observation, info = env.reset(seed=seed)
+    infos, rewards = [info], []
     while True:
-        seen, reward, terminated, truncated, told = env.step(act(seen))
-        course.append(told)
+        observation, reward, terminated, truncated, info = env.step(act(observation))
+        infos.append(info)
         rewards.append(reward)
         if terminated or truncated:
-            return course, rewards
+            return infos, rewards
 
 
 @pytest.mark.parametrize("end", ["at_time_limit", "on_arrival"])
@@ -61,16 +61,16 @@ def test_seed_s_is_the_mission_of_the_environment_with_seed_s(tmp_path, end):
     missions = roll_out(scenario, greedy_act(made, scenario), seeds)
     states = [state for state, _ in rollout_steps(scenario, greedy_act(made, scenario), seeds)]
     for i, seed in enumerate(seeds):
-        course, rewards = by_hand(DataCollectionEnv(scenario), made.act, seed)
-        for state, told in zip(states, course, strict=False):
+        infos, rewards = by_hand(DataCollectionEnv(scenario), made.act, seed)
+        for state, info in zip(states, infos, strict=False):
             for key in ("cell", "users_m", "data_bits", "collected"):
-                np.testing.assert_array_equal(getattr(state, key)[i], told[key])
-        assert missions.steps[i] == course[-1]["step"]
-        assert missions.users_collected[i] == course[-1]["collected"].sum()
-        assert missions.landed[i] == course[-1]["landed"]
-        assert missions.data_bits[i] == course[-1]["data_bits"].sum()
+                np.testing.assert_array_equal(getattr(state, key)[i], info[key])
+        assert missions.steps[i] == infos[-1]["step"]
+        assert missions.users_collected[i] == infos[-1]["collected"].sum()
+        assert missions.landed[i] == infos[-1]["landed"]
+        assert missions.data_bits[i] == infos[-1]["data_bits"].sum()
         assert missions.episode_return[i] == pytest.approx(sum(rewards), rel=1e-12)
-        rates = [told["sum_rate_bps"] for told in course[1:]]
+        rates = [info["sum_rate_bps"] for info in infos[1:]]
         assert missions.sum_rate_bps[i] == pytest.approx(np.mean(rates), rel=1e-12)
 
 
@@ -95,7 +95,7 @@ def test_on_arrival_a_mission_ends_there():
 
 
 def plan(*actions):
-    """Whoever flies the same course in every mission."""
+    """The same actions in every mission."""
     return lambda state: np.full(state.step.shape, actions[state.step[0]])
 
 
@@ -159,7 +159,7 @@ def test_every_policy_flies_in_every_scenario_and_is_compared_with_the_first(tmp
         assert f"{mean:.1f}" in out
 
 
-def test_policies_of_one_name_are_told_apart_by_their_folders(tmp_path, capsys):
+def test_policies_of_one_name_are_distinguished_by_their_folders(tmp_path, capsys):
     three = scenarios.load("three_clusters")
     folders = [str(saved(tmp_path / name, three, name="same")) for name in ("a", "b")]
     with pytest.raises(SystemExit):
@@ -219,7 +219,7 @@ def test_the_command_prints_and_writes_figures(tmp_path):
     ("arguments", "complaint"),
     [
         ([], "--policy"),
-        (["--policy", "nobody"], "'nobody'"),
+        (["--policy", "missing"], "'missing'"),
         (["--policy", "MADE", "--scenario", "nowhere"], "'nowhere'"),
         (["--policy", "MADE", "--scenario", "five_clusters"], "expected 3"),
         (["--policy", "MADE", "--seeds", "0"], "'0'; expected a whole number of at least 1"),

@@ -144,8 +144,8 @@ class Learner:
             return advantage
         subtracted = advantage.mean(1, keepdim=True)
         if self._any_max:
-            greatest = advantage.amax(1, keepdim=True)
-            subtracted = torch.where(self._subtracts_max[..., None], greatest, subtracted)
+            maximum = advantage.amax(1, keepdim=True)
+            subtracted = torch.where(self._subtracts_max[..., None], maximum, subtracted)
         return torch.addcmul(advantage, self._dueling[..., None], value - subtracted)
 
     def _backward(self, features: list[Tensor], head: Tensor, action: Tensor, d_q: Tensor) -> None:
@@ -160,8 +160,8 @@ class Learner:
             d_mean = d_value.masked_fill(to_max, 0.0) if self._any_max else d_value
             d_advantage.copy_(d_mean / -n_actions)
             if self._any_max:
-                greatest = head[:, 1:].argmax(1, keepdim=True)
-                d_advantage.scatter_add_(1, greatest, d_value.masked_fill(~to_max, 0.0).neg_())
+                argmax = head[:, 1:].argmax(1, keepdim=True)
+                d_advantage.scatter_add_(1, argmax, d_value.masked_fill(~to_max, 0.0).neg_())
         d_advantage.scatter_add_(1, action, d_q[:, None])
 
         torch.bmm(d_head, features[-1], out=gradient["head.weight"])

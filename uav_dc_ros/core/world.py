@@ -176,13 +176,8 @@ def step(
 
 def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
     """The observation of a state, float32 `[..., D]`; see `observations.encode`."""
-    seen = {
-        "cell": state.cell,
-        "step": state.step,
-        "data_bits": state.data_bits,
-        "collected": state.collected,
-    }
-    return observations.encode(kind, scenario, **seen)
+    cell, step, data_bits, collected = state.cell, state.step, state.data_bits, state.collected
+    return observations.encode(kind, scenario, cell=cell, step=step, data_bits=data_bits, collected=collected)
 
 
 def select(where: Array, chosen: State, other: State) -> State:
