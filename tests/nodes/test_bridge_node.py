@@ -38,18 +38,12 @@ FLIES = Telemetry(
 class Stub:
     """A vehicle without a link."""
 
-    kind = "ArduCopter"
-
     def __init__(self) -> None:
         self.known, self.datum = FLIES, None
         self.asked: list[Command] = []
         self.setpoints: list[Enu | None] = []
         self.opened = self.closed = 0
         self.broken = ""
-
-    @property
-    def grid_origin(self) -> str:
-        return str(self.datum or "")
 
     def open(self) -> None:
         self.opened += 1
@@ -60,7 +54,8 @@ class Stub:
         if self.broken == "telemetry":
             raise VehicleError("the link is gone for good")
         now_s = time.monotonic()
-        return replace(self.known, heartbeat_s=now_s, position_s=now_s)
+        grid = {"datum": self.datum, "grid_origin": str(self.datum or "")}
+        return replace(self.known, heartbeat_s=now_s, position_s=now_s, **grid)  # type: ignore[arg-type]
 
     def set_setpoint(self, setpoint: Enu | None) -> None:
         self.setpoints.append(setpoint)
@@ -249,6 +244,7 @@ def test_a_bridge_that_was_killed_before_it_knew_where_the_grid_lies_goes_by_the
         node.trigger_deactivate()
         node.trigger_activate()
         made.vehicle.datum = DATUM  # by the next time, it has taken off
+        made.until(lambda: node._telemetry.datum == DATUM)
         node._on_change()
     assert given == [(DATUM, ""), (DATUM, ""), (None, str(DATUM))]
     assert restarted == [False, True, True], "the graph still tells of the one that was killed"

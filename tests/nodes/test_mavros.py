@@ -58,8 +58,8 @@ def test_px4_flies_a_mission_that_a_pilot_starts_and_lands(ros: Ros) -> None:
         flight = Flight(executor, vehicle, mavros, SafetySettings())
         bridge = flight.bridge
         flight.until(lambda: bridge.phase is Phase.PREFLIGHT)
-        assert vehicle.kind == "PX4"
-        assert vehicle.grid_origin == "27.0,-11.0,-3.0"
+        assert vehicle.telemetry().autopilot == "PX4"
+        assert vehicle.telemetry().grid_origin == "27.0,-11.0,-3.0"
         mavros.do("param COM_OF_LOSS_T 100")  # on a busy machine the stream has gaps, at five times its speed
         mavros.do("arm")
         flight.until(lambda: bridge.reason == "a pilot flies: mode POSCTL")
@@ -94,13 +94,13 @@ def test_ardupilot_is_taken_off_by_a_pilot_resumed_after_a_restart_and_taken_ove
         mavros.do("takeoff 10")
         flight.until(lambda: flight.bridge.phase is Phase.MOVING)
         assert flight.bridge.step == 0
-        standing, grid_origin = flight.bridge.checkpoint, vehicle.grid_origin
+        standing, grid_origin = flight.bridge.checkpoint, vehicle.telemetry().grid_origin
         vehicle.close()
 
         with mavros_of(node, grid_origin=grid_origin) as after:
             resumed = Flight(executor, after, mavros, SafetySettings(), checkpoint=standing)
             resumed.until(lambda: resumed.bridge.phase is Phase.MOVING)
-            assert after.grid_origin == grid_origin
+            assert after.telemetry().grid_origin == grid_origin
             assert Phase.PREFLIGHT not in [phase for phase, _, _ in resumed.log]
             assert (flight.executed, resumed.executed) == ([0], [1]), "no step twice, none left out"
             assert (flight.cells, resumed.cells) == ([(2, 0, 0)], [(2, 1, 0)])
@@ -206,7 +206,7 @@ def test_names_can_be_remapped_and_others_who_fly_the_same_are_told(ros: Ros) ->
         until(executor, vehicle, lambda known: known.other_controller is None)
         vehicle.set_setpoint(START)
         mavros.wait_for("setpoint")
-        restarted = stack.enter_context(mavros_of(node, grid_origin=vehicle.grid_origin))
+        restarted = stack.enter_context(mavros_of(node, grid_origin=vehicle.telemetry().grid_origin))
         known = until(executor, restarted, lambda known: known.missing is None)
         assert known.other_controller is None, "its predecessor is still in the graph"
         assert node.count_publishers("/uav2/goal") == 2

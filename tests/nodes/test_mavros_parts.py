@@ -23,7 +23,17 @@ from uav_dc_ros.nodes.vehicles.mavros_commands import RETRY_S, MavrosCommands
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.offboard.mavros.diagnostics import OTHERS_S
-from uav_dc_ros.offboard.mavros.telemetry import STAMP_TIMEOUT_S, MavrosTelemetry, VehicleTime
+from uav_dc_ros.offboard.mavros.telemetry import (
+    ESTIMATOR_STATUS,
+    EXTENDED_STATE,
+    HOME,
+    STAMP_TIMEOUT_S,
+    STATE,
+    SYS_STATUS,
+    TARGET,
+    MavrosTelemetry,
+    VehicleTime,
+)
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
 from uav_dc_ros.offboard.rejections import Rejections
 from uav_dc_ros.offboard.setpoint_stream import STREAM_TIMEOUT_S, SetpointStream
@@ -311,7 +321,7 @@ class Service:
 
 
 PACKAGE = mavros_commands.MavrosMsgs(
-    msg=SimpleNamespace(**dict.fromkeys(mavros_commands.MESSAGES, Message)),
+    msg=SimpleNamespace(**dict.fromkeys(mavros_commands.MESSAGES.values(), Message)),
     srv=SimpleNamespace(**dict.fromkeys(mavros_commands.SERVICES.values(), Service)),
 )
 FLAGS = [
@@ -330,9 +340,9 @@ def estimator(**wrong: bool) -> Message:
 def full(kind: str) -> MavrosTelemetry:
     """A vehicle on the ground, with all that mavros_msgs tells."""
     telemetry = met(kind, has_msgs=True)
-    telemetry.on_state(Message(connected=True, armed=False, mode="STABILIZE", system_status=3), 1.0)
-    telemetry.on_extended_state(Message(landed_state=1, vtol_state=0), 1.0)
-    telemetry.on_sys_status(Message(sensors_enabled=HEALTHY, sensors_health=HEALTHY), 1.0)
+    telemetry.update(STATE, Message(connected=True, armed=False, mode="STABILIZE", system_status=3), 1.0)
+    telemetry.update(EXTENDED_STATE, Message(landed_state=1, vtol_state=0), 1.0)
+    telemetry.update(SYS_STATUS, Message(sensors_enabled=HEALTHY, sensors_health=HEALTHY), 1.0)
     return telemetry
 
 
@@ -342,7 +352,7 @@ def test_with_mavros_msgs_all_is_waited_for_and_named() -> None:
     assert missing.startswith("nothing received of mavros/state, mavros/extended_state, mavros/sys_status, ")
     telemetry = full("PX4 Autopilot")
     assert telemetry.snapshot(1.0).missing == "nothing received of mavros/estimator_status"
-    telemetry.on_estimator_status(estimator(), 1.0)
+    telemetry.update(ESTIMATOR_STATUS, estimator(), 1.0)
     telemetry.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.1)
     assert telemetry.snapshot(1.1).missing is None
     arducopter = full("ArduPilot")
@@ -355,15 +365,15 @@ def test_with_mavros_msgs_home_and_target_are_told_in_the_grid_s_frame() -> None
     assert (telemetry.snapshot(1.0).home, telemetry.snapshot(1.0).target) == (None, None)
     point = Message(x=5.0, y=16.0, z=7.0)
     telemetry.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.1, tilt_rad(0.5, 0.5, 0.5, 0.5))
-    telemetry.on_home(Message(position=point), 1.05)
-    telemetry.on_target(Message(position=point, type_mask=0xDF8), 1.05)
+    telemetry.update(HOME, Message(position=point), 1.05)
+    telemetry.update(TARGET, Message(position=point, type_mask=0xDF8), 1.05)
     known = telemetry.snapshot(1.1)
     there = (PLACE.east_m, PLACE.north_m + 10.0, PLACE.up_m)
     assert (known.home, known.target) == (pytest.approx(there), pytest.approx(there))
     assert known.target_s == 1.05
     assert known.tilt_rad == pytest.approx(math.pi / 2)
     assert known.system == "mavros (uas:///uas1)"
-    telemetry.on_target(Message(position=point, type_mask=0xDFF), 1.1)
+    telemetry.update(TARGET, Message(position=point, type_mask=0xDFF), 1.1)
     assert telemetry.snapshot(1.1).target is None, "it follows a velocity"
 
 
@@ -376,14 +386,14 @@ def test_with_mavros_msgs_state_and_ground_are_what_it_says() -> None:
         (2, False, True),
         (3, False, False),
     ]:
-        telemetry.on_state(Message(connected=True, armed=True, mode="GUIDED", system_status=4), 2.0)
-        telemetry.on_extended_state(Message(landed_state=landed_state), 2.0)
+        telemetry.update(STATE, Message(connected=True, armed=True, mode="GUIDED", system_status=4), 2.0)
+        telemetry.update(EXTENDED_STATE, Message(landed_state=landed_state), 2.0)
         known = telemetry.snapshot(2.0)
         assert (known.on_ground, telemetry.accepts_setpoints) == (on_ground, steered), (
             "a take-off is not interrupted"
         )
         assert (known.mode, known.armed, known.heartbeat_s) == (Mode.COMMANDED, True, 2.0)
-    telemetry.on_state(Message(connected=False, armed=False, mode="", system_status=0), 12.0)
+    telemetry.update(STATE, Message(connected=False, armed=False, mode="", system_status=0), 12.0)
     known = telemetry.snapshot(12.0)
     assert (known.armed, known.mode_name, known.heartbeat_s) == (True, "GUIDED", 2.0), (
         "it is lost, not landed"
@@ -396,10 +406,10 @@ def test_with_mavros_msgs_state_and_ground_are_what_it_says() -> None:
 )
 def test_with_mavros_msgs_the_estimators_flags_count(wrong: dict[str, bool]) -> None:
     telemetry = full("PX4 Autopilot")
-    telemetry.on_estimator_status(estimator(), 1.0)
+    telemetry.update(ESTIMATOR_STATUS, estimator(), 1.0)
     assert telemetry.snapshot(1.0).estimate_ok
     assert not telemetry.snapshot(9.0).estimate_ok, "nothing new for a while"
-    telemetry.on_estimator_status(estimator(**wrong), 1.0)
+    telemetry.update(ESTIMATOR_STATUS, estimator(**wrong), 1.0)
     assert not telemetry.snapshot(1.0).estimate_ok
 
 
@@ -412,12 +422,14 @@ def test_with_mavros_msgs_an_estimate_that_a_cut_link_leaves_old_is_not_lost(kin
 
     def report(now_s: float) -> None:
         if kind == "PX4 Autopilot":
-            telemetry.on_estimator_status(estimator(attitude=False), now_s)
+            telemetry.update(ESTIMATOR_STATUS, estimator(attitude=False), now_s)
         else:
-            telemetry.on_sys_status(sys_status, now_s)
+            telemetry.update(SYS_STATUS, sys_status, now_s)
 
     def is_lost(now_s: float, heartbeat_s: float) -> bool:
-        telemetry.on_state(Message(connected=True, armed=True, mode="GUIDED", system_status=4), heartbeat_s)
+        telemetry.update(
+            STATE, Message(connected=True, armed=True, mode="GUIDED", system_status=4), heartbeat_s
+        )
         return detector.estimate_lost(now_s, detector.update(now_s, telemetry.snapshot(now_s)))
 
     telemetry.on_pose(Enu(5.0, 6.0, 7.0), 0.5, 101.0, 1.0)

@@ -206,7 +206,7 @@ def standing(msg: Any, ned: Ned = START, **more: Any) -> Px4Telemetry:
     """What is known of a vehicle that stands on the ground and told where."""
     telemetry = Px4Telemetry(start=more.pop("start", PLACE), **more)
     telemetry.on_vehicle_status(status(msg), 0.0)
-    telemetry.on_vehicle_land_detected(msg.VehicleLandDetected(landed=True), 0.0)
+    telemetry.update("vehicle_land_detected", msg.VehicleLandDetected(landed=True), 0.0)
     telemetry.on_vehicle_local_position(position(msg, ned), 0.0)
     return telemetry
 
@@ -309,29 +309,29 @@ def test_a_setpoint_goes_out_in_ned(vehicle: px4.Px4Vehicle, spun: Spun, hand: H
 
 def test_the_grid_has_a_datum_once_px4_knows_the_earth(msg: Any) -> None:
     telemetry = standing(msg)
-    assert telemetry.grid_origin == "local:2.0,-3.0,0.5"
+    assert telemetry.snapshot().grid_origin == "local:2.0,-3.0,0.5"
     telemetry.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
-    datum = Geodetic.parse(telemetry.grid_origin)
+    datum = Geodetic.parse(telemetry.snapshot().grid_origin)
     # PX4 counts from a point 3 m south and 2 m east of where the vehicle stands, half a metre above it.
     assert ZURICH.enu_from(datum) == pytest.approx((2.0, -3.0, 0.5), abs=1e-5)
     known = telemetry.snapshot().position
     assert known == pytest.approx(PLACE, abs=1e-5)
     # PX4 moves its origin 40 m to the east in flight: the same place has other numbers from then on.
     moved = ZURICH.at(Enu(40.0, 0.0, 0.0))
-    telemetry.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
+    telemetry.update("vehicle_land_detected", msg.VehicleLandDetected(landed=False), 2.0)
     telemetry.on_vehicle_local_position(position(msg, Ned(3.0, -42.0, 0.5), moved), 2.0)
     assert telemetry.snapshot().position == pytest.approx(PLACE, abs=1e-3)
-    assert telemetry.grid_origin == str(datum)
+    assert telemetry.snapshot().grid_origin == str(datum)
 
 
 @pytest.mark.parametrize("reference", [None, ZURICH], ids=["local", "global"])
 def test_a_bridge_that_comes_back_in_the_air_has_the_same_grid(msg: Any, reference: Geodetic | None) -> None:
     telemetry = standing(msg, start=Enu(100.0, 0.0, 0.0))
     telemetry.on_vehicle_local_position(position(msg, START, reference), 1.0)
-    again = Px4Telemetry(start=Enu(100.0, 0.0, 0.0), grid_origin=telemetry.grid_origin)
+    again = Px4Telemetry(start=Enu(100.0, 0.0, 0.0), grid_origin=telemetry.snapshot().grid_origin)
     for each in (telemetry, again):
         each.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 2.0)
-        each.on_vehicle_land_detected(msg.VehicleLandDetected(landed=False), 2.0)
+        each.update("vehicle_land_detected", msg.VehicleLandDetected(landed=False), 2.0)
         each.on_vehicle_local_position(position(msg, Ned(50.0, 60.0, -70.0), reference), 2.0)
     assert again.snapshot().missing is None
     assert again.snapshot().position == pytest.approx((162.0, 47.0, 70.5), abs=0.01)
@@ -454,7 +454,7 @@ def test_no_setpoint_no_stream(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) 
 
 
 def test_another_bridge_is_seen(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand, msg: Any) -> None:
-    spun.until(lambda: vehicle.kind == "PX4", hand.say)
+    spun.until(lambda: vehicle.telemetry().autopilot == "PX4", hand.say)
     assert vehicle.telemetry().other_controller is None
     topic = f"{spun.namespace}/fmu/in/trajectory_setpoint"
     other = spun.node("other").create_publisher(msg.TrajectorySetpoint, topic, 1)
@@ -501,7 +501,7 @@ def test_a_vehicle_whose_time_is_faster_gets_more_of_it(
 def test_wishes_as_commands(vehicle: px4.Px4Vehicle, spun: Spun, hand: Hand) -> None:
     for command in (Arm(), SetMode(Mode.LAND)):
         vehicle.send_command(command)  # nobody is there yet: to be forgotten, not kept
-    spun.until(lambda: vehicle.kind == "PX4", hand.say)
+    spun.until(lambda: vehicle.telemetry().autopilot == "PX4", hand.say)
     assert hand.commands == []
     commands = [SetMode(mode) for mode in (Mode.COMMANDED, Mode.HOLD, Mode.RETURN, Mode.LAND)]
     for command in [*commands, TakeOff(50.0), Arm()]:
@@ -534,7 +534,7 @@ def test_a_refusal_is_told_until_it_is_granted(msg: Any) -> None:
     assert answer(5) is None, "it is being done"
     assert answer(1, command=511) is None, "never asked"
     assert answer(1) == "arming refused: temporarily rejected"
-    telemetry.on_failsafe_flags(msg.FailsafeFlags(home_position_invalid=True), 1.0)
+    telemetry.update("failsafe_flags", msg.FailsafeFlags(home_position_invalid=True), 1.0)
     telemetry.on_vehicle_status(status(msg, pre_flight_checks_pass=False), 1.0)
     why = "(home position invalid, its preflight checks fail)"
     assert answer(77, 176) == f"the change of mode refused: result 77 {why}"
@@ -656,7 +656,7 @@ def test_in_the_air_without_a_datum_nobody_knows_where_the_grid_is(msg: Any) -> 
         telemetry = Px4Telemetry(start=PLACE)
         telemetry.on_vehicle_status(status(msg, arming_state=2, nav_state=14), 0.0)
         if landed is not None:
-            telemetry.on_vehicle_land_detected(msg.VehicleLandDetected(landed=landed), 0.0)
+            telemetry.update("vehicle_land_detected", msg.VehicleLandDetected(landed=landed), 0.0)
         telemetry.on_vehicle_local_position(position(msg, START), 0.0)
         assert "expected a datum" in str(telemetry.snapshot().missing)
     telemetry = Px4Telemetry(start=PLACE)
@@ -854,7 +854,8 @@ def test_without_a_position_it_holds_until_px4_gives_up(
 def test_a_bridge_that_is_started_again_in_the_air_goes_on(flight: Flight) -> None:
     flight.until(lambda: flight.bridge.step == 2)
     flight.do("speed 0.2")  # PX4 waits a second of its time, and no more
-    standing, grid_origin, place = flight.bridge.checkpoint, flight.vehicle.grid_origin, Enu(7.0, 7.0, 7.0)
+    standing, place = flight.bridge.checkpoint, Enu(7.0, 7.0, 7.0)
+    grid_origin = flight.vehicle.telemetry().grid_origin
     flight.vehicle.close()
     flight.bridge = MissionController(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
     flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], start=place, grid_origin=grid_origin)

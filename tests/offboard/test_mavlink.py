@@ -168,9 +168,9 @@ def test_without_a_datum_the_grid_lies_where_the_vehicle_stands_and_that_is_told
         known = until(vehicle, lambda known: known.missing is None)
         # Not exactly: the plane at the grid's corner is no longer level half a kilometre away (0.02 m).
         assert known.position == pytest.approx(place, abs=0.05)
-        assert vehicle.grid_origin
-        assert HOME.enu_from(Geodetic.parse(vehicle.grid_origin)) == pytest.approx(place, abs=0.05)
-        assert vehicle.kind == "PX4"
+        assert known.grid_origin
+        assert HOME.enu_from(Geodetic.parse(known.grid_origin)) == pytest.approx(place, abs=0.05)
+        assert known.autopilot == "PX4"
 
 
 def test_the_stream_ends_with_those_who_decide() -> None:

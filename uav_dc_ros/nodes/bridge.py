@@ -85,7 +85,7 @@ class AutopilotBridge(MissionNode):
         self._peers_found = False
         self._started = checkpoint is not None and checkpoint.airborne
         self._journal_failed = False
-        self._telemetry = Telemetry(system_id=system)
+        self._telemetry = Telemetry(system_id=system, grid_origin=grid_origin)
         self._status: messages.Mission | None = None  # published last
         self._changes: list[str] = []  # since the last diagnostics
         self._n_changes = 0
@@ -224,7 +224,7 @@ class AutopilotBridge(MissionNode):
 
     def _log_grid(self) -> None:
         """Log the grid's position once it is known, and its distance from that of the last flight."""
-        datum, grid_origin = self.vehicle.datum, self.vehicle.grid_origin
+        datum, grid_origin = self._telemetry.datum, self._telemetry.grid_origin
         grid = grid_origin if datum is None else str(datum)
         if grid == self._grid:
             return
@@ -237,7 +237,7 @@ class AutopilotBridge(MissionNode):
 
     def _save_datum(self) -> None:
         """Save the datum at take-off, for the next flight."""
-        datum = self.vehicle.datum
+        datum = self._telemetry.datum
         if self._datum_saved or self.bridge.phase is not Phase.TAKEOFF or datum is None:
             return
         self._datum_saved = True
@@ -253,7 +253,7 @@ class AutopilotBridge(MissionNode):
             seed=self.values["seed"],
             run=self.run,
             checkpoint=self.bridge.checkpoint,
-            grid_origin=self.vehicle.grid_origin,
+            grid_origin=self._telemetry.grid_origin,
             system=self._telemetry.system_id,
         )
         try:
@@ -302,7 +302,7 @@ class AutopilotBridge(MissionNode):
             "phase": bridge.phase.value,
             "reason": bridge.reason,
             "step": str(bridge.step),
-            "autopilot": self.vehicle.kind or "not known yet",
+            "autopilot": telemetry.autopilot or "not known yet",
             "mode": telemetry.mode_name,
             "armed": str(telemetry.armed).lower(),
             "estimate": "good" if telemetry.estimate_ok else "not good",

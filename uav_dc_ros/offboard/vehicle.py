@@ -64,6 +64,9 @@ class Telemetry:
     system_id: int | None = None  # its number there, for a transport that is opened again
     is_selected: bool = True  # False: several vehicles are on the link, and none is named
     discarded: Mapping[str, int] = field(default_factory=dict)  # ignored messages by reason
+    autopilot: str = ""  # its name
+    datum: Geodetic | None = None  # position of the grid's corner on the Earth
+    grid_origin: str = ""  # position of the grid, for a transport that is opened again in the air
 
     @property
     def mode_text(self) -> str:
@@ -107,18 +110,6 @@ class Vehicle(Protocol):
 
     def open(self) -> None:
         """Start to receive."""
-
-    @property
-    def kind(self) -> str:
-        """Name of the autopilot; empty until it is known."""
-
-    @property
-    def grid_origin(self) -> str:
-        """Position of the grid, for a transport that is opened again in the air; empty until it is known."""
-
-    @property
-    def datum(self) -> Geodetic | None:
-        """Position of the grid's corner on the Earth; None: not known."""
 
     def telemetry(self) -> Telemetry:
         """Current state of the vehicle; times as of `time.monotonic`.

@@ -12,6 +12,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -31,24 +32,13 @@ from uav_dc_ros.nodes.ros.convert import position_m, stamp_ns
 from uav_dc_ros.nodes.vehicles import mavros_commands
 from uav_dc_ros.nodes.vehicles.graph_checks import PeriodicCheck, other_publishers
 from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
-from uav_dc_ros.offboard.mavros.telemetry import (
-    ESTIMATOR_STATUS,
-    EXTENDED_STATE,
-    FIX,
-    HOME,
-    POSE,
-    STALE_S,
-    STATE,
-    SYS_STATUS,
-    TARGET,
-    MavrosTelemetry,
-)
+from uav_dc_ros.offboard.mavros.telemetry import FIX, MESSAGES, POSE, STALE_S, TARGET, MavrosTelemetry
 from uav_dc_ros.offboard.setpoint_stream import SetpointStream
 from uav_dc_ros.offboard.vehicle import Command, Mode, Telemetry
 
 SETPOINT = "mavros/setpoint_position/local"
 DIAGNOSTICS = "/diagnostics"  # absolute, as diagnostic_updater publishes it
-BATTERY, STATUSTEXT = "mavros/battery", "mavros/statustext/recv"
+BATTERY = "mavros/battery"
 
 # A best-effort subscription matches both kinds of publishers (MAVROS's sensor data are best effort), and a
 # reliable publisher both kinds of subscriptions. Nothing latched: an old state is no sign of life.
@@ -113,14 +103,9 @@ class MavrosVehicle:
         self._subscribe(BatteryState, BATTERY, self._on_battery)
         self._subscribe(NavSatFix, FIX, self._on_fix, NEWEST)
         if self._package is not None:
-            msg = self._package.msg
-            self._subscribe(msg.State, STATE, telemetry.on_state)
-            self._subscribe(msg.ExtendedState, EXTENDED_STATE, telemetry.on_extended_state)
-            self._subscribe(msg.SysStatus, SYS_STATUS, telemetry.on_sys_status)
-            self._subscribe(msg.EstimatorStatus, ESTIMATOR_STATUS, telemetry.on_estimator_status)
-            self._subscribe(msg.HomePosition, HOME, telemetry.on_home)
-            self._subscribe(msg.PositionTarget, TARGET, telemetry.on_target, NEWEST)
-            self._subscribe(msg.StatusText, STATUSTEXT, telemetry.on_status_text)
+            for topic, name in MESSAGES.items():
+                kind, handler = getattr(self._package.msg, name), partial(telemetry.update, topic)
+                self._subscribe(kind, topic, handler, NEWEST if topic == TARGET else SEVERAL)
         self._stream.start()
 
     def close(self) -> None:
@@ -133,22 +118,6 @@ class MavrosVehicle:
             self._node.destroy_subscription(subscription)
         self._commands.close()
         self._node.destroy_publisher(self._publisher)
-
-    @property
-    def kind(self) -> str:
-        """Name of the autopilot; empty until it is known."""
-        return self._telemetry.flight_stack.name if self._telemetry.flight_stack else ""
-
-    @property
-    def datum(self) -> Geodetic | None:
-        """Position of the grid's corner on the Earth, of altitude 0 unless given; None: not known."""
-        return self._telemetry.corner
-
-    @property
-    def grid_origin(self) -> str:
-        """Origin of MAVROS's frame in the grid's: EAST,NORTH,UP, metres; empty until it is known."""
-        origin = self._telemetry.origin
-        return "" if origin is None else origin.to_text()
 
     def telemetry(self) -> Telemetry:
         """The vehicle's state now, times as of `time.monotonic`."""

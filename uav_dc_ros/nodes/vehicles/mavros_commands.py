@@ -8,15 +8,11 @@ from rclpy.node import Node
 
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.flight_stacks import FlightStack
-from uav_dc_ros.offboard.mavros.telemetry import ESTIMATOR_STATUS, EXTENDED_STATE, POSE
+from uav_dc_ros.offboard.mavros.telemetry import ESTIMATOR_STATUS, EXTENDED_STATE, MESSAGES, POSE
 from uav_dc_ros.offboard.rejections import Rejections
 from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, TakeOff
 
 PACKAGE = "mavros_msgs"
-MESSAGES = (
-    *("State", "ExtendedState", "SysStatus", "EstimatorStatus", "StatusText", "HomePosition"),
-    "PositionTarget",
-)
 SET_MODE, ARM, TAKE_OFF = "mavros/set_mode", "mavros/cmd/arming", "mavros/cmd/takeoff"
 SET_INTERVAL = "mavros/set_message_interval"
 SERVICES = {
@@ -54,7 +50,7 @@ def load_messages(*, needed_for: str = "") -> MavrosMsgs | None:
                 "sudo apt install ros-jazzy-mavros-msgs"
             ) from None
         return None
-    lacking = [name for name in MESSAGES if not hasattr(package.msg, name)]
+    lacking = [name for name in MESSAGES.values() if not hasattr(package.msg, name)]
     lacking += [name for name in SERVICES.values() if not hasattr(package.srv, name)]
     if lacking:
         raise VehicleError(

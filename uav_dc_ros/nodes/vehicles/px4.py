@@ -123,24 +123,6 @@ class Px4Vehicle:
         while self._publishers:
             self._node.destroy_publisher(self._publishers.popitem()[1])
 
-    @property
-    def kind(self) -> str:
-        """Name of the autopilot; empty until it is known."""
-        with self._lock:
-            return flight_stacks.PX4.name if self._telemetry.status is not None else ""
-
-    @property
-    def datum(self) -> Geodetic | None:
-        """Position of the grid's corner on the Earth; None: not known."""
-        with self._lock:
-            return self._telemetry.datum
-
-    @property
-    def grid_origin(self) -> str:
-        """The grid's datum, or else PX4's origin in the grid; empty until it is known."""
-        with self._lock:
-            return self._telemetry.grid_origin
-
     def telemetry(self) -> Telemetry:
         """The vehicle's state now, times as of `time.monotonic`."""
         other_controller = self._other_publishers()

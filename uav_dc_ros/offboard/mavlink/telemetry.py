@@ -62,7 +62,6 @@ class MavlinkTelemetry:
     Attributes:
         datum, frame: of the grid, and of the vehicle's local position in it; None until known.
         position: of the vehicle, in the grid's ENU frame.
-        landed_state: MAV_LANDED_STATE.
         received_s: when a message of each name was received last, steady clock, seconds.
     """
 
@@ -79,26 +78,18 @@ class MavlinkTelemetry:
         self._custom_mode, self._armed = 0, False
         self._left_s: dict[tuple[int, bool], float] = {}  # when the vehicle last left a state
         self._returned_s: float | None = None  # last heartbeat, if it reports a state left a moment ago
-        self._health = 0
-        self._battery: float | None = None
-        self._battery_v: float | None = None
-        self._battery_fails = False
+        self._messages: dict[str, Any] = {}  # the last one of each name
         self._chunks: dict[int, str] = {}
         self._reset()
 
     def _reset(self) -> None:
         """Drop what a vehicle reported before it was started anew."""
-        heartbeats = "HEARTBEAT" in self.received_s
-        self.received_s = {"HEARTBEAT": self.received_s["HEARTBEAT"]} if heartbeats else {}
+        self.received_s = {name: at_s for name, at_s in self.received_s.items() if name == "HEARTBEAT"}
+        self._messages = {name: last for name, last in self._messages.items() if name == "SYS_STATUS"}
         self.position: Enu | None = None
         self._position_s: float | None = None
         self._ned: Ned | None = None
         self._origin: Geodetic | None = None
-        self._home: Geodetic | None = None
-        self._target: Ned | None = None
-        self._tilt_rad: float | None = None
-        self.landed_state: int | None = None
-        self._flags = 0
         self.parameters = limits.ParameterReader()
         self._limits: Limits | None = None
 
@@ -116,6 +107,12 @@ class MavlinkTelemetry:
     def vehicle_s(self) -> float:
         """The vehicle's own time, seconds; monotonic across its restarts."""
         return self._clock.vehicle_s
+
+    @property
+    def landed_state(self) -> int | None:
+        """MAV_LANDED_STATE; None: not reported."""
+        message = self._messages.get("EXTENDED_SYS_STATE")
+        return message.landed_state if message is not None else None
 
     def is_mode_uncertain(self, now_s: float) -> bool:
         """Whether the last heartbeat reports a state left a moment ago: a late message, or a pilot."""
@@ -136,7 +133,7 @@ class MavlinkTelemetry:
             return False
         if name == "HEARTBEAT" and known:
             self.systems.on_heartbeat(message, now_s)
-        self.received_s[name] = now_s
+        self.received_s[name], self._messages[name] = now_s, message
         if (handler := getattr(self, f"_on_{name.lower()}", None)) is not None:
             handler(message, now_s)
         return True
@@ -156,35 +153,43 @@ class MavlinkTelemetry:
 
     def snapshot(self, now_s: float) -> Telemetry:
         """The vehicle's state at a steady time."""
-        stack, received_s = self.flight_stack, self.received_s
-        target = self._target if self._is_fresh("POSITION_TARGET_LOCAL_NED", now_s) else None
+        stack, received_s, landed_state = self.flight_stack, self.received_s, self.landed_state
+        target = _target(self._fresh("POSITION_TARGET_LOCAL_NED", now_s))
+        attitude, status = self._fresh("ATTITUDE", now_s), self._messages.get("SYS_STATUS")
+        home = self._messages.get("HOME_POSITION")
+        charge, volts, fails = _battery(status) if status is not None else (None, None, False)
         return Telemetry(
             heartbeat_s=received_s.get("HEARTBEAT"),
             mode=stack.mode(self._custom_mode) if stack else Mode.OTHER,
             mode_name=stack.mode_name(self._custom_mode) if stack else "",
             armed=self._armed,
-            on_ground=self.landed_state == ON_GROUND if self.landed_state else None,
+            on_ground=landed_state == ON_GROUND if landed_state else None,
             position=self.position,
             position_s=self._position_s,
-            estimate_ok=bool(stack and self._is_fresh(stack.estimate_message, now_s) and self._flags_ok()),
+            estimate_ok=bool(stack and self._fresh(stack.estimate_message, now_s) and self._estimate_ok()),
             estimate_s=received_s.get(stack.estimate_message) if stack else None,
-            battery=self._battery,
-            battery_v=self._battery_v,
-            battery_fails=self._battery_fails,
+            battery=charge,
+            battery_v=volts,
+            battery_fails=fails,
             vehicle_s=self.vehicle_s,
             missing=self._missing(now_s),
             refusal=self.rejections.latest(),
             status_text=self.rejections.recent_texts(now_s),
-            home=_enu_from(self._home, self.datum) if self._home and self.datum else None,
+            home=_enu_from(_geodetic(home), self.datum) if home is not None and self.datum else None,
             target=self.frame.from_autopilot(target) if self.frame and target else None,
             target_s=received_s.get("POSITION_TARGET_LOCAL_NED"),
-            tilt_rad=self._tilt_rad if self._is_fresh("ATTITUDE", now_s) else None,
+            tilt_rad=math.acos(math.cos(attitude.roll) * math.cos(attitude.pitch))
+            if attitude is not None
+            else None,
             limits=self._limits,
             other_controller=self.other_controllers.evidence(self.vehicle_s),
             system=str(self.systems),
             system_id=self.system,
             is_selected=self.systems.is_unambiguous(now_s),
             discarded=dict(self.discarded),
+            autopilot=stack.name if stack else "",
+            datum=self.datum,
+            grid_origin=str(self.datum or ""),
         )
 
     def rates_hz(self) -> dict[str, float]:
@@ -198,8 +203,10 @@ class MavlinkTelemetry:
     def _required_rates_hz(self) -> dict[str, float]:
         return {**RATES_HZ, self.flight_stack.estimate_message: ESTIMATE_HZ} if self.flight_stack else {}
 
-    def _is_fresh(self, name: str, now_s: float) -> bool:
-        return now_s - self.received_s.get(name, -math.inf) <= STALE_S
+    def _fresh(self, name: str, now_s: float) -> Any:
+        """The last message of a name; None: it is stale."""
+        is_fresh = now_s - self.received_s.get(name, -math.inf) <= STALE_S
+        return self._messages[name] if is_fresh else None
 
     def _missing(self, now_s: float) -> str | None:
         if (missing := self.systems.missing(now_s)) is not None or self.flight_stack is None:
@@ -209,7 +216,7 @@ class MavlinkTelemetry:
             return f"the autopilot has not sent {', '.join(lacking)} yet"
         if not self._armed and self.parameters.are_pending(self.flight_stack.parameters, now_s):
             return "the autopilot has not answered for its parameters yet"
-        if not self._armed and not self._flags_ok():
+        if not self._armed and not self._estimate_ok():
             texts = self.rejections.texts(now_s - PREARM_TEXT_S, now_s)
             reasons = [text for text in texts if text.startswith(PREARM_TEXTS)]
             return f"the autopilot is not ready to arm: {(reasons or ['no position estimate yet'])[-1]}"
@@ -242,23 +249,14 @@ class MavlinkTelemetry:
             self.frame = self._frame_at(self._origin.enu_from(self.datum))
         self._locate()
 
-    def _on_home_position(self, message: Any, now_s: float) -> None:
-        self._home = _geodetic(message)
-
     def _on_local_position_ned(self, message: Any, now_s: float) -> None:
         self._ned = Ned(message.x, message.y, message.z)
         self._position_s = now_s - self._clock.lag_s(message.time_boot_ms)
         self._locate()
 
     def _on_position_target_local_ned(self, message: Any, now_s: float) -> None:
-        target = Ned(message.x, message.y, message.z)
-        has_one = not message.type_mask & POSITION_IGNORED and all(map(math.isfinite, target))
-        self._target = target if has_one else None
         if self.flight_stack is not None and self.flight_stack.mode(self._custom_mode) is Mode.COMMANDED:
-            self.other_controllers.on_target(self._target, self.vehicle_s)
-
-    def _on_attitude(self, message: Any, now_s: float) -> None:
-        self._tilt_rad = math.acos(math.cos(message.roll) * math.cos(message.pitch))
+            self.other_controllers.on_target(_target(message), self.vehicle_s)
 
     def _on_param_value(self, message: Any, now_s: float) -> None:
         if (stack := self.flight_stack) is not None:
@@ -266,21 +264,6 @@ class MavlinkTelemetry:
             self.parameters.receive(message.param_id, value)
             values = self.parameters.values
             self._limits = stack.limits(values) if values else None
-
-    def _on_extended_sys_state(self, message: Any, now_s: float) -> None:
-        self.landed_state = message.landed_state
-
-    def _on_sys_status(self, message: Any, now_s: float) -> None:
-        self._health = message.onboard_control_sensors_health
-        self._battery = message.battery_remaining / 100 if message.battery_remaining >= 0 else None
-        volts = message.voltage_battery / 1e3
-        self._battery_v = volts if 0 < message.voltage_battery < NO_VOLTAGE else None
-        self._battery_fails = bool(message.onboard_control_sensors_enabled & BATTERY & ~self._health)
-
-    def _on_ekf_status_report(self, message: Any, now_s: float) -> None:
-        self._flags = message.flags
-
-    _on_estimator_status = _on_ekf_status_report
 
     def _on_statustext(self, message: Any, now_s: float) -> None:
         text = self._chunks.pop(message.id, "") + message.text
@@ -294,7 +277,7 @@ class MavlinkTelemetry:
         if self._ned is None or self._origin is None:
             return
         if self.datum is None:
-            if self.landed_state != ON_GROUND or not self._flags_ok():
+            if self.landed_state != ON_GROUND or not self._estimate_ok():
                 return
             here = self._frame_at(Enu(0.0, 0.0, 0.0)).from_autopilot(self._ned)
             self.datum = self._origin.at(here.minus(self.start))
@@ -302,9 +285,12 @@ class MavlinkTelemetry:
         if self.frame is not None:
             self.position = self.frame.from_autopilot(self._ned)
 
-    def _flags_ok(self) -> bool:
-        stack = self.flight_stack
-        return stack is not None and stack.estimate_ok(self._flags, self._health, self._armed)
+    def _estimate_ok(self) -> bool:
+        if (stack := self.flight_stack) is None:
+            return False
+        estimate, status = self._messages.get(stack.estimate_message), self._messages.get("SYS_STATUS")
+        health = status.onboard_control_sensors_health if status is not None else 0
+        return stack.estimate_ok(estimate.flags if estimate is not None else 0, health, self._armed)
 
     def _frame_at(self, origin: Enu) -> LocalFrame:
         assert self.flight_stack is not None
@@ -319,3 +305,19 @@ def _geodetic(message: Any) -> Geodetic:
         longitude_deg=message.longitude / 1e7,
         altitude_m=message.altitude / 1e3,
     )
+
+
+def _target(message: Any) -> Ned | None:
+    """Position of a POSITION_TARGET_LOCAL_NED."""
+    if message is None or message.type_mask & POSITION_IGNORED:
+        return None
+    target = Ned(message.x, message.y, message.z)
+    return target if all(map(math.isfinite, target)) else None
+
+
+def _battery(status: Any) -> tuple[float | None, float | None, bool]:
+    """Charge, voltage and failure in a SYS_STATUS."""
+    charge = status.battery_remaining / 100 if status.battery_remaining >= 0 else None
+    volts = status.voltage_battery / 1e3 if 0 < status.voltage_battery < NO_VOLTAGE else None
+    fails = status.onboard_control_sensors_enabled & BATTERY & ~status.onboard_control_sensors_health
+    return charge, volts, bool(fails)

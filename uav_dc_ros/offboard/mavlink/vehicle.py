@@ -108,23 +108,6 @@ class MavlinkVehicle:
         os.close(self._wake_in)
         os.close(self._wake_out)
 
-    @property
-    def grid_origin(self) -> str:
-        """The grid's datum as text; empty until it is known."""
-        return str(self.datum or "")
-
-    @property
-    def datum(self) -> Geodetic | None:
-        """Position of the grid's corner on the Earth; None: not known."""
-        with self._lock:
-            return self._telemetry.datum
-
-    @property
-    def kind(self) -> str:
-        """Name of the autopilot; empty until it is known."""
-        with self._lock:
-            return self._telemetry.flight_stack.name if self._telemetry.flight_stack else ""
-
     def telemetry(self) -> Telemetry:
         """The vehicle's state now, times as of `time.monotonic`.
 

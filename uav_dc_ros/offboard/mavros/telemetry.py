@@ -32,6 +32,16 @@ POSE, FIX = "mavros/local_position/pose", "mavros/global_position/global"
 STATE, EXTENDED_STATE = "mavros/state", "mavros/extended_state"
 HOME, TARGET = "mavros/home_position/home", "mavros/setpoint_raw/target_local"
 SYS_STATUS, ESTIMATOR_STATUS = "mavros/sys_status", "mavros/estimator_status"
+STATUS_TEXT = "mavros/statustext/recv"
+MESSAGES = {  # of mavros_msgs, by topic
+    STATE: "State",
+    EXTENDED_STATE: "ExtendedState",
+    SYS_STATUS: "SysStatus",
+    HOME: "HomePosition",
+    ESTIMATOR_STATUS: "EstimatorStatus",
+    TARGET: "PositionTarget",
+    STATUS_TEXT: "StatusText",
+}
 ESTIMATOR_FLAGS = (  # fields of EstimatorStatus: the bits of ESTIMATOR_STATUS_FLAGS, lowest first
     *("attitude", "velocity_horiz", "velocity_vert", "pos_horiz_rel", "pos_horiz_abs", "pos_vert_abs"),
     *("pos_vert_agl", "const_pos_mode", "pred_pos_horiz_rel", "pred_pos_horiz_abs", "gps_glitch"),
@@ -99,10 +109,7 @@ class MavrosTelemetry:
         self.received_s: dict[str, float] = {}
         self.corner = datum
         self.discarded: Counter[str] = Counter()
-        self._state: Any = None  # the last one of a vehicle that was connected
-        self._landed_state = 0
-        self._sys_status: Any = None
-        self._flags: int | None = None
+        self._messages: dict[str, Any] = {}  # of mavros_msgs: the last one by topic
         self._local: Enu | None = None
         self._pose_error = ""  # why the last pose was rejected
         self._fix: Geodetic | None = None
@@ -110,8 +117,6 @@ class MavrosTelemetry:
         self._time = VehicleTime()
         self._order = StampOrder()
         self._tilt_rad: float | None = None
-        self._home: Enu | None = None  # in MAVROS's frame
-        self._target: Enu | None = None  # in MAVROS's frame
 
     @property
     def flight_stack(self) -> FlightStack | None:
@@ -122,7 +127,7 @@ class MavrosTelemetry:
     def mode_name(self) -> str:
         """The autopilot's name of its mode."""
         if self.has_msgs:
-            return self._state.mode if self._state is not None else ""
+            return self._messages[STATE].mode if STATE in self._messages else ""
         return self.diagnostics.mode_name
 
     @property
@@ -140,14 +145,15 @@ class MavrosTelemetry:
     def armed(self) -> bool | None:
         """Whether the vehicle is armed, or (ArduPilot without mavros_msgs) flies; None: not known."""
         if self.has_msgs:
-            return None if self._state is None else bool(self._state.armed)
+            return bool(self._messages[STATE].armed) if STATE in self._messages else None
         return self.diagnostics.armed
 
     @property
     def landed_state(self) -> int | None:
         """MAV_LANDED_STATE, reported or inferred; None: not known."""
         if self.has_msgs:
-            return self._landed_state or None
+            state = self._messages.get(EXTENDED_STATE)
+            return (state.landed_state or None) if state is not None else None
         if not self.armed:
             return None if self.armed is None else ON_GROUND
         if self.flight_stack is ARDUCOPTER:
@@ -176,8 +182,10 @@ class MavrosTelemetry:
 
     def snapshot(self, now_s: float, other_controller: str | None = None) -> Telemetry:
         """The vehicle's state at a steady time."""
-        landed_state = self.landed_state
-        enabled, health = self._sensors
+        landed_state, (enabled, health) = self.landed_state, self._sensors
+        home, target = self._messages.get(HOME), self._messages.get(TARGET)
+        if target is not None and target.type_mask & NO_POSITION:
+            target = None
         batteries = self._batteries.values()
         reported = [battery for battery in batteries if battery[0] is not None] or batteries
         charge, volts = min(reported, key=lambda battery: battery[0] or 0.0, default=(None, None))
@@ -200,13 +208,16 @@ class MavrosTelemetry:
             missing=self._missing(now_s),
             refusal=self.rejections.latest(),
             status_text=self.rejections.recent_texts(now_s),
-            home=self._in_grid(self._home),
-            target=self._in_grid(self._target),
+            home=self._in_grid(_finite(home.position) if home is not None else None),
+            target=self._in_grid(_finite(target.position) if target is not None else None),
             target_s=self.received_s.get(TARGET),
             tilt_rad=self._tilt_rad,
             other_controller=other_controller,
             system=self.diagnostics.source,
             discarded=dict(self.discarded),
+            autopilot=self.flight_stack.name if self.flight_stack else "",
+            datum=self.corner,
+            grid_origin=self.origin.to_text() if self.origin else "",
         )
 
     def required_topics(self) -> list[str]:
@@ -243,8 +254,8 @@ class MavrosTelemetry:
     @property
     def _sensors(self) -> tuple[int, int]:
         """Enabled and healthy MAV_SYS_STATUS_SENSOR bits; the estimate is unhealthy before any came."""
-        if self.has_msgs and self._sys_status is not None:
-            return self._sys_status.sensors_enabled, self._sys_status.sensors_health
+        if (status := self._messages.get(SYS_STATUS)) is not None:
+            return status.sensors_enabled, status.sensors_health
         enabled, health = self.diagnostics.enabled, self.diagnostics.health
         return (AHRS, 0) if enabled is None or health is None else (enabled, health)
 
@@ -253,10 +264,11 @@ class MavrosTelemetry:
         arms = not self.armed and self.flight_stack is not None and self.flight_stack.reports_readiness
         if (AHRS | (PREARM_CHECK if arms else 0)) & enabled & ~health:
             return False
-        if self._flags is None:  # no report: without an estimate the autopilot sends no local position
+        if ESTIMATOR_STATUS not in self._messages:  # without an estimate there is no local position either
             return True
+        flags = _flags(self._messages[ESTIMATOR_STATUS])
         fresh = now_s - self.received_s[ESTIMATOR_STATUS] <= STALE_S
-        return fresh and self._flags & FLYABLE == FLYABLE and not self._flags & CONST_POS_MODE
+        return fresh and flags & FLYABLE == FLYABLE and not flags & CONST_POS_MODE
 
     def _locate(self, now_s: float) -> None:
         """Find MAVROS's origin in the grid, and the grid on the Earth; only while the vehicle stands."""
@@ -308,39 +320,18 @@ class MavrosTelemetry:
         known = charge if 0.0 <= charge <= 1.0 else None
         self._batteries[location] = known, volts if 0.0 < volts < NO_VOLTAGE else None
 
-    # Messages of mavros_msgs.
+    def update(self, topic: str, message: Any, now_s: float) -> None:
+        """Process a message of mavros_msgs; a State without a connection has no other content."""
+        if topic == STATUS_TEXT:
+            self.rejections.on_status_text(message.severity, message.text, now_s)
+        elif topic != STATE or message.connected:
+            self._messages[topic], self.received_s[topic] = message, now_s
 
-    def on_state(self, state: Any, now_s: float) -> None:
-        """Process a State; one without a connection only reports that the link is lost."""
-        if state.connected:
-            self._state, self.received_s[STATE] = state, now_s
 
-    def on_extended_state(self, state: Any, now_s: float) -> None:
-        """Process an ExtendedState."""
-        self.received_s[EXTENDED_STATE], self._landed_state = now_s, state.landed_state
-
-    def on_sys_status(self, status: Any, now_s: float) -> None:
-        """Process a SysStatus."""
-        self.received_s[SYS_STATUS], self._sys_status = now_s, status
-
-    def on_estimator_status(self, status: Any, now_s: float) -> None:
-        """Process an EstimatorStatus."""
-        self.received_s[ESTIMATOR_STATUS] = now_s
-        flags = (getattr(status, f"{name}_status_flag") for name in ESTIMATOR_FLAGS)
-        self._flags = sum(1 << bit for bit, flag in enumerate(flags) if flag)
-
-    def on_home(self, home: Any, now_s: float) -> None:
-        """Process a HomePosition, whose `position` is in MAVROS's frame."""
-        self._home = _finite(home.position)
-
-    def on_target(self, target: Any, now_s: float) -> None:
-        """Process the PositionTarget that the autopilot follows."""
-        self.received_s[TARGET] = now_s
-        self._target = None if target.type_mask & NO_POSITION else _finite(target.position)
-
-    def on_status_text(self, text: Any, now_s: float) -> None:
-        """Process a StatusText."""
-        self.rejections.on_status_text(text.severity, text.text, now_s)
+def _flags(status: Any) -> int:
+    """ESTIMATOR_STATUS_FLAGS of an EstimatorStatus."""
+    flags = (getattr(status, f"{name}_status_flag") for name in ESTIMATOR_FLAGS)
+    return sum(1 << bit for bit, flag in enumerate(flags) if flag)
 
 
 def _finite(point: Any) -> Enu | None:

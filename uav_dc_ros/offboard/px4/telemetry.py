@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from typing import Any
 
-from uav_dc_ros.offboard.flight_stacks import COPTERS
+from uav_dc_ros.offboard.flight_stacks import COPTERS, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, tilt_rad, to_enu
 from uav_dc_ros.offboard.stamp_order import StampOrder
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry
@@ -79,21 +79,11 @@ class Px4Telemetry:
         self._estimate_ok = False
         self._estimate_s: float | None = None
         self._status_s: float | None = None
-        self._landed: bool | None = None
         self._batteries: dict[int, tuple[float, float, bool]] = {}  # charge, volts, failing
-        self._tilt_rad: float | None = None
-        self._home: Ned | None = None
         self._orders = {name: StampOrder() for name in ORDERED}
-        self._flags: Any = None
+        self._messages: dict[str, Any] = {}  # the last one by topic
         self._rejections: dict[str, str] = {}  # by command, the newest last
         self._stamp_us = 0
-
-    @property
-    def grid_origin(self) -> str:
-        """The grid's datum, or else PX4's origin in the grid; empty until either is known."""
-        if self.datum is not None:
-            return str(self.datum)
-        return LOCAL + self.frame.origin.to_text() if self.frame else ""
 
     @property
     def armed(self) -> bool:
@@ -107,13 +97,17 @@ class Px4Telemetry:
             mode = MODES.get(status.nav_state, Mode.OTHER)
             name = MODE_NAMES.get(status.nav_state, f"nav_state {status.nav_state}")
             name += " (failsafe)" if status.failsafe else ""
+        grid_origin = LOCAL + self.frame.origin.to_text() if self.frame else ""
+        if self.datum is not None:
+            grid_origin = str(self.datum)
+        home, attitude = self._home(), self._messages.get("vehicle_attitude")
         charge, volts, fails = min(self._batteries.values(), default=(None, None, False))
         return Telemetry(
             heartbeat_s=self._status_s,
             mode=mode,
             mode_name=name,
             armed=self.armed,
-            on_ground=self._landed,
+            on_ground=self._landed(),
             position=self._position,
             position_s=self.position_s,
             estimate_ok=self._estimate_ok,
@@ -124,11 +118,14 @@ class Px4Telemetry:
             vehicle_s=self.vehicle_s,
             missing=self._missing(),
             refusal=self._rejection(),
-            home=self.frame.from_autopilot(self._home) if self.frame and self._home else None,
-            tilt_rad=self._tilt_rad,
+            home=self.frame.from_autopilot(home) if self.frame and home else None,
+            tilt_rad=tilt_rad(*map(float, attitude.q)) if attitude is not None else None,
             other_controller=other_controller,
             system="" if status is None else f"system {status.system_id}",
             discarded=dict(self.discarded),
+            autopilot="" if status is None else PX4.name,
+            datum=self.datum,
+            grid_origin=grid_origin,
         )
 
     def update(self, topic: str, message: Any, now_s: float) -> None:
@@ -141,7 +138,9 @@ class Px4Telemetry:
         if why is not None:
             self.discarded[why] += 1
             return
-        getattr(self, f"on_{topic}")(message, now_s)
+        self._messages[topic] = message
+        if (handler := getattr(self, f"on_{topic}", None)) is not None:
+            handler(message, now_s)
 
     def on_vehicle_status(self, message: Any, now_s: float) -> None:
         """Process a VehicleStatus."""
@@ -162,10 +161,6 @@ class Px4Telemetry:
             if self.frame is not None:
                 self._position, self.position_s = self.frame.from_autopilot(ned), now_s
 
-    def on_vehicle_land_detected(self, message: Any, now_s: float) -> None:
-        """Process a VehicleLandDetected."""
-        self._landed = bool(message.landed)
-
     def on_battery_status(self, message: Any, now_s: float) -> None:
         """Process a BatteryStatus of one of the batteries."""
         if message.connected and message.remaining >= 0:
@@ -173,19 +168,6 @@ class Px4Telemetry:
             self._batteries[message.id] = float(message.remaining), float(message.voltage_v), fails
         else:
             self._batteries.pop(message.id, None)
-
-    def on_vehicle_attitude(self, message: Any, now_s: float) -> None:
-        """Process a VehicleAttitude."""
-        self._tilt_rad = tilt_rad(*map(float, message.q))
-
-    def on_home_position(self, message: Any, now_s: float) -> None:
-        """Process a HomePosition."""
-        ned = Ned(message.x, message.y, message.z)
-        self._home = ned if message.valid_lpos and all(map(math.isfinite, ned)) else None
-
-    def on_failsafe_flags(self, message: Any, now_s: float) -> None:
-        """Process FailsafeFlags."""
-        self._flags = message
 
     def on_vehicle_command_ack(self, message: Any, now_s: float) -> None:
         """Process a VehicleCommandAck; those for other senders are ignored."""
@@ -198,13 +180,25 @@ class Px4Telemetry:
         if message.result != ACCEPTED:
             self._rejections[command] = RESULTS.get(message.result, f"result {message.result}")
 
+    def _landed(self) -> bool | None:
+        message = self._messages.get("vehicle_land_detected")
+        return bool(message.landed) if message is not None else None
+
+    def _home(self) -> Ned | None:
+        message = self._messages.get("home_position")
+        if message is None or not message.valid_lpos:
+            return None
+        ned = Ned(message.x, message.y, message.z)
+        return ned if all(map(math.isfinite, ned)) else None
+
     def _locate(self, ned: Ned, reference: Geodetic | None) -> None:
         """Find PX4's local frame in the grid's.
 
         The first position on the ground is `start`. Once PX4 knows the global position of its origin, the
         datum follows, and from then on the frame from the datum: PX4 may move its origin in flight.
         """
-        on_ground = self._landed if self._landed is not None else self.status is not None and not self.armed
+        landed = self._landed()
+        on_ground = landed if landed is not None else self.status is not None and not self.armed
         if self.datum is None and self.frame is None and on_ground:
             self.frame = LocalFrame(origin=self.start.minus(to_enu(ned)))
         if reference is None or reference == self._reference:
@@ -239,7 +233,8 @@ class Px4Telemetry:
         if not self._rejections:
             return None
         command, result = list(self._rejections.items())[-1]
-        reasons = [flag.replace("_", " ") for flag in REASONS if getattr(self._flags, flag, False)]
+        flags = self._messages.get("failsafe_flags")
+        reasons = [flag.replace("_", " ") for flag in REASONS if getattr(flags, flag, False)]
         if not self.status.pre_flight_checks_pass:
             reasons.append("its preflight checks fail")
         return f"{command} refused: {result}" + (f" ({', '.join(reasons)})" if reasons else "")
