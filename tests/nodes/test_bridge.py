@@ -30,7 +30,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.registration import ENV_ID
 
 STEPS = 7  # of the low world's missions
-NODES = ("--nodes", "bridge,world,channel_monitor,policy,recorder")  # nobody looks at the drawings
+NODES = ("--nodes", "bridge,world,channel_monitor,policy,recorder")  # without the visualizer
 
 
 def beside(autopilot: Fake, *options: object) -> tuple[object, ...]:
@@ -38,7 +38,7 @@ def beside(autopilot: Fake, *options: object) -> tuple[object, ...]:
 
 
 def statuses(bag: Path) -> list[dict[str, Any]]:
-    """What the vehicle said, in order."""
+    """The reports of the vehicle, in order."""
     with AnyReader([bag]) as reader:
         wanted = [connection for connection in reader.connections if connection.topic == "/mission"]
         texts = [reader.deserialize(data, one.msgtype).data for one, _, data in reader.messages(wanted)]
@@ -47,11 +47,11 @@ def statuses(bag: Path) -> list[dict[str, Any]]:
 
 def check_steps(bag: Path, steps: int = STEPS) -> None:
     """Each step was flown once, and ended one cell further."""
-    told = statuses(bag)
-    moving = [status["step"] for status in told if status["phase"] == "moving"]
+    reported = statuses(bag)
+    moving = [status["step"] for status in reported if status["phase"] == "moving"]
     begun = [step for step, _ in itertools.groupby(moving)]
     assert begun == list(range(steps)), begun
-    cells = {status["step"]: status["cell"] for status in told}
+    cells = {status["step"]: status["cell"] for status in reported}
     assert cells == {step: [step, 0, 0] for step in range(steps + 1)}
 
 
@@ -72,7 +72,7 @@ def until(condition: Callable[[], Any], process: subprocess.Popen[str], seconds:
 
 def flies_east(autopilot: Fake, step: int) -> bool:
     """Has it been sent to the cell of a step."""
-    return any(told["ned"][1] == pytest.approx(20.0 * step, abs=0.2) for told in autopilot.all("setpoint"))
+    return any(event["ned"][1] == pytest.approx(20.0 * step, abs=0.2) for event in autopilot.all("setpoint"))
 
 
 # Whole missions.
@@ -112,14 +112,14 @@ def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) 
         given = ("--compose", "--scenario", name, "--seed", 3, "--bag", "bag", "--summary", summary)
         status, output = ros.run_all(*beside(autopilot, "--arm", "--system", 1, *given, *NODES))
         report = autopilot.report()
-    assert not [told for told in autopilot.events if told["event"].startswith("second ")]
+    assert not [event for event in autopilot.events if event["event"].startswith("second ")]
     assert status == 0, output
     assert "Traceback" not in output
     kept = json.loads(next((ros.folder / "state").rglob("*.json")).read_text())
     assert f"the grid's corner lies at {kept['datum']}, from the vehicle's position; no earlier" in output
-    told = json.loads(summary.read_text())
-    assert (told["outcome"], told["steps"], told["seed"]) == ("landed", steps, 3)
-    assert told["reason"].startswith(f"step {steps}: at the dock")
+    result = json.loads(summary.read_text())
+    assert (result["outcome"], result["steps"], result["seed"]) == ("landed", steps, 3)
+    assert result["reason"].startswith(f"step {steps}: at the dock")
     assert not report["armed"]
     dock = np.subtract(scenario.mission.dock_m, scenario.mission.start_m[:2])
     assert report["ned"][:2] == pytest.approx([dock[1], dock[0]], abs=2.0)  # north, east
@@ -139,8 +139,8 @@ def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) 
         assert np.array_equal(np.asarray([users[step]["x_m"], users[step]["y_m"]]).T, crowd.positions_m)
     rates = [p for t, p in bag if t == "/rates"]
     assert sorted({p["step"] for p in rates}) == list(range(steps + 1))
-    assert sum(rates[-1]["collected"]) == told["users_collected"] >= least
-    told = [p for t, p in bag if t == "/mission"]
+    assert sum(rates[-1]["collected"]) == result["users_collected"] >= least
+    reported = [p for t, p in bag if t == "/mission"]
     changes = [
         pair.value
         for topic, message in bag
@@ -148,7 +148,7 @@ def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) 
         for pair in message.status[0].values
         if pair.key.startswith("change ")
     ]
-    of_mission = [f"{p['phase']}, step {p['step']}: {p['reason']}" for p in told]
+    of_mission = [f"{p['phase']}, step {p['step']}: {p['reason']}" for p in reported]
     assert changes == of_mission, "every change is in the diagnostics, too"
 
 
@@ -159,7 +159,7 @@ def test_a_pilot_arms_where_the_bridge_may_not(ros: Ros, low: tuple[object, ...]
         assert process.stdout is not None
         shown = wait_for(process.stdout, "waiting for a pilot")
         time.sleep(1.0)
-        assert not [told for told in autopilot.all("command") if told["command"] in (176, 400, 22)]
+        assert not [event for event in autopilot.all("command") if event["command"] in (176, 400, 22)]
         autopilot.do("mode", "GUIDED")
         autopilot.do("arm")
         status, output = finish(process)
@@ -182,7 +182,7 @@ def test_the_second_flight_has_the_grid_of_the_first(ros: Ros, low: tuple[object
         fly(autopilot, "here")
         first = len(autopilot.all("setpoint"))
         assert "; 0.0 m east and 0.0 m north of that of the last flight (" in fly(autopilot, "last")
-        second = [told["ned"] for told in autopilot.all("setpoint")[first:]]
+        second = [event["ned"] for event in autopilot.all("setpoint")[first:]]
         for step in range(STEPS + 1):
             assert any(ned[:2] == pytest.approx([0.0, 20.0 * step], abs=0.2) for ned in second), step
         assert autopilot.report()["ned"][:2] == pytest.approx([0.0, 20.0 * STEPS], abs=2.0)
@@ -212,7 +212,7 @@ def test_a_killed_policy_makes_the_vehicle_hold_and_a_killed_bridge_takes_the_mi
         until(lambda: flies_east(autopilot, 4), process)
         killed(ros, "bridge")
         status, output = finish(process)
-        arms = [told for told in autopilot.all("command") if told["command"] == 400]
+        arms = [event for event in autopilot.all("command") if event["command"] == 400]
         assert len(arms) == 1, "never armed a second time"
         assert not autopilot.report()["armed"]
     assert "node policy was killed by SIGKILL" in output
@@ -270,8 +270,8 @@ def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
         if number != signal.SIGKILL:
             assert "aborted" in output
             assert statuses(ros.folder / "bag")[-1]["reason"] == "the bridge was stopped"
-            told = json.loads((ros.folder / "summary.json").read_text())
-            assert (told["outcome"], told["reason"]) == ("aborted", "the bridge was stopped")
+            result = json.loads((ros.folder / "summary.json").read_text())
+            assert (result["outcome"], result["reason"]) == ("aborted", "the bridge was stopped")
         assert ros.gone()
 
 
@@ -322,10 +322,10 @@ def test_a_pilot_who_takes_over_keeps_the_vehicle(ros: Ros, low: tuple[object, .
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag"))
         until(lambda: flies_east(autopilot, 2), process)
         autopilot.do("mode", "LOITER")
-        asked = len(autopilot.all("command"))
+        n_sent = len(autopilot.all("command"))
         status, output = finish(process)
         assert status == 1, output
-        assert len(autopilot.all("command")) == asked, "nothing more is asked of it"
+        assert len(autopilot.all("command")) == n_sent, "nothing more is sent to it"
         report = autopilot.report()
         assert (report["mode"], report["armed"]) == ("LOITER", True)
     last = statuses(ros.folder / "bag")[-1]

@@ -31,7 +31,7 @@ def test_a_charge_under_the_minimum_is_low() -> None:
 
 
 def test_one_that_is_counted_empty_at_the_voltage_of_a_full_one_is_not() -> None:
-    """As ArduCopter's simulator tells it: 29 A of 3.3 Ah for 18 minutes, 12.3 V all the time."""
+    """As ArduCopter's simulator reports it: 29 A of 3.3 Ah for 18 minutes, 12.3 V all the time."""
     battery = in_the_air()
     for at_s in range(1, 1080):
         assert battery.fault(reported(max(0.0, 1 - at_s * 29.3 / 3600 / 3.3), 12.3, float(at_s))) is None

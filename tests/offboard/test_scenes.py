@@ -1,6 +1,6 @@
 """Scenes of whole flights, in the vehicle's time: odd telemetry, low voltage, others on the link.
 
-And what real flights broke: each ends on the ground or with a pilot, in bounded time, and says why.
+And what real flights broke: each ends on the ground or with a pilot, in bounded time, with a reason.
 """
 
 import random
@@ -129,7 +129,7 @@ def test_the_failsafe_for_the_ground_station_stays_calm_at_any_speed_of_the_simu
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_second_vehicle_on_the_link_is_left_alone(kind: str) -> None:
-    """It speaks first; the own one is on the ground while nobody says which is meant."""
+    """It sends first; the own one stays on the ground while none is selected."""
     flight = VirtualFlight(kind)
     flight.autopilot.other = Autopilot(Copter(kind, 0.0, "second "), 7)
     flight.run(60.0)
@@ -141,7 +141,7 @@ def test_a_second_vehicle_on_the_link_is_left_alone(kind: str) -> None:
     flight.until_over()
     check_landed(flight)
     named = f"connected to system 1, {'PX4' if kind == 'px4' else 'ArduCopter'}"
-    assert (Phase.PREFLIGHT, 0, named) in flight.log, "the display and the bag say which one it took"
+    assert (Phase.PREFLIGHT, 0, named) in flight.log, "console and bag name the selected vehicle"
     assert (other.copter.armed, other.setpoints) == (False, 0)
 
 
@@ -157,7 +157,7 @@ def test_a_second_bridge_is_known_before_anybody_can_arm(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_after_a_lost_link_the_report_on_the_estimate_is_older_than_the_heartbeat(kind: str) -> None:
-    """Nothing says that the estimate was lost: nothing was reported."""
+    """The estimate is not lost: nothing was reported."""
     flight = VirtualFlight(kind)
     moving(flight)
     flight.link_is_up = False
@@ -208,7 +208,7 @@ def test_an_autopilot_s_fence_inside_the_field_is_refused_before_take_off(kind: 
     ("kind", "cause"), [("ardupilot", "does not accept the setpoint"), ("px4", "AUTO.RTL: changed by")]
 )
 def test_an_autopilot_s_fence_that_comes_in_flight_is_noticed(kind: str, cause: str) -> None:
-    """ArduCopter ignores a target outside in silence; PX4 returns, and says so."""
+    """ArduCopter ignores a target outside in silence; PX4 returns, and reports it."""
     flight = VirtualFlight(kind, scenario=short(20))
     moving(flight, 0)
     fence_in(flight, kind)

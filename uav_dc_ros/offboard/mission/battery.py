@@ -19,7 +19,7 @@ class BatteryMonitor:
     """Monitors one battery.
 
     Args:
-        min_charge: 0 to 1.
+        min_charge: 0 to 1; 0: nothing is checked.
         at_rest_v: see below, from the checkpoint.
 
     Attributes:
@@ -34,6 +34,8 @@ class BatteryMonitor:
 
     def fault(self, telemetry: Telemetry) -> str | None:
         """Why the battery is low or broken; None: it is neither, or not reported. Called in every tick."""
+        if not self.min_charge:
+            return None
         self._update(telemetry)
         volts = "" if telemetry.battery_v is None else f" at {telemetry.battery_v:.1f} V"
         charge = "battery" if telemetry.battery is None else f"battery {telemetry.battery:.0%}"

@@ -243,7 +243,7 @@ class MissionController:
 
     def _check_faults(self, now_s: float, telemetry: Telemetry) -> None:
         """End the mission at once, or when the fault timer expires."""
-        if (low := self.detector.battery_fault(telemetry)) is not None:
+        if (low := self.detector.battery.fault(telemetry)) is not None:
             self._abort(low)
             return
         if (other := other_controller(telemetry)) not in (None, self._other_controller):

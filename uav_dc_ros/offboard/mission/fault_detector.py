@@ -139,7 +139,3 @@ class FaultDetector:
         if self.clock_stopped(now_s):
             return Fault(FaultKind.CLOCK, f"the vehicle's time has not advanced for {CLOCK_S:g} s")
         return None
-
-    def battery_fault(self, telemetry: Telemetry) -> str | None:
-        """Why the battery is low or broken; None: it is neither, or not reported."""
-        return self.battery.fault(telemetry) if self.settings.min_battery > 0 else None

@@ -156,7 +156,7 @@ class Preflight:
         command: Command | None = None
         if telemetry.armed:
             reason = f"a pilot flies: mode {telemetry.mode_text}"
-        elif (low := self.detector.battery_fault(telemetry)) is not None:
+        elif (low := self.detector.battery.fault(telemetry)) is not None:
             reason = low
         elif self.pilot_has_control:
             reason = "a pilot had control: waiting for a pilot to set the mode and arm"
