@@ -65,11 +65,6 @@ class MissionRunner:
 
     Raises:
         UavDcError: the run cannot be flown; nothing was started or written.
-
-    Attributes:
-        summaries: of the missions that are over.
-        errors: printed messages.
-        interrupted: whether `interrupt` was called.
     """
 
     def __init__(self, config: RunConfig, *, show: bool = True) -> None:
@@ -97,8 +92,8 @@ class MissionRunner:
             run_options.check_summary(Path(config.summary), self.bag)
         self._show, self._console = show, cast("MissionConsole | None", None)
         self._console_lock = threading.Lock()
-        self.summaries: list[Summary] = []
-        self.errors: list[str] = []
+        self.summaries: list[Summary] = []  # of the missions that are over
+        self.errors: list[str] = []  # that were printed
         self.interrupted = self._aborted = False
         self._abort_reason = ""  # of the whole run
         self._step_s = 0.0  # time of the last step, monotonic clock

@@ -29,22 +29,14 @@ IDENTIFY_S = 3.0  # longest wait for both the nodes and the run of another missi
 
 @dataclass(kw_only=True)
 class MonitoredMission(MissionTotals):
-    """A mission in progress.
+    """A mission in progress."""
 
-    Attributes:
-        index: of the mission in its run.
-        cell, rates: of the last step.
-        distance_m: length of the path from cell to cell, metres.
-        sum_of_sum_rates_bps: sum over the measured steps, bit/s.
-        unmeasured_steps: number of flown steps without rates.
-    """
-
-    index: int
-    cell: tuple[int, int, int] | None = None
-    rates: messages.Rates | None = None
-    distance_m: float = 0.0
-    sum_of_sum_rates_bps: float = 0.0
-    unmeasured_steps: int = 0
+    index: int  # in its run
+    cell: tuple[int, int, int] | None = None  # of the last step
+    rates: messages.Rates | None = None  # of the last step
+    distance_m: float = 0.0  # from cell to cell, metres
+    sum_of_sum_rates_bps: float = 0.0  # over the measured steps, bit/s
+    unmeasured_steps: int = 0  # flown without rates
 
     def summary(self, scenario: Scenario, policy: str, bag: str | None) -> Summary:
         """The result of a mission that is over."""
@@ -78,10 +70,6 @@ class MissionMonitor(MissionNode):
         run: identity of the run; empty: that of the vehicle, which is started elsewhere.
         peers: nodes of the mission.
         local_nodes: those that this run_all starts; they publish only after `is_alone`.
-
-    Attributes:
-        is_alone: whether this mission may begin: no other one was found for long enough.
-        restarts_of: number of restarts by node name, for the diagnostics.
     """
 
     pause_s = 0.01  # no node waits for the monitor
@@ -104,8 +92,8 @@ class MissionMonitor(MissionNode):
         self.scenario = scenario
         self.seed = seed
         self.mission: MonitoredMission | None = None
-        self.restarts_of: dict[str, int] = {}
-        self.is_alone = False
+        self.restarts_of: dict[str, int] = {}  # number by node name
+        self.is_alone = False  # whether the mission may begin: no other one was found for long enough
         self._on_status, self._on_step, self._on_end = on_status, on_step, on_end
         self._local_nodes, self._on_note = local_nodes, on_note
 

@@ -35,13 +35,6 @@ class NodeProcess:
 
     Raises:
         NodeError: the parameter file cannot be written.
-
-    Attributes:
-        name: of the module.
-        description: of the process, for messages.
-        kill_reason: empty if `kill` was not called.
-        reports: last report by node name; empty until the process has started.
-        silent_s: time since the last report, or the start, seconds.
     """
 
     def __init__(
@@ -83,9 +76,9 @@ class NodeProcess:
             start_new_session=True,  # Ctrl-C reaches run_all only, which stops the nodes in order
         )
         os.close(write_end)
-        self.kill_reason = ""
-        self.silent_s = 0.0
-        self.reports: Mapping[str, NodeReport] = {}
+        self.kill_reason = ""  # empty: not killed
+        self.silent_s = 0.0  # since the last report, or the start
+        self.reports: Mapping[str, NodeReport] = {}  # last one by node name; empty until the start
         self._partial = b""  # start of a report
         self._on_line = on_line
         self._last_line = ""

@@ -25,16 +25,13 @@ TRANSITIONS = {"unconfigured": CONFIGURE, "inactive": ACTIVATE}
 class SupervisedNode:
     """A node, and its process, which other nodes may share.
 
-    Attributes:
-        state: last reported state; None before the first report. A change through ROS services after the
-            node was active is not reverted.
-        restarts: number of restarts.
+    A change of its state through ROS services after it was active is not reverted.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, object]) -> None:
         self.row = NODES[name]
         self.parameters = dict(parameters)
-        self.state: str | None = None
+        self.state: str | None = None  # as last reported; None before the first report
         self.restarts = 0
         self.process: NodeProcess | None = None
         self.start_s = 0.0  # time of the next start, without a process
@@ -77,9 +74,6 @@ class Supervisor:
             faulty node.
         folder: for parameter files.
         on_line: called from threads with the name of a process and a line of its output.
-
-    Attributes:
-        brought_up: whether all nodes have been active at once.
     """
 
     def __init__(
@@ -95,7 +89,7 @@ class Supervisor:
         self._composed, self._folder = composed, folder
         self._on_line, self._on_note = on_line, on_note
         self.nodes = [SupervisedNode(name, values) for name, values in parameters.items()]
-        self.brought_up = False
+        self.brought_up = False  # whether all nodes have been active at once
         self._checked_s = time.monotonic()
 
     def __enter__(self) -> Self:

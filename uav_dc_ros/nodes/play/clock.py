@@ -14,17 +14,13 @@ class PlaybackClock:
     Args:
         rate: seconds of the bag per second; infinite: no message waits for its time.
         now: the steady clock, seconds.
-
-    Attributes:
-        paused: whether the bag's time stands still.
-        limit_ns: log time of the next message, upper bound of the bag's time.
     """
 
     def __init__(
         self, rate: float, *, paused: bool = False, now: Callable[[], float] = time.monotonic
     ) -> None:
         self.paused = paused
-        self.limit_ns = 0
+        self.limit_ns = 0  # log time of the next message, upper bound of the bag's time
         self._now = now
         self._rate = rate
         self._reference_ns, self._reference_s = 0, now()

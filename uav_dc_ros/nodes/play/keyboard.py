@@ -29,13 +29,10 @@ class Keyboard:
 
     Args:
         on_resumed: called after Ctrl-Z and `fg`, with the seconds between them.
-
-    Attributes:
-        active: whether keys can be read.
     """
 
     def __init__(self, on_resumed: Callable[[float], None]) -> None:
-        self.active = False
+        self.active = False  # whether keys can be read
         self._on_resumed = on_resumed
         self._settings: list[Any] = []  # of the terminal, before
         self._fd = -1

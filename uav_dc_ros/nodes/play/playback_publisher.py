@@ -41,10 +41,6 @@ class PlaybackPublisher:
         name: full name of the topic to publish.
         message_bytes, per_s: size and rate of its messages, see `recorded_qos.profile`.
 
-    Attributes:
-        latched: whether late subscribers receive its last messages.
-        depth: number of messages in its history.
-
     Raises:
         BagError: invalid recorded QoS.
         NodeError: its messages cannot be published here.
@@ -56,13 +52,13 @@ class PlaybackPublisher:
         kind = message_class(topic)
         profile = recorded_qos.profile(topic, message_bytes=message_bytes, per_s=per_s)
         self.latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        self.depth = profile.depth
+        self.depth = profile.depth  # number of messages in its history
         self.name = name
         self.publisher = node.create_publisher(
             kind, name, profile, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False)
         )
         self._reliable = profile.reliability == ReliabilityPolicy.RELIABLE
-        self._unacknowledged = 0
+        self._unacknowledged = 0  # messages
         self._published: dict[tuple[int, int], None] = {}  # the last messages of a latched topic
         try:
             _check_definition(node, name, topic)

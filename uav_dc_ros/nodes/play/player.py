@@ -40,48 +40,29 @@ RATE_FACTOR = 1.25  # per key; three times is about twice as fast
 
 @dataclass(frozen=True, kw_only=True)
 class PlaybackOptions:
-    """What to play, and how.
-
-    Attributes:
-        path: folder or file of the bag.
-        names: full name of the topic to publish, by recorded topic.
-        start_s: start, seconds from the bag's first message.
-        duration_s: length to play, seconds of the bag; None: to its end.
-        max_gap_s: longest time without a message that is not skipped, seconds of the bag.
-        rate: seconds of the bag per second; infinite: as fast as reliable subscribers keep up.
-        clock_hz: rate of `/clock` in wall time; None: it is not published.
-        wait_s: timeout for a subscriber of every topic; None: do not wait.
-    """
+    """What to play, and how. Times are seconds of the bag."""
 
     path: Path
-    names: dict[str, str]
-    start_s: float = 0.0
-    duration_s: float | None = None
-    max_gap_s: float = math.inf
-    rate: float = 1.0
-    loop: bool = False
-    paused: bool = False
-    clock_hz: float | None = None
-    wait_s: float | None = None
+    names: dict[str, str]  # full name of the topic to publish, by recorded topic
+    start_s: float  # from the first message
+    duration_s: float | None  # None: to the end
+    max_gap_s: float  # longest time without a message that is not skipped
+    rate: float  # seconds of the bag per second; infinite: as fast as reliable subscribers keep up
+    loop: bool
+    paused: bool
+    clock_hz: float | None  # rate of `/clock` in wall time; None: it is not published
+    wait_s: float | None  # timeout for a subscriber of every topic, wall time; None: do not wait
 
 
 class Player:
-    """Plays a bag once, or in a loop; creates all publishers at once.
-
-    Attributes:
-        publishers: by recorded topic.
-        messages: number published.
-
-    Raises:
-        BagError: no message can be played.
-    """
+    """Plays a bag once, or in a loop; raises BagError if no message can be played."""
 
     def __init__(
         self, node: Node, options: PlaybackOptions, display: PlaybackDisplay, reader: BagReader
     ) -> None:
         self.options, self.display, self.reader = options, display, reader
-        self.publishers: dict[str, PlaybackPublisher] = {}
-        self.messages = 0
+        self.publishers: dict[str, PlaybackPublisher] = {}  # by recorded topic
+        self.messages = 0  # published
         length_s = max(1.0, (reader.last_ns - reader.first_ns) * 1e-9)
         for recorded, name in options.names.items():
             topic = reader.topics[recorded]

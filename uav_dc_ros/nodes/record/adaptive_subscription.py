@@ -33,16 +33,13 @@ class AdaptiveSubscription:
         name: full name.
         type: ROS 2 message type.
         callback: receives each message and its info.
-
-    Attributes:
-        publishers: number of publishers at the last scan of the graph.
     """
 
     def __init__(self, node: Node, name: str, type: str, callback: Callback) -> None:
         self.name = name
         self.type = type
         self.callback = callback
-        self.publishers = 0
+        self.publishers = 0  # at the last scan of the graph
         self._node = node
         self._losses: dict[Any, EventCount] = {}  # by subscription; two while a new one takes over
         self._class: Any = None  # of the messages; None: the subscription does not adapt

@@ -31,21 +31,16 @@ HOUSEKEEPING = ("/parameter_events", "/rosout", "/transition_event")  # of ROS: 
 
 
 class RecorderBase(MissionNode):
-    """Records the topics of its row, and other topics that it discovers.
-
-    Attributes:
-        delays_new_topics: whether a topic is recorded only from the second scan on that finds it.
-        selected: full names of the topics to record; empty: all in the node's namespace.
-    """
+    """Records the topics of its row, and other topics that it discovers."""
 
     drains = True
     pause_s = 0.005  # no node waits for the recorder
-    delays_new_topics = False
+    delays_new_topics = False  # whether a topic is recorded only from the second scan on
 
     def __init__(self, name: str, *arguments: Any) -> None:
         super().__init__(name, *arguments)
         self.writer: BagWriter | None = None
-        self.selected: set[str] = set()
+        self.selected: set[str] = set()  # full names of the topics to record; empty: all in the namespace
         self._recorded: dict[str, AdaptiveSubscription] = {}  # by full name
         self._announced: set[str] = set()
         self._not_recorded: dict[str, str] = {}  # reasons

@@ -58,23 +58,15 @@ TEXT_COLOUR = _rgba("FFFFFF")
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """State of a mission; unknown values are None, or empty.
+    """State of a mission; unknown values are None, or empty."""
 
-    Attributes:
-        time_ns: mission time of the pose, nanoseconds.
-        position_m: x, y and altitude of the UAV, metres.
-        users_m: positions, metres, `[U, 2]`.
-        served, collected: of each user, bool `[U]`.
-        sum_rate_bps: sum-rate of the last step, bit/s.
-    """
-
-    time_ns: int
-    position_m: Xyz | None
-    users_m: Array
-    served: Array
-    collected: Array
+    time_ns: int  # mission time of the pose, nanoseconds
+    position_m: Xyz | None  # of the UAV: x, y and altitude, metres
+    users_m: Array  # positions, metres, [U, 2]
+    served: Array  # bool [U]
+    collected: Array  # bool [U]
     mission: Mission | None
-    sum_rate_bps: float | None
+    sum_rate_bps: float | None  # of the last step, bit/s
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,15 +19,12 @@ class PathHistory:
 
     Poses are not latched. Targets are, so they replace the poses that a late subscriber missed; in simulation
     both are equal.
-
-    Attributes:
-        version: changes whenever the path changes.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self._step_ns = scenario.step_ns
         self._min_distance_m = MIN_DISTANCE_CELLS * scenario.grid.cell_m
-        self.version = 0
+        self.version = 0  # changes with the path
         self._path: SpacedSeries[tuple[int, Pose]] = SpacedSeries(POSES_MAX)  # with the time of publication
         self._last: tuple[int, Pose] | None = None  # also if the path leaves it out
         self._targets: list[Pose] = []
