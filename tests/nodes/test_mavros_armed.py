@@ -19,7 +19,8 @@ from rclpy.task import Future
 
 from tests.nodes.test_mavros_parts import HEALTHY, PACKAGE, Message, estimator
 from tests.support.fake_autopilot.autopilot import TICK_S, Autopilot, Copter
-from tests.support.fake_autopilot.mavros_flight import SCENARIO, START, way_home
+from tests.support.fake_autopilot.common import way_home
+from tests.support.fake_autopilot.mavros_flight import SCENARIO, START
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros import convert
 from uav_dc_ros.nodes.vehicles import mavros

@@ -4,10 +4,8 @@ No PX4 has been flown here. What a stand-in cannot tell is whether it is one.
 """
 
 import itertools
-import json
 import math
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tests.conftest import Ros, each_once
 from tests.nodes import px4_messages
 from tests.nodes.conftest import SMALL
+from tests.support.fake_autopilot.common import FakeProcess
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import VehicleError
@@ -679,34 +678,11 @@ def test_px4_msgs_of_another_release_are_named(vehicle: px4.Px4Vehicle, spun: Sp
 # Flights, with the stand-in for PX4.
 
 
-class Fake:
-    """The stand-in, a process; `events` are what it told."""
+class Fake(FakeProcess):
+    """The stand-in, a process; its commands are those of `Px4.obey`."""
 
     def __init__(self, ros: Ros, messages: Path, namespace: str) -> None:
-        self.process = ros.stranger("px4", messages, SPEED, namespace, folder="support/fake_autopilot")
-        self.events: list[dict[str, Any]] = []
-        threading.Thread(target=self._listen, daemon=True).start()
-
-    def _listen(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.events.append(json.loads(line))
-
-    def do(self, line: str) -> None:
-        """A line of `Px4.obey`."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(line + "\n")
-        self.process.stdin.flush()
-
-    def all(self, event: str) -> list[dict[str, Any]]:
-        return [told for told in list(self.events) if told["event"] == event]
-
-    def close(self) -> None:
-        died = self.process.poll()
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait(10.0)
-        assert died is None, f"the stand-in died: {died}"
+        super().__init__(ros.stranger("px4", messages, SPEED, namespace, folder="support/fake_autopilot"))
 
 
 class Flight:
@@ -752,7 +728,7 @@ class Flight:
     def do(self, line: str) -> None:
         """Have the stand-in do something, and fly on until it has."""
         before = len(self.fake.all("obeyed"))
-        self.fake.do(line)
+        self.fake.write(line)
         self.until(lambda: len(self.fake.all("obeyed")) > before)
 
     def finish(self) -> None:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.fake_autopilot.common import way_home
 from tests.support.fake_autopilot.simulated import (
     ARMING,
     SCENARIO,
@@ -15,7 +16,6 @@ from tests.support.fake_autopilot.simulated import (
     Flight,
     Vehicle,
     fly_to_step,
-    way_home,
 )
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase

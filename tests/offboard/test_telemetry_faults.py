@@ -10,7 +10,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from tests.support.fake_autopilot.simulated import ARMING, Flight, Vehicle, way_home
+from tests.support.fake_autopilot.common import way_home
+from tests.support.fake_autopilot.simulated import ARMING, Flight, Vehicle
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase

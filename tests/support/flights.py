@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from tests.recordings.made import BEGUN_NS, about, pose, said, write
+from tests.support.fake_autopilot.common import way_home
 from tests.support.fake_autopilot.simulated import Vehicle
 from uav_dc_ros import cdr, messages, payloads
 from uav_dc_ros.agents.policy import Policy
@@ -213,16 +214,6 @@ class Flight:
             collected=np.asarray(rates.collected),
         )
         return Action(int(self._policy.act(observation)))
-
-
-def way_home(bridge: MissionController) -> Action:
-    """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.cell, bridge.scenario.dock_cell
-    if x != dock_x:
-        return Action.RIGHT if x < dock_x else Action.LEFT
-    if y != dock_y:
-        return Action.FORWARD if y < dock_y else Action.BACKWARD
-    return Action.HOVER
 
 
 def once(when: Callable[[Flight], bool], do: Callable[[Flight], None]) -> Callable[[Flight], None]:

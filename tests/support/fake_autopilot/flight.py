@@ -1,17 +1,15 @@
 """The fake autopilot as a process, and a whole flight against it: bridge, transport, a trivial policy."""
 
 import contextlib
-import json
-import queue
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from tests.support.fake_autopilot.common import FakeProcess, FlightRecord, way_home
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
@@ -35,7 +33,7 @@ def free_udp_port() -> int:
         return int(probe.getsockname()[1])
 
 
-class Fake:
+class Fake(FakeProcess):
     """The process; `address` is where the bridge finds it."""
 
     def __init__(self, kind: str, wire: str = "tcp", *, speed: float = 1.0, ready_s: float = 5.0) -> None:
@@ -49,60 +47,25 @@ class Fake:
             f"--{wire}",
             str(number),
         ]
-        self.process = subprocess.Popen(
+        process = subprocess.Popen(
             [*command, "--speed", str(speed), "--ready-s", str(ready_s)],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.events: list[dict[str, Any]] = []
-        self._new: queue.Queue[dict[str, Any]] = queue.Queue()
-        threading.Thread(target=self._listen, daemon=True).start()
+        super().__init__(process)
         port = self.wait_for("listens")["port"]
         self.address = f"{'tcp' if wire == 'tcp' else 'udpin'}:127.0.0.1:{port}"
 
-    def _listen(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            event = json.loads(line)
-            self.events.append(event)
-            self._new.put(event)
-
     def do(self, *words: object) -> None:
         """A line of `Control`'s."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(" ".join(map(str, words)) + "\n")
-        self.process.stdin.flush()
-
-    def wait_for(self, event: str, seconds: float = 90.0) -> dict[str, Any]:
-        """The next event of a name that was not waited for yet."""
-        end = time.monotonic() + seconds
-        while True:
-            try:
-                told = self._new.get(timeout=max(0.0, end - time.monotonic()))
-            except queue.Empty:
-                raise AssertionError(f"no {event!r} within {seconds} s: {self.events[-5:]}") from None
-            if told["event"] == event:
-                return told
+        self.write(" ".join(map(str, words)))
 
     def report(self) -> dict[str, Any]:
         """How it is now."""
         self.do("report")
         return self.wait_for("report")
-
-    def all(self, event: str) -> list[dict[str, Any]]:
-        """All events of a name so far."""
-        return [told for told in self.events if told["event"] == event]
-
-    def close(self) -> None:
-        """End it; it must have lived until now."""
-        died = self.process.poll()
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError):
-            self.process.stdin.close()
-        self.process.wait(10.0)
-        assert died is None, f"the fake autopilot died: {died}"
 
 
 @contextlib.contextmanager
@@ -115,23 +78,10 @@ def fake(kind: str, wire: str = "tcp", **options: Any) -> Iterator[Fake]:
         autopilot.close()
 
 
-def way_home(bridge: MissionController) -> Action:
-    """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.cell, bridge.scenario.dock_cell
-    if x != dock_x:
-        return Action.RIGHT if x < dock_x else Action.LEFT
-    if y != dock_y:
-        return Action.FORWARD if y < dock_y else Action.BACKWARD
-    return Action.HOVER
-
-
-class Flight:
+class Flight(FlightRecord):
     """One flight, tick by tick, as the bridge's node does it.
 
     Attributes:
-        log: each change of phase or reason.
-        executed: the step of each move that was flown.
-        cells: the cells that were flown to.
         known: the telemetry of the last tick.
         unflown: steps that counted, though the position that was reported was that of another cell.
     """
@@ -139,10 +89,8 @@ class Flight:
     def __init__(
         self, autopilot: Fake, how: SafetySettings, scenario: Scenario = SCENARIO, **bridge: Any
     ) -> None:
+        super().__init__()
         self.fake = autopilot
-        self.log: list[tuple[Phase, int, str]] = []
-        self.executed: list[int] = []
-        self.cells: list[tuple[int, int, int]] = []
         self.known = Telemetry()
         self.unflown: list[int] = []
         self._step = 0
@@ -154,13 +102,10 @@ class Flight:
 
     def _note(self) -> None:
         bridge = self.bridge
-        if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
-            self.executed.append(bridge.step)
-            self.cells.append(bridge.progress.goal)
         if bridge.step != self._step:
             self._step = bridge.step
             self._check_step()
-        self.log.append((bridge.phase, bridge.step, bridge.reason))
+        self.record(bridge)
 
     def _check_step(self) -> None:
         grid, centre = self.bridge.scenario.grid, self.bridge.progress.centre(self.bridge.cell)

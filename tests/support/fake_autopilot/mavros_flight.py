@@ -1,9 +1,6 @@
 """A flight beside a fake MAVROS: its process, and bridge and transport on a node's executor in this one."""
 
 import contextlib
-import json
-import queue
-import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,8 +9,8 @@ import pytest
 import rclpy
 
 from tests.conftest import Ros
+from tests.support.fake_autopilot.common import FakeProcess, FlightRecord, way_home
 from tests.support.worlds import changed
-from uav_dc_ros.core.grid import Action
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
 from uav_dc_ros.nodes.vehicles.mavros import MavrosVehicle
@@ -30,61 +27,23 @@ SCENARIO = changed(
 )
 
 
-class Fake:
+class Fake(FakeProcess):
     """The fake MAVROS; it is told what to do, and tells what happened."""
 
     def __init__(self, ros: Ros, *arguments: object) -> None:
-        self.process = ros.start("tests.support.fake_autopilot.mavros", *arguments, stdin=-1)
-        self.events: list[dict[str, Any]] = []
-        self._new: queue.Queue[dict[str, Any]] = queue.Queue()
-        threading.Thread(target=self._listen, daemon=True).start()
+        super().__init__(ros.start("tests.support.fake_autopilot.mavros", *arguments, stdin=-1))
         self.wait_for("ready")
-
-    def _listen(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            event = json.loads(line) if line.startswith("{") else {"event": "printed", "line": line}
-            self.events.append(event)
-            self._new.put(event)
-
-    def wait_for(self, event: str, seconds: float = 90.0) -> dict[str, Any]:
-        """The next event of a name that was not waited for yet."""
-        end = time.monotonic() + seconds
-        while True:
-            try:
-                told = self._new.get(timeout=max(0.0, end - time.monotonic()))
-            except queue.Empty:
-                raise AssertionError(f"no {event!r} within {seconds} s: {self.events[-5:]}") from None
-            if told["event"] == event:
-                return told
 
     def do(self, line: str) -> None:
         """A command, done when this returns."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{line}\n")
-        self.process.stdin.flush()
+        self.write(line)
         while self.wait_for("done")["line"] != line:
             pass
 
     def report(self) -> dict[str, Any]:
         """How it is now, and when it heard setpoints."""
-        assert self.process.stdin is not None
-        self.process.stdin.write("report\n")
-        self.process.stdin.flush()
+        self.write("report")
         return self.wait_for("report") | self.wait_for("times")
-
-    def all(self, event: str) -> list[dict[str, Any]]:
-        """All events of a name so far."""
-        return [told for told in self.events if told["event"] == event]
-
-    def close(self) -> None:
-        """End it; it must have lived until now."""
-        died = self.process.poll()
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError):
-            self.process.stdin.close()
-        self.process.wait(10.0)
-        assert died is None, self.events[-20:]
 
 
 @contextlib.contextmanager
@@ -123,21 +82,8 @@ def mavros_of(node: rclpy.node.Node, **how: Any) -> Iterator[MavrosVehicle]:
         yield vehicle
 
 
-def way_home(bridge: MissionController) -> Action:
-    """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.cell, bridge.scenario.dock_cell
-    if x != dock_x:
-        return Action.RIGHT if x < dock_x else Action.LEFT
-    return Action.HOVER if y == dock_y else Action.FORWARD
-
-
-class Flight:
-    """One flight, tick by tick, as the bridge's node does it.
-
-    Attributes:
-        log: each change of phase or reason, with the step.
-        executed, cells: the step of each move that was flown, and the cell that it led to.
-    """
+class Flight(FlightRecord):
+    """One flight, tick by tick, as the bridge's node does it."""
 
     def __init__(
         self,
@@ -147,18 +93,9 @@ class Flight:
         how: SafetySettings,
         **bridge: Any,
     ) -> None:
+        super().__init__()
         self.executor, self.vehicle, self.mavros = executor, vehicle, mavros
-        self.log: list[tuple[Phase, int, str]] = []
-        self.executed: list[int] = []
-        self.cells: list[tuple[int, int, int]] = []
-        self.bridge = MissionController(SCENARIO, how, self._note, **bridge)
-
-    def _note(self) -> None:
-        bridge = self.bridge
-        if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
-            self.executed.append(bridge.step)
-            self.cells.append(bridge.progress.goal)
-        self.log.append((bridge.phase, bridge.step, bridge.reason))
+        self.bridge = MissionController(SCENARIO, how, lambda: self.record(self.bridge), **bridge)
 
     def tick(self) -> None:
         """What the node's executor and timer do."""

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from tests.support.fake_autopilot.common import FlightRecord, way_home
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
@@ -159,22 +160,10 @@ def towards(position: Enu, target: Enu, seconds: float, speeds_mps: dict[str, fl
     )
 
 
-def way_home(bridge: MissionController) -> Action:
-    """A policy: straight to the dock, then hover."""
-    (x, y, _), (dock_x, dock_y) = bridge.progress.goal, bridge.scenario.dock_cell
-    if x != dock_x:
-        return Action.RIGHT if x < dock_x else Action.LEFT
-    if y != dock_y:
-        return Action.FORWARD if y < dock_y else Action.BACKWARD
-    return Action.HOVER
-
-
-class Flight:
+class Flight(FlightRecord):
     """Bridge, vehicle and policy, tick by tick.
 
     Attributes:
-        log: each change of phase or reason.
-        executed: the step of each move that was begun.
         ended_m: how far the vehicle was from the cell of each step that counted.
     """
 
@@ -185,10 +174,9 @@ class Flight:
         scenario: Scenario = SCENARIO,
         **bridge: object,
     ) -> None:
+        super().__init__()
         start_m = scenario.mission.start_m
         self.vehicle = vehicle or Vehicle(position=Enu(start_m[0], start_m[1], 0.0))
-        self.log: list[tuple[Phase, int, str]] = []
-        self.executed: list[int] = []
         self.ended_m: list[float] = []
         self.bridge = MissionController(scenario, how, self._note, **bridge)  # type: ignore[arg-type]
         self.policy: Callable[[MissionController], Action] | None = way_home
@@ -196,10 +184,7 @@ class Flight:
 
     def _note(self) -> None:
         bridge = self.bridge
-        changed = not self.log or self.log[-1][0] is not bridge.phase
-        self.log.append((bridge.phase, bridge.step, bridge.reason))
-        if bridge.phase is Phase.MOVING and changed:
-            self.executed.append(bridge.step)
+        self.record(bridge)
         if bridge.step != self._step:
             assert bridge.step == self._step + 1, "one step after the other"
             self._step = bridge.step

@@ -12,8 +12,9 @@ from typing import Any
 import msgspec
 
 from tests.support.fake_autopilot.autopilot import Autopilot, Control
+from tests.support.fake_autopilot.common import FlightRecord, way_home
 from tests.support.fake_autopilot.copter import TICK_S, Copter
-from tests.support.fake_autopilot.flight import SCENARIO, way_home
+from tests.support.fake_autopilot.flight import SCENARIO
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
@@ -45,7 +46,7 @@ def short(steps: int = 6) -> Scenario:
     return msgspec.structs.replace(SCENARIO, grid=small, mission=way, users=users)
 
 
-class VirtualFlight:
+class VirtualFlight(FlightRecord):
     """One flight, tick by tick; `do` commands the fake autopilot.
 
     Args:
@@ -62,8 +63,6 @@ class VirtualFlight:
         copter, autopilot: the fake; `events` is what it tells.
         bridge: decides.
         link_is_up: may be set.
-        log: each change of phase or reason.
-        executed: the step of each move that was flown.
     """
 
     def __init__(
@@ -78,6 +77,7 @@ class VirtualFlight:
         looks: int = LOOKS,
         **bridge: Any,
     ) -> None:
+        super().__init__()
         scenario = scenario or short()
         self.events: list[dict[str, Any]] = []
         self.copter = Copter(kind, 3.0)
@@ -92,8 +92,6 @@ class VirtualFlight:
         self._control = Control(self.autopilot)
         self.bridge = MissionController(scenario, how or SafetySettings(arm=True), self._note, **bridge)
         self.policy: Callable[[MissionController], Action] | None = way_home
-        self.log: list[tuple[Phase, int, str]] = []
-        self.executed: list[int] = []
         self.session.keep_alive(self.now_s)
         self.session.on_connected(self.now_s)
 
@@ -101,10 +99,7 @@ class VirtualFlight:
         self.events.append({"event": event, "t_s": self.copter.t_s, **more})
 
     def _note(self) -> None:
-        bridge = self.bridge
-        if bridge.phase is Phase.MOVING and (not self.log or self.log[-1][0] is not Phase.MOVING):
-            self.executed.append(bridge.step)
-        self.log.append((bridge.phase, bridge.step, bridge.reason))
+        self.record(self.bridge)
 
     def _write(self, data: bytes) -> bool:
         if self.link_is_up:
