@@ -37,58 +37,36 @@ Probability: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Hyperparameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Hyperparameters of training; the defaults are the paper's where it gives one.
+    """Hyperparameters of training; the defaults are the paper's where it gives one."""
 
-    Attributes:
-        gamma: discount.
-        epsilon: probability of the greedy action.
-        batch_size: transitions in a mini-batch.
-        learning_rate: of Adam.
-        target_every: iterations between copies to the target network. The paper leaves it open; 500 is about
-            eight missions.
-        buffer_size: transitions in the replay buffer. The paper leaves it open; 50 000 is about 800 missions.
-        episodes: missions of training.
-    """
-
-    gamma: Probability = 0.9
-    epsilon: Probability = 0.9
-    batch_size: Count = 32
-    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 1e-3
+    gamma: Probability = 0.9  # discount
+    epsilon: Probability = 0.9  # probability of the greedy action
+    batch_size: Count = 32  # transitions in a mini-batch
+    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 1e-3  # of Adam
+    # Iterations between copies to the target network. The paper leaves it open; 500 is about eight missions.
     target_every: Count = 500
+    # Transitions in the replay buffer. The paper leaves it open; 50 000 is about 800 missions.
     buffer_size: Count = 50_000
-    episodes: Count = 2000
+    episodes: Count = 2000  # missions of training
 
 
 class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A policy without its parameters.
+    """A policy without its parameters."""
 
-    Attributes:
-        format: version of this file's layout.
-        name: the policy's name.
-        algorithm: `dqn` or `dueling_dqn`.
-        aggregation: subtracted from the advantage by the dueling network; ignored for `dqn`.
-        observation: encoding, see `core.observations`.
-        hidden: units of each hidden layer.
-        actions: labels of the actions, in the order of the network's outputs.
-        hyperparameters: of training.
-        seed: seed of its run.
-        episode: episode after which these parameters were taken.
-        version: version of the package that made it.
-        scenario: the world it was trained in, as plain values.
-    """
-
-    format: Literal[1] = 1
-    name: Annotated[str, Meta(pattern=NAME)]
-    algorithm: Algorithm
+    format: Literal[1] = 1  # version of this file's layout
+    name: Annotated[str, Meta(pattern=NAME)]  # the policy's name
+    algorithm: Algorithm  # `dqn` or `dueling_dqn`
+    # Subtracted from the advantage by the dueling network; ignored for `dqn`
     aggregation: network.Aggregation = "mean"
-    observation: Observation
+    observation: Observation  # encoding, see `core.observations`
+    # Units of each hidden layer
     hidden: Annotated[tuple[network.Width, ...], Meta(min_length=1, max_length=16)]
-    actions: tuple[str, ...] = ACTION_LABELS
-    hyperparameters: Hyperparameters
-    seed: Annotated[int, Meta(ge=0)]
-    episode: Annotated[int, Meta(ge=0)]
-    version: str
-    scenario: dict[str, Any]
+    actions: tuple[str, ...] = ACTION_LABELS  # labels of the actions, in the order of the network's outputs
+    hyperparameters: Hyperparameters  # of training
+    seed: Annotated[int, Meta(ge=0)]  # seed of its run
+    episode: Annotated[int, Meta(ge=0)]  # episode after which these parameters were taken
+    version: str  # version of the package that made it
+    scenario: dict[str, Any]  # the world it was trained in, as plain values
 
     def architecture(self, scenario: Scenario) -> network.Architecture:
         """Sizes of its network for the world it was trained in."""
@@ -102,21 +80,13 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Policy:
-    """A trained policy.
+    """A trained policy."""
 
-    Attributes:
-        folder: folder that it was loaded from.
-        config: everything except the parameters.
-        scenario: the world it was trained in.
-        parameters: of its network, float32, as named by `network.shapes`.
-        sha256: hash of config and model, in hex: identifies exactly what flew.
-    """
-
-    folder: Path
-    config: PolicyConfig
-    scenario: Scenario
-    parameters: Mapping[str, Array]
-    sha256: str
+    folder: Path  # folder that it was loaded from
+    config: PolicyConfig  # everything except the parameters
+    scenario: Scenario  # the world it was trained in
+    parameters: Mapping[str, Array]  # of its network, float32, as named by `network.shapes`
+    sha256: str  # hash of config and model, in hex: identifies exactly what flew
 
     @property
     def name(self) -> str:

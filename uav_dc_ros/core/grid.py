@@ -47,21 +47,16 @@ MOVES: tuple[tuple[int, int, int], ...] = (
 
 
 class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Extent and spacing of the cells.
+    """Extent and spacing of the cells."""
 
-    Attributes:
-        n_x, n_y, n_z: number of cells east, north and up.
-        cell_m: horizontal distance between neighbouring centres, metres.
-        altitude_min_m: altitude of the lowest layer, metres above the users.
-        altitude_step_m: distance between layers, metres.
-    """
-
+    # n_x, n_y, n_z: number of cells east, north and up
     n_x: Annotated[int, msgspec.Meta(ge=1, le=1000)]
     n_y: Annotated[int, msgspec.Meta(ge=1, le=1000)]
     n_z: Annotated[int, msgspec.Meta(ge=1, le=100)]
-    cell_m: Annotated[float, msgspec.Meta(gt=0)]
+    cell_m: Annotated[float, msgspec.Meta(gt=0)]  # horizontal distance between neighbouring centres, metres
+    # Altitude of the lowest layer, metres above the users
     altitude_min_m: Annotated[float, msgspec.Meta(gt=0)]
-    altitude_step_m: Annotated[float, msgspec.Meta(gt=0)]
+    altitude_step_m: Annotated[float, msgspec.Meta(gt=0)]  # distance between layers, metres
 
     @property
     def shape(self) -> tuple[int, int, int]:

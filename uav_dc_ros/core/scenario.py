@@ -40,62 +40,38 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class UserSettings(_Table, frozen=True):
-    """The users on the ground.
+    """The users on the ground."""
 
-    Attributes:
-        cluster_centres_m: centre x, y of each of the M clusters, metres.
-        users_per_cluster: users K in a cluster.
-        cluster_radius_m: radius C of the disc in which a cluster's users start, metres.
-        v_max_mps: maximum speed v of the random walk, m/s.
-    """
-
+    # Centre x, y of each of the M clusters, metres
     cluster_centres_m: Annotated[tuple[tuple[float, float], ...], Meta(min_length=1, max_length=1000)]
-    users_per_cluster: Annotated[int, Meta(ge=1, le=100_000)]
-    cluster_radius_m: Positive
-    v_max_mps: NotNegative
+    users_per_cluster: Annotated[int, Meta(ge=1, le=100_000)]  # users K in a cluster
+    cluster_radius_m: Positive  # radius C of the disc in which a cluster's users start, metres
+    v_max_mps: NotNegative  # maximum speed v of the random walk, m/s
 
 
 class MissionSettings(_Table, frozen=True):
-    """Start, destination and limits of the mission.
+    """Start, destination and limits of the mission."""
 
-    Attributes:
-        start_m: start x, y, altitude, metres; the centre of a cell.
-        dock_m: destination x, y, metres; the centre of a cell.
-        step_s: duration of a step, seconds.
-        max_steps: steps T_cons that the battery allows.
-        d_cons_m: maximum 3D distance at which a user is served, metres.
-        r_min_bits: data at which a user counts as collected, bit.
-        episode_end: `at_time_limit`: every mission flies `max_steps` steps, and has landed if it ends
-            over the dock. `on_arrival`: it ends at the dock, or after `max_steps` without landing.
-    """
-
-    start_m: tuple[float, float, float]
-    dock_m: tuple[float, float]
-    step_s: Positive
-    max_steps: Annotated[int, Meta(ge=1, le=1_000_000)]
-    d_cons_m: Positive
-    r_min_bits: Positive
+    start_m: tuple[float, float, float]  # start x, y, altitude, metres; the centre of a cell
+    dock_m: tuple[float, float]  # destination x, y, metres; the centre of a cell
+    step_s: Positive  # duration of a step, seconds
+    max_steps: Annotated[int, Meta(ge=1, le=1_000_000)]  # steps T_cons that the battery allows
+    d_cons_m: Positive  # maximum 3D distance at which a user is served, metres
+    r_min_bits: Positive  # data at which a user counts as collected, bit
+    # `at_time_limit`: every mission flies `max_steps` steps, and has landed if it ends over the dock.
+    # `on_arrival`: it ends at the dock, or after `max_steps` without landing.
     episode_end: EpisodeEnd
 
 
 class RadioSettings(_Table, frozen=True):
-    """The uplink.
+    """The uplink."""
 
-    Attributes:
-        bandwidth_hz: bandwidth B, hertz.
-        tx_power_w: transmit power p of a user, watts.
-        noise_power_dbm: noise power alpha^2, dBm.
-        ref_gain_db: channel power gain beta_0 at 1 m, dB.
-        path_loss_exponent: exponent of the path loss.
-        interference: transmitting users, see `radio.sinr`.
-    """
-
-    bandwidth_hz: Positive
-    tx_power_w: Positive
-    noise_power_dbm: Annotated[float, Meta(ge=-300, le=100)]
-    ref_gain_db: Annotated[float, Meta(ge=-200, le=100)]
-    path_loss_exponent: Annotated[float, Meta(ge=1, le=10)]
-    interference: Interference
+    bandwidth_hz: Positive  # bandwidth B, hertz
+    tx_power_w: Positive  # transmit power p of a user, watts
+    noise_power_dbm: Annotated[float, Meta(ge=-300, le=100)]  # noise power alpha^2, dBm
+    ref_gain_db: Annotated[float, Meta(ge=-200, le=100)]  # channel power gain beta_0 at 1 m, dB
+    path_loss_exponent: Annotated[float, Meta(ge=1, le=10)]  # exponent of the path loss
+    interference: Interference  # transmitting users, see `radio.sinr`
 
     @property
     def noise_power_w(self) -> float:
@@ -109,21 +85,13 @@ class RadioSettings(_Table, frozen=True):
 
 
 class RewardSettings(_Table, frozen=True):
-    """The trade-off game.
+    """The trade-off game."""
 
-    Attributes:
-        beta: weight of the data collected.
-        zeta: weight of the trajectory reward.
-        r_plus: trajectory reward, see `reward.r_plus`.
-        form: reward of a step, see `reward.step_reward`.
-        data_scale_bits: data of a user that counts as 1 in the reward, bit.
-    """
-
-    beta: NotNegative
-    zeta: NotNegative
-    r_plus: RPlus
-    form: RewardForm
-    data_scale_bits: Positive
+    beta: NotNegative  # weight of the data collected
+    zeta: NotNegative  # weight of the trajectory reward
+    r_plus: RPlus  # trajectory reward, see `reward.r_plus`
+    form: RewardForm  # reward of a step, see `reward.step_reward`
+    data_scale_bits: Positive  # data of a user that counts as 1 in the reward, bit
 
 
 class Scenario(_Table, frozen=True, dict=True):

@@ -17,59 +17,35 @@ from uav_dc_ros.core.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """The channel in one step. `U` is the number of users.
+    """The channel in one step. `U` is the number of users."""
 
-    Attributes:
-        sinr: linear, `[..., U]`.
-        rate_bps: achievable rate of each user, bit/s, `[..., U]`.
-        served: P(m, k), bool `[..., U]`.
-        sum_rate_bps: sum of the rates of the served users, bit/s, `[...]`.
-    """
-
-    sinr: Array
-    rate_bps: Array
-    served: Array
-    sum_rate_bps: Array
+    sinr: Array  # linear, `[..., U]`
+    rate_bps: Array  # achievable rate of each user, bit/s, `[..., U]`
+    served: Array  # P(m, k), bool `[..., U]`
+    sum_rate_bps: Array  # sum of the rates of the served users, bit/s, `[...]`
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """A world between two steps.
+    """A world between two steps."""
 
-    Attributes:
-        step: steps flown, integers `[...]`.
-        cell: the UAV's cell, integers `[..., 3]`.
-        users_m: users' positions, metres, `[..., U, 2]`.
-        data_bits: data collected from each user, bit, `[..., U]`.
-        collected: bool `[..., U]`.
-        total_reward: r^t (eq. 7), `[...]`.
-    """
-
-    step: Array
-    cell: Array
-    users_m: Array
-    data_bits: Array
-    collected: Array
-    total_reward: Array
+    step: Array  # steps flown, integers `[...]`
+    cell: Array  # the UAV's cell, integers `[..., 3]`
+    users_m: Array  # users' positions, metres, `[..., U, 2]`
+    data_bits: Array  # data collected from each user, bit, `[..., U]`
+    collected: Array  # bool `[..., U]`
+    total_reward: Array  # r^t (eq. 7), `[...]`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """The result of a step, each `[...]`.
+    """The result of a step, each `[...]`."""
 
-    Attributes:
-        reward: the agent's reward.
-        terminated: the mission is over.
-        truncated: the mission was cut off (`on_arrival`: out of steps before the dock).
-        landed: the mission is over and the UAV is over the dock.
-        link: the channel during the step.
-    """
-
-    reward: Array
-    terminated: Array
-    truncated: Array
-    landed: Array
-    link: Link
+    reward: Array  # the agent's reward
+    terminated: Array  # the mission is over
+    truncated: Array  # the mission was cut off (`on_arrival`: out of steps before the dock)
+    landed: Array  # the mission is over and the UAV is over the dock
+    link: Link  # the channel during the step
 
 
 # An action (its value) for each world, integers `[...]`, from their state `[...]`.

@@ -22,87 +22,62 @@ TEST_SEEDS = range(100)
 
 
 class Figure(msgspec.Struct, frozen=True, kw_only=True):
-    """Statistics of one quantity over missions; null where unknown.
+    """Statistics of one quantity over missions; null where unknown."""
 
-    Attributes:
-        n: missions that have the quantity.
-        mean: over these missions.
-        low, high: ends of the 95% bootstrap interval of the mean, for two missions or more. It has no width
-            where all missions are alike: 100 landings of 100 do not exclude a rare failure.
-        min, max: extremes.
-    """
-
-    n: int
-    mean: float | None = None
+    n: int  # missions that have the quantity
+    mean: float | None = None  # over these missions
+    # low, high: ends of the 95% bootstrap interval of the mean, for two missions or more. It has no width
+    # where all missions are alike: 100 landings of 100 do not exclude a rare failure.
     low: float | None = None
     high: float | None = None
+    # min, max: extremes
     min: float | None = None
     max: float | None = None
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
-    """The performance of a policy in a scenario.
+    """The performance of a policy in a scenario."""
 
-    Attributes:
-        policy, sha256: name, and hash of config and model; no hash for a planner.
-        scenario, fingerprint: name, and hash of the world's values.
-        version: of the package.
-        seeds: first seed and number of seeds.
-        users_total: users in the field.
-        landing_rate: 1 for a mission that landed, else 0.
-        users_collected, steps: counts per mission.
-        arrival_step: step after which the UAV stayed over the dock; missions that landed only.
-        sum_rate_bps: mean over the steps of a mission, bit/s.
-        data_bits: data collected in a mission, bit.
-        reward: r^t at the end of a mission (eq. 7), with the weights of this scenario.
-        episode_return: undiscounted sum of the agent's rewards.
-    """
-
+    # policy, sha256: name, and hash of config and model; no hash for a planner
     policy: str
     sha256: str | None
+    # scenario, fingerprint: name, and hash of the world's values
     scenario: str
     fingerprint: str
-    version: str
-    seeds: tuple[int, int]
-    users_total: int
-    landing_rate: Figure
+    version: str  # of the package
+    seeds: tuple[int, int]  # first seed and number of seeds
+    users_total: int  # users in the field
+    landing_rate: Figure  # 1 for a mission that landed, else 0
+    # users_collected, steps: counts per mission
     users_collected: Figure
     steps: Figure
-    arrival_step: Figure
-    sum_rate_bps: Figure
-    data_bits: Figure
-    reward: Figure
-    episode_return: Figure
+    arrival_step: Figure  # step after which the UAV stayed over the dock; missions that landed only
+    sum_rate_bps: Figure  # mean over the steps of a mission, bit/s
+    data_bits: Figure  # data collected in a mission, bit
+    reward: Figure  # r^t at the end of a mission (eq. 7), with the weights of this scenario
+    episode_return: Figure  # undiscounted sum of the agent's rewards
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
-    """Two policies in the same missions, mission by mission.
+    """Two policies in the same missions, mission by mission."""
 
-    Attributes:
-        policy, baseline: names.
-        scenario, fingerprint, seeds: as in `Evaluation`.
-        differences: `policy` minus `baseline`, by the name of the figure in `Evaluation`, over the missions
-            in which both have it.
-    """
-
+    # policy, baseline: names
     policy: str
     baseline: str
+    # scenario, fingerprint, seeds: as in `Evaluation`
     scenario: str
     fingerprint: str
     seeds: tuple[int, int]
+    # `policy` minus `baseline`, by the name of the figure in `Evaluation`, over the missions in which both
+    # have it
     differences: dict[str, Figure]
 
 
 class EvaluationReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of a file of `python -m uav_dc_ros.evaluate --json`.
+    """The content of a file of `python -m uav_dc_ros.evaluate --json`."""
 
-    Attributes:
-        evaluations: one for each policy in each scenario.
-        comparisons: in each scenario, every further policy with the first.
-    """
-
-    evaluations: list[Evaluation]
-    comparisons: list[Comparison]
+    evaluations: list[Evaluation]  # one for each policy in each scenario
+    comparisons: list[Comparison]  # in each scenario, every further policy with the first
 
 
 @dataclass(frozen=True, kw_only=True)
