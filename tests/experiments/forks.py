@@ -2,7 +2,7 @@
 
     python -m tests.experiments.forks
 
-It reads lines of JSON: a moment at which the child kills itself (what is called, which of its calls, before
+It reads lines of JSON: a moment at which the child kills itself (a function, the number of its call, before
 or after it) or null, arguments of `uav_dc_ros.train`, and a file for all that the child prints. It answers
 each with the child's process id, and with its exit status when it has ended.
 """
@@ -62,7 +62,7 @@ class Forks:
         return Child(self, output)
 
     def answer(self) -> int:
-        """The next number that it tells."""
+        """The next number that it reports."""
         assert self._process.stdout is not None
         return int(self._process.stdout.readline())
 

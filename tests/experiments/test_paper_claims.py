@@ -97,7 +97,7 @@ TRUE = {
     "C19": lambda s: {"tau": 20 if s.batch_size == 32 else 60},
     "C20": lambda s: rates(s, {1e-3: 1.1, 1e-5: 0.4}, {1e-4: 100, 1e-5: 100}, {1e-2: 0.3}),
 }
-# And in one in which one thing that it says is false, the others being true.
+# And in one in which one part of it is false, the others being true.
 FALSE = {
     "C1 lands": ("C1", lambda s: TRUE["C1"](s) | {"greedy_landing_rate": 0.1}),
     "C1 users": ("C1", lambda s: {"greedy_users_collected": 27.0}),

@@ -1,4 +1,4 @@
-"""The policies that come with the package do what their cards say."""
+"""The shipped policies perform as their cards state."""
 
 import re
 import shlex

@@ -167,7 +167,7 @@ def test_a_mistake_is_one_line_and_status_2(tmp_path, field, capsys, arguments, 
     assert list(tmp_path.iterdir()) == [field], "nothing is in the way of the next command"
 
 
-def test_so_it_is_for_a_whole_process(tmp_path, field):
+def test_a_mistake_ends_a_whole_process_alike(tmp_path, field):
     status, out, err = command(
         "--scenario", field, "--algo", "dqn", "--out", tmp_path / "made", "--batch-size", 0
     )
@@ -267,10 +267,10 @@ def killed(tmp_path_factory, request, forks):
     """A folder for each moment: `killed` as a kill left it, `made` as `--resume` then ended."""
     root = tmp_path_factory.mktemp("killed")
     (root / "tiny.toml").write_text(TINY)
-    asked = {
+    selected = {
         item.callspec.params.get("moment") for item in request.session.items if hasattr(item, "callspec")
     }
-    moments = {name: MOMENTS[name] for name in MOMENTS if name == "never" or name in asked}
+    moments = {name: MOMENTS[name] for name in MOMENTS if name == "never" or name in selected}
     for moment, (kill, checkpoints) in moments.items():
         (root / moment).mkdir()
         arguments = learns(root / moment, **{"--tensorboard": root / moment / "scalars"})
@@ -279,8 +279,8 @@ def killed(tmp_path_factory, request, forks):
             assert child.wait() == -signal.SIGKILL, child.output
         child = forks.start([*arguments, "--resume"])
         assert child.wait() == 0, child.output
-        told = [line.split() for line in child.output.splitlines()]
-        assert [int(words[1]) for words in told if words[0] == "episode"] == checkpoints, child.output
+        lines = [line.split() for line in child.output.splitlines()]
+        assert [int(words[1]) for words in lines if words[0] == "episode"] == checkpoints, child.output
     (root / "left").mkdir()
     child = forks.start(learns(root / "left"), MOMENTS["between two checkpoints"][0])
     assert child.wait() == -signal.SIGKILL, child.output
@@ -288,7 +288,7 @@ def killed(tmp_path_factory, request, forks):
 
 
 def result(folder):
-    """Every file of a policy but its card, which tells the time and the command."""
+    """Every file of a policy but its card, which has the time and the command."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != policy.CARD}
 
 
@@ -392,7 +392,7 @@ def test_a_foreign_file_is_refused(left, capsys):
     assert "not the state of a training" in refused(capsys, *learns(left), "--resume")
 
 
-def test_a_best_policy_that_is_gone_is_missed_at_once(left, capsys):
+def test_a_missing_best_policy_is_an_error_at_once(left, capsys):
     shutil.rmtree(left / "made.checkpoints" / "episode_000020")
     assert "episode_000020" in refused(capsys, *learns(left), "--resume")
 

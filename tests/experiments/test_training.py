@@ -192,7 +192,7 @@ def test_the_count_notices_a_crossing():
 
 @pytest.mark.parametrize("end", ENDS)
 def test_nothing_is_left_on_the_host(end, monkeypatch):
-    """The meta device knows shapes and no values: to ask for one is an error, as is a tensor of the CPU."""
+    """The meta device knows shapes and no values: reading one is an error, as is a tensor of the CPU."""
     meta, scenario = torch.device("meta"), tiny(mission={"episode_end": end})
     # Its own Adam is for devices that compute.
     monkeypatch.setattr(torch.optim, "Adam", lambda groups, fused: torch.optim.SGD(groups, foreach=False))

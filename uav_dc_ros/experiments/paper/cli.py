@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper.setting import SCALES
-from uav_dc_ros.experiments.paper.shards import Shard
+from uav_dc_ros.experiments.paper.shards import Shard, result_file
 from uav_dc_ros.experiments.paper.workers import train_locally, train_on_ray
+from uav_dc_ros.experiments.train.progress import ProgressBar
 
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.paper.results import Results
@@ -101,19 +102,18 @@ def _train(options: argparse.Namespace, command: str) -> "tuple[Results, Network
     folder = out / "shards"
     resumed = _reserve(folder, options)
     started = time.monotonic()
-    with _Progress(sum(shard.n_steps for shard, _ in sweep.make_shards(planned, scale))) as progress:
-
-        def train_shards(shards: Sequence[Shard], folder: Path) -> None:
-            progress.start(shards)
-            if options.ray is not None:
-                train_on_ray(shards, folder, options.ray, progress.update)
-            else:
-                train_locally(shards, folder, options.workers, progress.update)
-
-        try:
-            found = sweep.train(planned, scale, folder, train_shards)
-        finally:
-            _discard_empty(folder)
+    shards = sweep.make_shards(planned, scale)
+    missing = [shard for shard, _ in shards if not result_file(folder, shard).is_file()]
+    try:
+        if missing:
+            with _Progress(sum(shard.n_steps for shard, _ in shards), missing) as progress:
+                if options.ray is not None:
+                    train_on_ray(missing, folder, options.ray, progress.show)
+                else:
+                    train_locally(missing, folder, options.workers, progress.show)
+        found = sweep.load_results(shards, folder)
+    finally:
+        _discard_empty(folder)
     local = f"{options.workers} processes on {_cores()} cores of {platform.machine()}"
     metadata = Metadata(
         command=command,
@@ -136,8 +136,7 @@ def _train(options: argparse.Namespace, command: str) -> "tuple[Results, Network
 def _reserve(folder: Path, options: argparse.Namespace) -> bool:
     """Makes the folder of the shards; returns whether it holds shards to resume.
 
-    Raises:
-        TrainingError: it cannot be made, or belongs to a sweep with other options.
+    Raises TrainingError if it cannot be made, or belongs to a sweep with other options.
     """
     only = None if options.only is None else sorted(set(options.only))
     plan = msgspec.json.encode({"scale": options.scale, "only": only})
@@ -168,41 +167,28 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-class _Progress:
-    """Agent-steps done, their rate and the time left: a bar on a terminal, lines elsewhere."""
+class _Progress(ProgressBar):
+    """Agent-steps done, their rate and the time left."""
 
-    def __init__(self, total: int) -> None:
-        self._console = Console(stderr=True)
-        self._bar = Progress(
+    def __init__(self, total: int, shards: Sequence[Shard]) -> None:
+        """For the shards to train; the rest of `total` agent-steps is done."""
+        super().__init__(
             BarColumn(bar_width=20),
-            TextColumn("{task.percentage:3.0f}%  {task.fields[rate]}"),
+            TextColumn("{task.percentage:3.0f}%  {task.fields[text]}"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
-            console=self._console,
-            disable=not self._console.is_terminal,
+            total=total,
         )
-        self._task = self._bar.add_task("", total=total, rate="")
         self._total = total
-        self._shards: dict[str, Shard] = {}
+        self._shards = {shard.name: shard for shard in shards}
+        self._before = total - sum(shard.n_steps for shard in shards)
         # Agent-steps of each shard at its first update, and now.
         self._first: dict[str, int] = {}
         self._done: dict[str, int] = {}
         self._started = self._last = time.monotonic()
 
-    def __enter__(self) -> "_Progress":
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def start(self, shards: Sequence[Shard]) -> None:
-        """Sets the shards to train; the others are done."""
-        self._shards = {shard.name: shard for shard in shards}
-        self._before = self._total - sum(shard.n_steps for shard in shards)
-
-    def update(self, name: str, n_flown: int) -> None:
-        """Sets the episodes flown by each run of a shard."""
+    def show(self, name: str, n_flown: int) -> None:
+        """Shows the episodes flown by each run of a shard."""
         shard = self._shards[name]
         n_episodes = shard.population.n_episodes
         # A resumed shard begins at its checkpoint; one that reports only its end, at 0.
@@ -211,11 +197,9 @@ class _Progress:
         self._done[name] = shard.n_steps * n_flown // n_episodes
         done, now = sum(self._done.values()), time.monotonic()
         rate = (done - sum(self._first.values())) / max(now - self._started, 1e-9)
-        completed = self._before + done
-        self._bar.update(self._task, completed=completed, rate=f"{rate:,.0f} agent-steps/s")
-        if not self._console.is_terminal and now - self._last > _LINE_EVERY_S:
+        completed, text, line = self._before + done, f"{rate:,.0f} agent-steps/s", None
+        if now - self._last > _LINE_EVERY_S:
             self._last = now
             left_min = (self._total - completed) / max(rate, 1e-9) / 60
-            self._console.print(
-                f"{completed / self._total:.0%} done, {rate:,.0f} agent-steps/s, {left_min:.1f} minutes left"
-            )
+            line = f"{completed / self._total:.0%} done, {text}, {left_min:.1f} minutes left"
+        self.update(completed, text, line)

@@ -38,8 +38,7 @@ class Evidence:
     def of(self, measure: str, setting: Setting, *axes: str) -> Array:
         """A measure in every environment along `axes` of the sweep, `[E, ...]`; means over repeats.
 
-        Raises:
-            NotMeasured: a setting has no run in one of the environments.
+        Raises NotMeasured if a setting has no run in one of the environments.
         """
         values = self._of_runs(measure)
         cells = [self._by_environment(values, one) for one in setting.along(axes, self.scale)]
@@ -110,15 +109,10 @@ def smooth(curves: Array) -> Array:
 
 
 def settling(curves: Array, goal: Array, episode: Array) -> Array:
-    """Episode from which on smoothed curves stay above 90% of the way from their first point to a goal.
+    """Episode `[n]` from which on smoothed curves stay above 90% of the way from their start to a goal.
 
-    Args:
-        curves: `[n, P]`.
-        goal: `[n]`.
-        episode: of each point, `[P]`.
-
-    Returns:
-        Episodes, `[n]`: the last one for a goal that is not above the start, or a curve that does not stay.
+    It is the last one for a goal that is not above the start, or a curve that does not stay. Curves are
+    `[n, P]`, goals `[n]`, and the episodes of the points `[P]`.
     """
     start = curves[:, 0]
     level = start + SETTLED * (goal - start)

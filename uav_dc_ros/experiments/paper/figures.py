@@ -61,8 +61,7 @@ def drawable(results: Results) -> list[str]:
 def draw(figure: str, results: Results, tracks: Sequence[Trajectory], path: Path) -> None:
     """Writes a figure as a PNG file; `tracks` are the greedy missions of the figure `Traj`.
 
-    Raises:
-        TrainingError: there is no such figure, it lacks runs or missions, or the file cannot be written.
+    Raises TrainingError if there is no such figure, it lacks runs or missions, or the file cannot be written.
     """
     plan = figure_plan(figure)
     dpi = _DPI

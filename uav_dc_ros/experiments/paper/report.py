@@ -15,7 +15,7 @@ from uav_dc_ros.experiments.paper.criteria import RULES, Criterion, Table, Verdi
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES
-from uav_dc_ros.experiments.paper.results import Metadata, Results
+from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import domain, name
 
 CLAIMS_FILE, VERDICTS_FILE = "claims.md", "claims.json"
@@ -65,10 +65,14 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
     """The text of `claims.md`; `drawn` are the figures beside it."""
     n = Counter(finding.verdict for finding in findings)
     counts = ", ".join(f"{n[verdict]} {words}" for verdict, words in _VERDICTS.items() if n[verdict])
-    evidence = Evidence(results)
+    evidence, scale = Evidence(results), results.metadata.scale
+    warning = (
+        f"> **The scale is `{scale.name}`: {scale.episodes} episodes. These numbers mean nothing.** "
+        "They show that every figure and every claim can be made."
+    )
     sections = [
         "# Findings on the paper's claims",
-        *_warning(results.metadata),
+        *([] if scale.name == "full" else [warning]),
         f"Of {len(findings)} claims {counts}.",
         _summary(findings),
         "Effect and interval are those of the part that decides: where a claim fails, the part it fails by.",
@@ -83,15 +87,6 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
         *(section for finding in findings for section in _sections(finding, evidence, drawn)),
     ]
     return "\n\n".join(sections) + "\n"
-
-
-def _warning(metadata: Metadata) -> list[str]:
-    if metadata.scale.name == "full":
-        return []
-    return [
-        f"> **The scale is `{metadata.scale.name}`: {metadata.scale.episodes} episodes. These numbers mean "
-        "nothing.** They show that every figure and every claim can be made."
-    ]
 
 
 def _provenance(results: Results) -> str:

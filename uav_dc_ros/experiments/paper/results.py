@@ -133,11 +133,7 @@ class Results:
         return indices
 
     def save(self, folder: Path) -> None:
-        """Writes both files into an existing folder, each in one move.
-
-        Raises:
-            TrainingError: they cannot be written.
-        """
+        """Writes both files into an existing folder, each in one move; raises TrainingError if it cannot."""
         n_runs, n_points = len(self.planned), len(self.episode)
         runs = {
             "run": range(n_runs),
@@ -161,8 +157,7 @@ class Results:
     def load(cls, folder: Path) -> "Results":
         """Reads what `save` wrote.
 
-        Raises:
-            TrainingError: a file is missing or damaged, has other columns, or is of another sweep.
+        Raises TrainingError if a file is missing or damaged, has other columns, or is of another sweep.
         """
         runs, metadata = _read(folder / RUNS_FILE, _RUNS_SCHEMA)
         curves, other = _read(folder / CURVES_FILE, _CURVES_SCHEMA)

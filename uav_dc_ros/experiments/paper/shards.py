@@ -135,11 +135,7 @@ def save_result(folder: Path, shard: Shard, content: bytes) -> None:
 
 
 def load_result(folder: Path, shard: Shard) -> ShardResult:
-    """Reads the result of a shard.
-
-    Raises:
-        TrainingError: it is missing or damaged.
-    """
+    """Reads the result of a shard; raises TrainingError if it is missing or damaged."""
     path = result_file(folder, shard)
     shape = (shard.population.n_episodes, len(shard.population.runs))
     try:

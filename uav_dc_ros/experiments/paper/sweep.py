@@ -1,7 +1,7 @@
 """The sweep: planned runs become shards, and their results become `Results`."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -18,11 +18,10 @@ from uav_dc_ros.core.world import observe
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.rollout import roll_out_trajectory
-from uav_dc_ros.experiments.paper import shards
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results
 from uav_dc_ros.experiments.paper.setting import HIDDEN, OBSERVATION, PlannedRun, Scale, Setting
-from uav_dc_ros.experiments.paper.shards import Shard, ShardResult
+from uav_dc_ros.experiments.paper.shards import Shard, ShardResult, load_result
 from uav_dc_ros.experiments.train.population import Population, architecture, layout
 
 # Runs of a shard: enough to hide the overhead of an operation, few enough for a core's cache, and enough
@@ -31,8 +30,6 @@ _SHARD_RUNS = 128
 # First seed of the greedy missions and their number: disjoint from training, validation and test.
 GREEDY_SEEDS = (2_000_000, 20)
 
-# Trains shards and saves their results in a folder.
-TrainShards = Callable[[Sequence[Shard], Path], None]
 # The result of each run's shard, and the index of the run in it.
 RunResults: TypeAlias = dict[PlannedRun, tuple[ShardResult, int]]
 # Trained networks of the figure `Traj`, by environment.
@@ -56,16 +53,12 @@ def make_shards(planned: Sequence[PlannedRun], scale: Scale) -> list[tuple[Shard
     return sorted(made, key=lambda one: (-one[0].n_steps, one[0].name))
 
 
-def train(planned: Sequence[PlannedRun], scale: Scale, folder: Path, train_shards: TrainShards) -> RunResults:
-    """Trains the shards whose results are not in `folder`, and loads all results."""
-    made = make_shards(planned, scale)
-    missing = [shard for shard, _ in made if not shards.result_file(folder, shard).is_file()]
-    if missing:
-        train_shards(missing, folder)
+def load_results(shards: Iterable[tuple[Shard, list[PlannedRun]]], folder: Path) -> RunResults:
+    """Reads the results of all shards; raises TrainingError if one is missing or damaged."""
     found: RunResults = {}
-    for shard, own in made:
-        result = shards.load_result(folder, shard)
-        found |= {one: (result, run) for run, one in enumerate(own)}
+    for shard, runs in shards:
+        result = load_result(folder, shard)
+        found |= {one: (result, run) for run, one in enumerate(runs)}
     return found
 
 
@@ -77,25 +70,25 @@ def collect(planned: Sequence[PlannedRun], metadata: Metadata, found: RunResults
         result, run = found[one]
         return result.curves[name][: n_points * per_point, run].reshape(n_points, per_point).mean(axis=1)
 
-    def greedy(one: PlannedRun, name: str) -> float:
+    def greedy(one: PlannedRun) -> list[float]:
         result, run = found[one]
         missions, max_steps = result.greedy, metadata.worlds[one.setting.scenario].max_steps
-        values = {
-            "greedy_reward": missions.reward,
-            "greedy_return": missions.episode_return,
-            "greedy_throughput_bps": missions.sum_rate_bps,
-            "greedy_users_collected": missions.users_collected,
-            "greedy_landing_rate": missions.landed,
-            "greedy_arrival_step": np.where(missions.landed, missions.arrival_step, max_steps),
-        }
-        return float(np.mean(values[name][run]))
+        values = (  # in the order of GREEDY
+            missions.reward,
+            missions.episode_return,
+            missions.sum_rate_bps,
+            missions.users_collected,
+            missions.landed,
+            np.where(missions.landed, missions.arrival_step, max_steps),
+        )
+        return [float(np.mean(value[run])) for value in values]
 
     return Results(
         metadata=metadata,
         planned=tuple(planned),
         episode=per_point * (1 + np.arange(n_points)),
         curves={name: np.stack([curve(one, name) for one in planned]) for name in METRICS},
-        greedy={name: np.array([greedy(one, name) for one in planned], np.float32) for name in GREEDY},
+        greedy=dict(zip(GREEDY, np.array([greedy(one) for one in planned], np.float32).T, strict=True)),
     )
 
 

@@ -36,8 +36,7 @@ def train_locally(shards: Sequence[Shard], folder: Path, n_workers: int, on_prog
 
     A worker that dies is replaced; the new one resumes from the checkpoint.
 
-    Raises:
-        TrainingError: a shard failed, or its worker died three times.
+    Raises TrainingError if a shard failed, or its worker died three times.
     """
     context = multiprocessing.get_context("spawn")  # a fork would inherit threads of torch and numpy
     waiting = [(shard, 1) for shard in shards]
@@ -105,8 +104,7 @@ def train_on_ray(shards: Sequence[Shard], folder: Path, address: str, on_progres
     Ray restarts a shard whose worker or node dies. `address` is that of `ray.init`, such as `HOST:6379`,
     `ray://HOST:10001`, or `auto`. `on_progress` is called for finished shards only.
 
-    Raises:
-        TrainingError: ray is not installed, the cluster cannot be reached, or a shard failed.
+    Raises TrainingError if ray is not installed, the cluster cannot be reached, or a shard failed.
     """
     try:
         import ray

@@ -10,7 +10,6 @@ from safetensors import SafetensorError, safe_open
 
 from uav_dc_ros import files
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.train.population import Population
 from uav_dc_ros.experiments.train.training import Training
 
 _FORMAT = 1
@@ -21,11 +20,10 @@ _UNREADABLE = (OSError, SafetensorError, msgspec.DecodeError, KeyError, TypeErro
 def save(path: Path, training: Training, progress: Any) -> None:
     """Writes the state between two episodes, and `progress`, which JSON can hold, in place of an older file.
 
-    Raises:
-        TrainingError: the file cannot be written.
+    Raises TrainingError if the file cannot be written.
     """
     arrays, values = training.state()
-    values |= {"format": _FORMAT, "population": _plain(training.population), "progress": progress}
+    values |= {"format": _FORMAT, "population": training.population, "progress": progress}
     try:
         with files.replacing(path) as partial:
             safetensors.torch.save_file(
@@ -40,8 +38,7 @@ def save(path: Path, training: Training, progress: Any) -> None:
 def restore(path: Path, training: Training) -> dict[str, Any]:
     """Sets a training to the saved state, and returns the `progress` saved with it.
 
-    Raises:
-        TrainingError: the file is missing, damaged, or of another population.
+    Raises TrainingError if the file is missing, damaged, or of another population.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -49,7 +46,8 @@ def restore(path: Path, training: Training) -> dict[str, Any]:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a dict
         if values["format"] != _FORMAT:
             raise TrainingError(f"{path}: format is {values['format']}; expected {_FORMAT}")
-        saved, expected = dict(_flat(values["population"])), dict(_flat(_plain(training.population)))
+        saved = dict(_flat(values["population"]))
+        expected = dict(_flat(msgspec.to_builtins(training.population)))
         for key in expected | saved:
             refuse_other(path, key, saved.get(key, "absent"), expected.get(key, "absent"))
         training.restore(arrays, values)
@@ -69,16 +67,12 @@ def refuse_other(path: Path, key: str, saved: object, expected: object) -> None:
         )
 
 
-def _plain(population: Population) -> Any:
-    return msgspec.json.decode(msgspec.json.encode(population))
-
-
 def _flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """Key and value of every leaf of nested dicts and lists; a list yields its length first."""
     if isinstance(value, dict):
         for name, entry in value.items():
             yield from _flat(entry, f"{key}.{name}" if key else name)
-    elif isinstance(value, list):
+    elif isinstance(value, list | tuple):
         yield f"the number of {key}", len(value)
         for i, entry in enumerate(value):
             yield from _flat(entry, f"{key}[{i}]")

@@ -23,7 +23,7 @@ from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act, save_mission_picture
 from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run
-from uav_dc_ros.experiments.train.progress import ProgressDisplay
+from uav_dc_ros.experiments.train.progress import TrainingProgress
 from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay, prefill_replay
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     try:
         with ExitStack() as stack:
             stack.callback(_discard_empty, folder)
-            display = stack.enter_context(ProgressDisplay(training, every))
+            display = stack.enter_context(TrainingProgress(training, every))
             scalars = stack.enter_context(TensorBoardLog(options.tensorboard, options.out.name, training))
             while training.n_flown < population.n_episodes:
                 training.fly_episode()
@@ -218,8 +218,9 @@ def _save_best(
     folder: Path, config: PolicyConfig, training: "Training", progress: _Progress, command: str
 ) -> str:
     """Saves the best run's policy, and returns the name of its folder."""
+    assert progress.score is not None
     config = msgspec.structs.replace(config, seed=config.seed + progress.run, episode=training.n_flown)
-    text = checkpoint_card(config, progress.score or 0.0, command)
+    text = checkpoint_card(config, progress.score, command)
     name = f"episode_{training.n_flown:06d}"
     policy.save(folder / name, config, training.learner.parameters(progress.run), lambda _: text)
     return name

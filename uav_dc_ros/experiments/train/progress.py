@@ -1,11 +1,18 @@
-"""The live progress of a training: bars on a terminal, plain lines in a file."""
+"""Live progress: bars on a terminal, plain lines in a file."""
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.train.training import Training
@@ -13,42 +20,43 @@ if TYPE_CHECKING:
 _LATEST = 20  # episodes of each run
 
 
-def latest_means(training: "Training") -> dict[str, float]:
-    """Means of the curves over all runs and their latest 20 episodes; NaN before a mission has ended."""
-    latest = {name: values[-_LATEST:] for name, values in training.curves.items()}
-    ended = np.isfinite(latest["reward"])
-    return {
-        name: float(values[ended].mean()) if ended.any() else float("nan") for name, values in latest.items()
-    }
+class ProgressBar:
+    """A bar with a text on a terminal, lines elsewhere; a context manager."""
+
+    def __init__(self, *columns: ProgressColumn, total: int, completed: int = 0) -> None:
+        self._console = Console(stderr=True)
+        self._bar = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
+        self._task = self._bar.add_task("", total=total, completed=completed, text="")
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def update(self, completed: int, text: str, line: str | None) -> None:
+        """Shows `text` in the bar, or prints a line, if any, without a terminal."""
+        self._bar.update(self._task, completed=completed, text=text)
+        if line and not self._console.is_terminal:
+            self._console.print(line, soft_wrap=True)
 
 
-class ProgressDisplay:
-    """Shows the progress of a training; a context manager."""
+class TrainingProgress(ProgressBar):
+    """The progress of a new or resumed training; without a terminal, one line every `line_every` episodes."""
 
     def __init__(self, training: "Training", line_every: int) -> None:
-        """For a new or resumed training; without a terminal, one line every `line_every` episodes."""
         self._training, self._line_every = training, line_every
-        self._console = Console(stderr=True)
         self._started, self._first = time.monotonic(), training.n_flown
-        self._bars = Progress(
+        super().__init__(
             # Together they fit into 80 columns.
             MofNCompleteColumn(),
             BarColumn(bar_width=8),
             TimeRemainingColumn(compact=True),
             TextColumn("{task.fields[text]}"),
-            console=self._console,
-            disable=not self._console.is_terminal,
+            total=training.population.n_episodes,
+            completed=self._first,
         )
-        self._task = self._bars.add_task(
-            "", total=training.population.n_episodes, completed=self._first, text=""
-        )
-
-    def __enter__(self) -> "ProgressDisplay":
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
 
     def show(self, score: float) -> None:
         """Shows the training after an episode, its rate in agent-steps, and its best validation score."""
@@ -59,6 +67,13 @@ class ProgressDisplay:
             f"{steps / (time.monotonic() - self._started):,.0f}/s return {means['episode_return']:.1f} "
             f"collected {means['users_collected']:.1f} landed {means['landing_rate']:.0%} best {score:.1f}"
         )
-        self._bars.update(self._task, completed=episode, text=text)
-        if not self._console.is_terminal and episode % self._line_every == 0:
-            self._console.print(f"episode {episode} {text}", soft_wrap=True)
+        self.update(episode, text, None if episode % self._line_every else f"episode {episode} {text}")
+
+
+def latest_means(training: "Training") -> dict[str, float]:
+    """Means of the curves over all runs and their latest 20 episodes; NaN before a mission has ended."""
+    latest = {name: values[-_LATEST:] for name, values in training.curves.items()}
+    ended = np.isfinite(latest["reward"])
+    return {
+        name: float(values[ended].mean()) if ended.any() else float("nan") for name, values in latest.items()
+    }

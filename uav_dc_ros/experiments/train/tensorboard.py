@@ -12,11 +12,7 @@ class TensorBoardLog:
     """Writes the curves of every run under `DIR/NAME/seed_S`; writes nothing without a folder."""
 
     def __init__(self, folder: Path | None, name: str, training: Training) -> None:
-        """Scalars of a training from its next episode on.
-
-        Raises:
-            TrainingError: tensorboard is not installed, or the folder cannot be written.
-        """
+        """For the next episodes; raises TrainingError without tensorboard or for an unwritable folder."""
         self._training = training
         self._writers = []
         if folder is None:
