@@ -186,7 +186,7 @@ def check(ros: Ros, scenario: Path, policy: Path, per_topic: int, oversized: int
 
 
 def test_hundreds_on_each_topic(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
-    check(ros, small_scenario, small_policy, 300, 0)
+    check(ros, small_scenario, small_policy, 100, 0)
 
 
 @pytest.mark.long

@@ -136,7 +136,7 @@ def test_a_player_that_comes_later_changes_nothing(ros: Ros, options: list[objec
     given = (*options, "--seed", 7, "--pace", "lockstep")
     status, output = ros.run_all(*given, "--bag", "seven", "--summary", "seven.json")
     assert status == 0, output
-    paced = (*options, "--seed", 7, "--pace", 30, "--bag", "beside", "--summary", "beside.json")
+    paced = (*options, "--seed", 7, "--pace", 60, "--bag", "beside", "--summary", "beside.json")
     flight = ros.start("uav_dc_ros.run_all", *paced)
     assert flight.stdout is not None
     printed = wait_for(flight.stdout, "mission: step 0/30")
