@@ -66,7 +66,7 @@ def kill(
     while len(killed) < kills:
         assert process.poll() is None, "it flies until it is stopped"
         time.sleep(rng.uniform(0.0, longest_s))
-        name = rng.choice([name for name in KILLED if deaths[name] < NODES[name].restarts])
+        name = rng.choice([name for name in KILLED if deaths[name] < NODES[name].max_restarts])
         if composed and not killed:
             name = "container"
         for process_id, command in ros.processes().items():
@@ -130,7 +130,7 @@ def test_a_node_that_keeps_dying_ends_the_mission(
     given = ("--scenario", small_scenario, "--policy", small_policy, "--pace", 1)
     process = flight(ros, "bag", *given, missions=1)
     killed: set[int] = set()
-    while process.poll() is None and len(killed) <= NODES[node].restarts:
+    while process.poll() is None and len(killed) <= NODES[node].max_restarts:
         killed_now = ros.node(node)
         if killed_now not in killed:
             os.kill(killed_now, signal.SIGKILL)
@@ -139,7 +139,7 @@ def test_a_node_that_keeps_dying_ends_the_mission(
     status, output = finish(process)
     assert status == 1, output
     assert "Traceback" not in output
-    times = NODES[node].restarts + 1
+    times = NODES[node].max_restarts + 1
     assert f"error: node {node} was killed by SIGKILL" in output
     assert f"({times} times within 60 s)" in output
     summary = json.loads((ros.folder / "bag.json").read_text())

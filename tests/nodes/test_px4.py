@@ -814,6 +814,7 @@ def test_without_a_position_it_holds_until_px4_gives_up(
 ) -> None:
     flight.until(lambda: flight.bridge.step == 2)
     flight.do("speed 0.5")  # so that it is plain who is the first
+    flight.spun.pass_time(0.5, flight.tick)  # at that speed a position that came late is no jump
     flight.do(fault)
     flight.until(lambda: flight.bridge.phase is Phase.LANDING)
     (phase, step, why), (_, _, end) = flight.log[-2:]
