@@ -69,8 +69,8 @@ def test_every_node_tells_of_itself_once_a_second(observed: Observed) -> None:
     _, world = told["uav1/world"][-1]
     assert "ready" in {values["phase"] for _, values in told["uav1/world"]}
     # Steps begin ten times a second, whatever else the machine does.
-    assert float(world["pose said [Hz]"]) == pytest.approx(10.0, rel=0.5)
-    assert float(world["move heard [Hz]"]) > 0.0
+    assert float(world["pose published [Hz]"]) == pytest.approx(10.0, rel=0.5)
+    assert float(world["move received [Hz]"]) > 0.0
     transport, handling = (
         [float(world[f"move {kind} latency {percentile} [ms]"]) for percentile in ("p50", "p99")]
         for kind in ("transport", "handling")
@@ -81,7 +81,7 @@ def test_every_node_tells_of_itself_once_a_second(observed: Observed) -> None:
     assert {f"move {kind} latency p50 [ms]" for kind in ("transport", "handling")} <= recorder
     assert float(world["step lateness p99 [ms]"]) >= 0.0
     assert {"step overruns", "hovered steps"} <= set(world)
-    assert float(told["uav1/channel_monitor"][-1][1]["users heard [Hz]"]) > 0.0
+    assert float(told["uav1/channel_monitor"][-1][1]["users received [Hz]"]) > 0.0
     assert told["uav1/mission_monitor"][-1][1]["restarts of policy"] == "0"
 
 

@@ -21,7 +21,7 @@ from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 class RecorderNode(RecorderBase):
     """Writes a mission's bag, with metadata: scenario, policy and its hash, seed."""
 
-    delays_new_topics = True  # a later scan tells whether another mission owns their namespace
+    delays_new_topics = True  # a later scan shows whether another mission owns their namespace
 
     def __init__(self) -> None:
         super().__init__("recorder")

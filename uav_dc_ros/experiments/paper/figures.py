@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from the results in colours that colour-blind readers can tell apart."""
+"""The paper's figures, drawn from the results in colours that are distinct for colour-blind readers."""
 
 import textwrap
 from collections.abc import Sequence

@@ -6,8 +6,8 @@ state                                   of the life cycle
 restarts                                how often run_all has restarted it
 process id                              of its process, which other nodes may share
 cpu [%]                                 of one core, over the last period, the whole process
-TOPIC said [Hz]                         messages published
-TOPIC heard [Hz]                        messages handled
+TOPIC published [Hz]                    messages published
+TOPIC received [Hz]                     messages handled
 TOPIC transport latency p50, p99 [ms]   from publishing a message to its receipt by this node's middleware
 TOPIC handling latency p50, p99 [ms]    from publishing a message to the end of its handling in this node
 TOPIC rejected: REASON                  messages rejected since the start
@@ -66,9 +66,9 @@ class MessageStatistics:
         # Nodes that share a process report the same values for it.
         values = {"process id": str(os.getpid()), "cpu [%]": f"{100 * (cpu_s - self._cpu_s) / period_s:.1f}"}
         for topic, count in self._published.items():
-            values[f"{topic} said [Hz]"] = f"{count / period_s:.1f}"
+            values[f"{topic} published [Hz]"] = f"{count / period_s:.1f}"
         for topic, count in self._received.items():
-            values[f"{topic} heard [Hz]"] = f"{count / period_s:.1f}"
+            values[f"{topic} received [Hz]"] = f"{count / period_s:.1f}"
             if latencies_ns := self._latencies_ns[topic]:
                 percentiles_ms = np.percentile(np.asarray(latencies_ns), (50, 99), axis=0) * 1e-6
                 for name, (p50, p99) in zip(LATENCIES, percentiles_ms.T, strict=True):
