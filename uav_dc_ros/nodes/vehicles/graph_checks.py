@@ -10,12 +10,7 @@ FORGOTTEN_S = 30.0  # after which the graph no longer lists a process that was k
 
 
 class PeriodicCheck:
-    """Calls a check at most every `CHECK_S`, and returns its last result: a problem, or None.
-
-    Args:
-        check: of the graph.
-        delay_s: before the first call.
-    """
+    """Calls a check at most every `CHECK_S`, and returns its last result: a problem, or None."""
 
     def __init__(self, check: Callable[[], str | None], delay_s: float = 0.0) -> None:
         self._check, self._due_s = check, time.monotonic() + delay_s
@@ -30,13 +25,7 @@ class PeriodicCheck:
 
 
 def other_publishers(node: Node, topic: str, *, restarted: bool) -> PeriodicCheck:
-    """A check for other nodes that publish a topic of setpoints.
-
-    Args:
-        node: publishes the topic.
-        topic: its full name.
-        restarted: whether an earlier bridge was killed, which the graph still lists for a while.
-    """
+    """A check for other publishers of a topic of setpoints; a bridge that was killed does not count."""
 
     def check() -> str | None:
         count = node.count_publishers(topic)

@@ -33,10 +33,7 @@ class MavrosMsgs(NamedTuple):
 
 
 def load_messages(*, needed_for: str = "") -> MavrosMsgs | None:
-    """Import mavros_msgs; None if it is not installed, and not needed.
-
-    Args:
-        needed_for: what requires the package; empty: nothing.
+    """Import mavros_msgs; None if it is not installed, and `needed_for` nothing.
 
     Raises:
         VehicleError: it is needed, and not installed; or it is not that of MAVROS for ROS 2.
@@ -60,14 +57,7 @@ def load_messages(*, needed_for: str = "") -> MavrosMsgs | None:
 
 
 class MavrosCommands:
-    """Sends each command once, and records rejections. To be used in the executor's thread.
-
-    Args:
-        node: creates the clients.
-        package: mavros_msgs; None: it is not installed.
-        rejections: of the vehicle.
-        clock: steady, seconds.
-    """
+    """Sends each command once, and records rejections, in the executor's thread; `clock`: steady, seconds."""
 
     def __init__(
         self, node: Node, package: MavrosMsgs | None, rejections: Rejections, clock: Callable[[], float]
@@ -87,13 +77,10 @@ class MavrosCommands:
         self._clients = {}
 
     def send_command(self, command: Command, stack: FlightStack, up_m: float) -> None:
-        """Send a command.
+        """Send a command to a vehicle at a height in the grid.
 
-        Args:
-            command: what to do.
-            stack: of the autopilot.
-            up_m: the vehicle's height in the grid. A take-off's altitude is relative to it: MAVROS passes
-                the number on, and for ArduPilot it is above home, where the vehicle stands.
+        A take-off's altitude is sent relative to it: MAVROS passes the number on, and for ArduPilot it is
+        above home, where the vehicle stands.
         """
         match command:
             case SetMode(mode):

@@ -23,13 +23,7 @@ class ConnectionLost(Exception):
 
 @dataclass(frozen=True)
 class Address:
-    """Address of an autopilot.
-
-    Attributes:
-        kind: transport; `udp` is read as `udpin`, as by other MAVLink tools.
-        host: host or serial device.
-        number: port or baud rate.
-    """
+    """Address of an autopilot: host and port, or serial device and baud rate."""
 
     kind: Literal["tcp", "udpin", "udpout", "serial"]
     host: str
@@ -37,7 +31,7 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read an address such as `tcp:127.0.0.1:5760`.
+        """Read an address such as `tcp:127.0.0.1:5760`; `udp` means `udpin`, as with other MAVLink tools.
 
         Raises:
             VehicleError: the text is no address.
@@ -91,12 +85,7 @@ def load_serial(address: Address) -> Any:
 
 
 class Connection:
-    """A stream of bytes to and from an autopilot; datagrams override what differs.
-
-    Args:
-        address: for error messages.
-        file: the open socket or serial port.
-    """
+    """Bytes to and from an autopilot, on an open socket or serial port."""
 
     def __init__(self, address: Address, file: Any) -> None:
         self.address, self._file = address, file

@@ -22,13 +22,10 @@ class OtherControllers:
 
     A message that a router sends back is recognised by its number. What an earlier process of the same
     bridge left behind arrives once or twice, which is not enough.
-
-    Args:
-        identity: MAVLink system and component of this bridge.
     """
 
-    def __init__(self, identity: tuple[int, int]) -> None:
-        self._identity = f"of system {identity[0]}, component {identity[1]}"
+    def __init__(self, system: int, component: int) -> None:
+        self._identity = f"of system {system}, component {component}"
         self._heartbeats: deque[int] = deque(maxlen=MAX_HEARTBEATS)  # sequence numbers sent
         self._commands: dict[int, float] = {}
         self._setpoints: deque[Ned] = deque(maxlen=MAX_SETPOINTS)

@@ -37,12 +37,7 @@ NAMES = {SET_MODE: "the change of mode", ARM: "arming", TAKE_OFF: "taking off"} 
 
 
 class Session:
-    """One vehicle, on links that come and go.
-
-    Args:
-        codec: pymavlink's messages.
-        telemetry: receives the vehicle's messages.
-        write: sends bytes; returns whether there is a peer.
+    """One vehicle, on links that come and go. `write` sends bytes, and returns whether there is a peer.
 
     Attributes:
         next_setpoint_s: when the next setpoint is due, steady clock.

@@ -69,7 +69,7 @@ class MavlinkTelemetry:
         self, datum: Geodetic | None, start: Enu, system: int | None = None, again: bool = False
     ) -> None:
         self.datum, self.start = datum, start
-        self.systems, self.other_controllers = Systems(system, again), OtherControllers((SYSTEM, COMPONENT))
+        self.systems, self.other_controllers = Systems(system, again), OtherControllers(SYSTEM, COMPONENT)
         self.rejections = Rejections()
         self.discarded: Counter[str] = Counter()
         self._sequence, self._clock = Sequence(), VehicleClock()
