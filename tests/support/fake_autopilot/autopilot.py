@@ -1,28 +1,27 @@
-"""A fake autopilot: a process that speaks MAVLink 2 over TCP or UDP, like ArduCopter or like PX4.
+"""A fake autopilot: a process that sends and receives MAVLink 2 over TCP or UDP, like ArduCopter or like PX4.
 
     python -m tests.support.fake_autopilot.autopilot --kind ardupilot --tcp 0 --speed 20
 
-The vehicle itself is in `copter`. It tells in lines of JSON on standard output what happened to it, first
-where it listens, and takes commands on standard input: all of them are listed in `Control`. Simulated time
-runs `--speed` times faster than the clock.
+The vehicle itself is in `copter`. The process prints events as lines of JSON, first its port, and reads
+commands from standard input: `Control` lists all of them. Simulated time runs `--speed` times faster than
+the clock.
 
-Imitated, as it was seen with a real ArduCopter (4.6) in simulation, or as PX4's documentation tells: a TCP
-server starts when its first client comes; messages at the rates that were asked for; an estimate that is
-ready after a while, and arming that is refused before, with a text; GUIDED without an estimate; one position
-setpoint that is followed for ever, a velocity setpoint for 3 s; a take-off by command, which a setpoint
-interrupts; OFFBOARD only after a second of setpoints at more than 2 Hz, and a failsafe (return) when they
-end; the frames each of them takes; speeds; disarming on the ground; MAVLink 1 until MAVLink 2 is heard;
-motors that need two seconds to lift it; the last ten metres down at half a metre per second; the charge that
-ArduCopter's simulator counts to nothing within seven minutes while the voltage stays; PX4's origin, sent
-when it changes or when asked for it, and its readiness, told for the mode that it is in; parameters,
-answered by name; ArduCopter's position target, reported in GUIDED only, and ignored without a word where it
-lies outside its fence; failsafes for its fence, a ground station that fell silent (in its own time), and low
-voltage (a text and the battery's health; neither acts on it). Its metres are those of a sphere; all events
-here have true ones. A foreign gimbal speaks too.
+Imitated, from a real ArduCopter (4.6) in simulation, or from PX4's documentation: a TCP server starts with
+its first client; messages at the requested rates; an estimate that is ready after a while, and arming that
+is rejected before, with a text; GUIDED without an estimate; one position setpoint that is followed without
+end, a velocity setpoint for 3 s; a take-off by command, which a setpoint interrupts; OFFBOARD only after a
+second of setpoints at more than 2 Hz, and a failsafe (return) when they end; the frames each of them
+accepts; speeds; disarming on the ground; MAVLink 1 until MAVLink 2 is received; motors that need two seconds
+to lift it; the last ten metres down at half a metre per second; the charge that ArduCopter's simulator counts
+to nothing within seven minutes while the voltage stays; PX4's origin, sent when it changes or on request,
+and its readiness, reported for its current mode; parameters, by name; ArduCopter's position target, reported
+in GUIDED only, and silently ignored outside its fence; failsafes for its fence, a silent ground station (in
+its own time), and low voltage (a text and the battery's health; neither acts on it). Its metres are those of
+a sphere; all events have true ones. A foreign gimbal sends, too.
 
-Not imitated: noise, GPS, missions, other failsafes, links that lose single messages, yaw. Unlike any real
-one, its time waits (a quarter of a second at most) for a client that was heard lately and is late now: the
-machine that tests run on has other work to do.
+Not imitated: noise, GPS, missions, other failsafes, links that lose single messages, yaw. Unlike a real
+autopilot's, its time waits (a quarter of a second at most) for a client that is late: the machine that tests
+run on is busy.
 """
 
 import argparse
@@ -39,7 +38,7 @@ from typing import Any
 import pymap3d
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from tests.support.fake_autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, tell
+from tests.support.fake_autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, emit
 
 ADVICE_S = 30.0
 OFFBOARD_GAP_S, OFFBOARD_PROOF_S = 0.5, 1.0
@@ -67,7 +66,7 @@ def scale_of(kind: str) -> list[float]:
 
 
 class Codec(mav.MAVLink):
-    """Speaks MAVLink 1 until it has heard MAVLink 2."""
+    """Sends MAVLink 1 until it has received MAVLink 2."""
 
     old = True
 
@@ -114,25 +113,25 @@ class Autopilot:
 
     # Out.
 
-    def say(self, text: str, severity: int = mav.MAV_SEVERITY_CRITICAL) -> None:
+    def send_text(self, text: str, severity: int = mav.MAV_SEVERITY_CRITICAL) -> None:
         self.mav.statustext_send(severity, text.encode())
 
-    def speak(self) -> None:
+    def send_due(self) -> None:
         if self.other is not None:
             self.other.copter.tick()
             self.other.answer()
-            self.other.speak()
+            self.other.send_due()
             self.out += self.other.out
             self.other.out.clear()
-        self._speak_as_rival()
+        self._send_as_second_bridge()
         t_s = self.copter.t_s
         while self.copter.texts:
-            self.say(self.copter.texts.pop(0))
+            self.send_text(self.copter.texts.pop(0))
         while self.held_back and self.held_back[0][0] <= t_s:
             self.out += self.held_back.pop(0)[1]
         if not self.copter.ready and not self.copter.px4 and t_s - self.advised_s >= ADVICE_S:
             self.advised_s = t_s
-            self.say("PreArm: AHRS: waiting for home")
+            self.send_text("PreArm: AHRS: waiting for home")
         for number, (period_s, next_s) in list(self.due.items()):
             if t_s + 1e-9 >= next_s:
                 self.due[number] = (period_s, max(next_s + period_s, t_s - period_s))
@@ -145,8 +144,8 @@ class Autopilot:
                 elif self.twice:
                     self.out += self.out[begin:]
 
-    def _speak_as_rival(self) -> None:
-        """What a second bridge sends, and what is answered to it."""
+    def _send_as_second_bridge(self) -> None:
+        """Messages of a second bridge, and the answers to it."""
         c = self.copter
 
         def due(what: str, wanted: bool, period_s: float) -> bool:
@@ -228,8 +227,8 @@ class Autopilot:
             ned, mask = [0.0] * 3, VELOCITY
         self.mav.position_target_local_ned_send(boot_ms, 1, mask, *self._own(ned), 0, 0, 0, 0, 0, 0, 0, 0)
 
-    def _tell_parameter(self, name: str) -> None:
-        """Answer for a parameter; one that it does not know has no answer."""
+    def _send_parameter(self, name: str) -> None:
+        """Send a parameter; there is no answer for an unknown one."""
         value = self.copter.parameters.get(name)
         if value is None:
             return
@@ -240,10 +239,10 @@ class Autopilot:
 
     # In.
 
-    def hear(self, data: bytes) -> bool:
-        """Take in bytes; was a message among them."""
+    def receive(self, data: bytes) -> bool:
+        """Process bytes; returns whether a message was among them."""
         if self.other is not None:
-            self.other.hear(data)
+            self.other.receive(data)
         if self.echoes:
             self.out += data
         messages = self.parser.parse_buffer(data) or []
@@ -255,14 +254,14 @@ class Autopilot:
                 continue
             if name == "COMMAND_LONG" and self.ignores.get(message.command, 0) > 0:
                 self.ignores[message.command] -= 1
-                self.copter.tell("lost", command=message.command)
+                self.copter.emit("lost", command=message.command)
             elif name == "COMMAND_LONG":
                 self.later.append((self.copter.t_s + self.late_s, message))
             elif name == "SET_POSITION_TARGET_LOCAL_NED":
                 message.x, message.y = message.x / self.scale[0], message.y / self.scale[1]
                 self._setpoint(message)
             elif name == "PARAM_REQUEST_READ":
-                self._tell_parameter(message.param_id)
+                self._send_parameter(message.param_id)
             elif name == "HEARTBEAT":
                 self.heartbeats += 1
                 if message.get_srcSystem() == BRIDGE[0]:
@@ -270,7 +269,7 @@ class Autopilot:
         return bool(messages)
 
     def answer(self) -> None:
-        """Do what was asked long enough ago."""
+        """Execute the commands that are due."""
         while self.later and self.later[0][0] <= self.copter.t_s:
             message = self.later.pop(0)[1]
             result, why = self._command(message)
@@ -278,9 +277,9 @@ class Autopilot:
                 message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
             )
             if why:
-                self.say(why)
+                self.send_text(why)
             if message.command not in (mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAV_CMD_REQUEST_MESSAGE):
-                self.copter.tell("command", command=message.command, result=result, why=why)
+                self.copter.emit("command", command=message.command, result=result, why=why)
 
     def _command(self, m: Any) -> tuple[int, str]:
         c = self.copter
@@ -346,7 +345,7 @@ class Autopilot:
         ned, key = [m.x, m.y, m.z], (m.coordinate_frame, m.type_mask, m.x, m.y, m.z, m.vx, m.vy, m.vz)
         if key != self.last_setpoint:
             self.last_setpoint = key
-            c.tell("setpoint", frame=m.coordinate_frame, mask=m.type_mask, ned=ned, mode=c.mode)
+            c.emit("setpoint", frame=m.coordinate_frame, mask=m.type_mask, ned=ned, mode=c.mode)
         frames = (1, 8) if c.px4 else (1, 7, 8, 9)
         if m.coordinate_frame not in frames:
             return
@@ -355,7 +354,7 @@ class Autopilot:
             return
         if c.taking_off_to_m is not None:
             self.interrupted += 1
-            c.tell("take-off interrupted", ned=c.ned)
+            c.emit("take-off interrupted", ned=c.ned)
             c.taking_off_to_m = None
         if not m.type_mask & 0x7:  # position
             here = c.ned if m.coordinate_frame in (7, 9) else [0.0, 0.0, 0.0]
@@ -381,7 +380,7 @@ class Control:
         jump NORTH EAST DOWN             of the position that it reports; 0 0 0: back
         reboot                           parameters and wind stay
     Of commands:
-        refuse 0|1                       to arm, and says so before
+        refuse 0|1                       to arm, and reports that before
         balk 0|1                         to arm, without a warning
         late SECONDS                     until commands are looked at
         ignore COMMAND N                 the next N commands of that number (MAV_CMD) are lost on the way
@@ -419,7 +418,7 @@ class Control:
 
     def _do(self, verb: str, *words: str) -> None:
         a, c = self.autopilot, self.autopilot.copter
-        tell("control", c.t_s, line=" ".join((verb, *words)))
+        emit("control", c.t_s, line=" ".join((verb, *words)))
         match verb:
             case "refuse":
                 c.refuses = words[0] == "1"
@@ -486,7 +485,7 @@ class Control:
             case "times":
                 a.times = []
             case "report":
-                tell(
+                emit(
                     "report",
                     c.t_s,
                     ned=c.ned,
@@ -525,7 +524,7 @@ class Wire:
             self.peer = ("127.0.0.1", udp)
             port = udp
         self.met = False
-        tell("listens", 0.0, port=port)
+        emit("listens", 0.0, port=port)
 
     def files(self) -> list[socket.socket]:
         """To wait for."""
@@ -542,7 +541,7 @@ class Wire:
                     data, more, _, _ = self.udp.recvmsg(65536, 64)
                     seconds, nanoseconds = struct.unpack("@ll", more[0][2])
                     autopilot.came_s = seconds + nanoseconds * 1e-9
-                    met = (not dropped and autopilot.hear(data)) or met
+                    met = (not dropped and autopilot.receive(data)) or met
             if out and not dropped:
                 with contextlib.suppress(OSError):
                     self.udp.sendto(out, self.peer)
@@ -571,7 +570,7 @@ class Wire:
             pass
         except OSError:
             self._hang_up()
-        return autopilot.hear(data) if data else False
+        return autopilot.receive(data) if data else False
 
     def _hang_up(self) -> None:
         if self.client is not None:
@@ -609,7 +608,7 @@ def main() -> None:
         while owed_s >= TICK_S:
             owed_s -= TICK_S
             copter.tick()
-            autopilot.speak()
+            autopilot.send_due()
 
 
 if __name__ == "__main__":

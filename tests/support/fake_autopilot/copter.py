@@ -59,7 +59,7 @@ PX4_PARAMETERS: dict[str, float] = {
 CIRCLE, CEILING = 2, 1  # bits of FENCE_TYPE
 
 
-def tell(event: str, t_s: float, **more: Any) -> None:
+def emit(event: str, t_s: float, **more: Any) -> None:
     print(json.dumps({"event": event, "t_s": round(t_s, 3), **more}), flush=True)
 
 
@@ -99,8 +99,8 @@ class Copter:
         self.gcs_s = -math.inf  # last heartbeat of the ground station that FS_GCS_ENABLE watches
         self.texts: list[str] = []  # to be sent
 
-    def tell(self, event: str, **more: Any) -> None:
-        tell(self.prefix + event, self.t_s, **more)
+    def emit(self, event: str, **more: Any) -> None:
+        emit(self.prefix + event, self.t_s, **more)
 
     @property
     def ready(self) -> bool:
@@ -162,12 +162,12 @@ class Copter:
         if mode != self.mode:
             self.mode, self.taking_off_to_m = mode, None
             self.target, self.target_velocity, self.target_s = None, None, self.t_s
-            self.tell("mode", mode=mode, why=why)
+            self.emit("mode", mode=mode, why=why)
 
     def arm(self, armed: bool, why: str) -> None:
         if armed != self.armed:
             self.armed, self.ground_since_s = armed, self.t_s
-            self.tell("armed" if armed else "disarmed", why=why, ned=self.ned)
+            self.emit("armed" if armed else "disarmed", why=why, ned=self.ned)
 
     def put(self, ned: list[float]) -> None:
         """Have it fly at a place, in the commanded mode, as if a mission had brought it there."""
@@ -251,13 +251,13 @@ class Copter:
             if down <= -self.taking_off_to_m + 0.2:
                 self.taking_off_to_m = None
                 self.target, self.target_velocity = [north, east, down], None
-                self.tell("taken off", ned=self.ned)
+                self.emit("taken off", ned=self.ned)
             else:
                 return [north, east, -self.taking_off_to_m]
         if self.mode in FOLLOWS and self.target_velocity is not None:
             if self.t_s - self.target_s > VELOCITY_S:
                 self.target, self.target_velocity = [north, east, down], None
-                self.tell("velocity timed out")
+                self.emit("velocity timed out")
             else:
                 return [p + 10.0 * v for p, v in zip(self.ned, self.target_velocity, strict=True)]
         if self.mode in FOLLOWS and self.target is not None:
@@ -306,4 +306,4 @@ class Copter:
         if self.ned[2] >= 0.0 and self.velocity[2] >= 0.0:
             self.ned[2], self.velocity, self.landed = 0.0, [0.0, 0.0, 0.0], True
             self.ground_since_s, self.taking_off_to_m = self.t_s, None
-            self.tell("touched down", ned=self.ned)
+            self.emit("touched down", ned=self.ned)

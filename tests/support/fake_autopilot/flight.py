@@ -27,7 +27,7 @@ WIRES = ("tcp", "udp")
 
 
 def free_udp_port() -> int:
-    """A port that nobody had a moment ago."""
+    """A port that was free a moment ago."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -138,11 +138,11 @@ class Flight(FlightRecord):
             time.sleep(0.002)
 
     def outside(self) -> list[dict[str, Any]]:
-        """What the autopilot heard that is no position in frame 1, or lies outside the fence."""
-        return [heard for heard in self.fake.all("setpoint") if not self._is_right(heard)]
+        """Setpoints that the autopilot received in another form or frame, or outside the fence."""
+        return [event for event in self.fake.all("setpoint") if not self._is_right(event)]
 
-    def _is_right(self, heard: dict[str, Any]) -> bool:
-        up = to_enu(Ned(*heard["ned"]))
+    def _is_right(self, event: dict[str, Any]) -> bool:
+        up = to_enu(Ned(*event["ned"]))
         grid = Enu(*(u + p for u, p in zip(up, self.place, strict=True)))
-        form = (heard["frame"], heard["mask"])
+        form = (event["frame"], event["mask"])
         return form == (1, 0xDF8) and self.bridge.fence.breach(grid) is None

@@ -5,10 +5,10 @@
 It publishes as MAVROS does (its plugins local_position, sys_status and global_position; names, types, QoS,
 frames, texts): poses at 30 Hz, best effort, in the ENU frame of the EKF's origin, stamped with the
 autopilot's time; diagnostics once a second, a battery, and a fix. It follows
-`mavros/setpoint_position/local`, best effort. The flight is that of tests/autopilot. It tells in lines of
-JSON what happened, and takes commands on standard input, see `do`. Not imitated: services (mavros_msgs
-cannot be installed where this is tested), MAVLink. Unlike any real one, its time waits (half a second at
-most) for setpoints that are late: the machine that x
+`mavros/setpoint_position/local`, best effort. It prints events as lines of JSON, and reads
+commands from standard input, see `do`. Not imitated: services (mavros_msgs cannot be installed where this is
+tested), MAVLink. Unlike any real one, its time waits (half a second at most) for setpoints that are late: the
+machine that tests run on is busy.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from tests.support.fake_autopilot.autopilot import (
     OFFBOARD_PROOF_S,
     TICK_S,
     Copter,
-    tell,
+    emit,
 )
 from uav_dc_ros.nodes.ros import convert
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned, to_enu, to_ned
@@ -79,7 +79,7 @@ class FakeMavros:
         told = (point.x, point.y, point.z, yaw_deg)
         if told != self.last:
             self.last = told
-            tell("setpoint", c.t_s, enu=told[:3], yaw_deg=yaw_deg, frame=message.header.frame_id, mode=c.mode)
+            emit("setpoint", c.t_s, enu=told[:3], yaw_deg=yaw_deg, frame=message.header.frame_id, mode=c.mode)
         if c.t_s - c.streamed_s > OFFBOARD_GAP_S:
             c.streamed_since_s = c.t_s
         c.streamed_s = c.t_s
@@ -93,7 +93,7 @@ class FakeMavros:
         match verb:
             case "mode":  # a pilot, who may have to wait: OFFBOARD wants a second of setpoints first
                 if words[0] == "OFFBOARD" and c.streamed_s - c.streamed_since_s < OFFBOARD_PROOF_S:
-                    tell("mode refused", c.t_s, mode=words[0])
+                    emit("mode refused", c.t_s, mode=words[0])
                     return
                 c.set_mode(words[0], "pilot")
             case "arm" | "disarm":
@@ -108,8 +108,8 @@ class FakeMavros:
                 c.lost = words[0] == "1"
             case "report":
                 enu = [e + s for e, s in zip(to_enu(Ned(*c.ned)), self.stands, strict=True)]
-                tell("report", c.t_s, enu=enu, mode=c.mode, armed=c.armed, landed=c.landed)
-                tell("times", c.t_s, times=self.times, setpoints=self.setpoints)
+                emit("report", c.t_s, enu=enu, mode=c.mode, armed=c.armed, landed=c.landed)
+                emit("times", c.t_s, times=self.times, setpoints=self.setpoints)
             case "times":
                 self.times = []
             case _:
@@ -118,7 +118,7 @@ class FakeMavros:
 
     # Out.
 
-    def tell_pose(self) -> None:
+    def publish_pose(self) -> None:
         c = self.copter
         if self.frozen:
             return
@@ -133,7 +133,7 @@ class FakeMavros:
         q.z, q.w = math.sin(self.yaw_rad / 2), math.cos(self.yaw_rad / 2)
         self.pose.publish(message)
 
-    def tell_status(self) -> None:
+    def publish_status(self) -> None:
         c = self.copter
         self.beats += not self.link_lost
         flying = c.armed and (c.px4 or not c.landed)
@@ -192,7 +192,7 @@ def main() -> None:
     before_s = time.monotonic()
     pose_s = beat_s = before_s
     owed_s, pending = 0.0, b""
-    tell("ready", 0.0)
+    emit("ready", 0.0)
     for _ in itertools.count():
         executor.spin_once(timeout_sec=0.01)
         now_s = time.monotonic()
@@ -203,10 +203,10 @@ def main() -> None:
             fake.copter.tick()
         if now_s >= pose_s:
             pose_s = max(pose_s + POSE_S, now_s - POSE_S)
-            fake.tell_pose()
+            fake.publish_pose()
         if now_s >= beat_s:
             beat_s += options.beat_s
-            fake.tell_status()
+            fake.publish_status()
         while select.select([sys.stdin.fileno()], [], [], 0)[0]:
             data = os.read(sys.stdin.fileno(), 4096)
             if not data:

@@ -28,7 +28,7 @@ SCENARIO = changed(
 
 
 class Fake(FakeProcess):
-    """The fake MAVROS; it is told what to do, and tells what happened."""
+    """The process of the fake MAVROS."""
 
     def __init__(self, ros: Ros, *arguments: object) -> None:
         super().__init__(ros.start("tests.support.fake_autopilot.mavros", *arguments, stdin=-1))
@@ -41,7 +41,7 @@ class Fake(FakeProcess):
             pass
 
     def report(self) -> dict[str, Any]:
-        """How it is now, and when it heard setpoints."""
+        """Its state, and when it received setpoints."""
         self.write("report")
         return self.wait_for("report") | self.wait_for("times")
 

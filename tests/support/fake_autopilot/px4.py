@@ -3,12 +3,12 @@
     fake_px4.py MESSAGES SPEED NAMESPACE
 
 MESSAGES is a folder with px4_msgs in it (`px4_messages.py`); simulated time runs SPEED times faster than the
-clock. It is a stand-in: no PX4 exists here. It tells in lines of JSON on standard output what happened to it,
-and takes commands on standard input (`Px4.obey`).
+clock. It is a stand-in: no PX4 exists here. It prints events as lines of JSON, and reads commands from
+standard input (`Px4.obey`).
 
-Imitated, as PX4's sources tell: names of topics with the version of their definition; QoS; stamps of boot
+Imitated, from PX4's sources: names of topics with the version of their definition; QoS; stamps of boot
 time, and of the agent's clock once they agree; OFFBOARD only after a second of `offboard_control_mode` for
-positions at more than 2 Hz, lost a second after it ended, then a return; commands that are for somebody else,
+positions at more than 2 Hz, lost a second after it ended, then a return; commands for another system,
 and answers; taking off by setpoint; landing and disarming. Not imitated: attitude, wind, noise, limits of
 acceleration, what is not in fmu/. Unlike any real one, its time waits 0.8 s of ours at most for a
 stream that was there lately: the machine that tests run on has other work to do.
@@ -45,7 +45,7 @@ SENT = QoSProfile(
 HEARD = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def tell(event: str, t_s: float, **more: Any) -> None:
+def emit(event: str, t_s: float, **more: Any) -> None:
     print(json.dumps({"event": event, "t_s": round(t_s, 3), **more}), flush=True)
 
 
@@ -94,7 +94,7 @@ class Px4:
     def on_heartbeat(self, message: Any) -> None:
         asked = [name for name in message.get_fields_and_field_types() if getattr(message, name)]
         if asked != ["position"]:  # a stamp that is not 0 would be seen here, too
-            tell("odd", self.t_s, heartbeat=asked)
+            emit("odd", self.t_s, heartbeat=asked)
             return
         if self.t_s - self.streamed_s > GAP_S:
             self.since_s = self.t_s
@@ -104,21 +104,21 @@ class Px4:
         unused = [*message.velocity, *message.acceleration, *message.jerk, message.yaw, message.yawspeed]
         ned = [float(value) for value in message.position]
         if message.timestamp or not all(map(math.isnan, unused)) or not all(map(math.isfinite, ned)):
-            tell("odd", self.t_s, setpoint=str(message))
+            emit("odd", self.t_s, setpoint=str(message))
             return
         self.target = ned
         if ned != self.last:
             self.last = ned
-            tell("setpoint", self.t_s, ned=ned)
+            emit("setpoint", self.t_s, ned=ned)
 
     def on_command(self, message: Any) -> None:
         ours = message.target_system == SYSTEM and message.target_component in (0, 1)
         if not ours or message.timestamp or not message.from_external:
-            tell("odd", self.t_s, command=str(message))
+            emit("odd", self.t_s, command=str(message))
             return
         done = not self.refuses and self.do(message)
-        tell("command", self.t_s, command=message.command, done=done)
-        for component in (message.source_component, 190):  # somebody else was refused the same
+        emit("command", self.t_s, command=message.command, done=done)
+        for component in (message.source_component, 190):  # another sender was rejected, too
             answer = px4.VehicleCommandAck(command=message.command, timestamp=self.stamp())
             answer.result = 0 if done and component == message.source_component else 1
             answer.target_system, answer.target_component = message.source_system, component
@@ -143,7 +143,7 @@ class Px4:
         self.failsafe = why == "failsafe"
         if mode != self.mode:
             self.mode = mode
-            tell("mode", self.t_s, mode=mode, why=why, ned=self.ned)
+            emit("mode", self.t_s, mode=mode, why=why, ned=self.ned)
         return True
 
     def obey(self, line: str) -> None:
@@ -160,12 +160,12 @@ class Px4:
                 self.speed = value
             case "mode":
                 self.switch(int(value), "pilot")
-        tell("obeyed", self.t_s, line=line)
+        emit("obeyed", self.t_s, line=line)
 
     # What it does.
 
     def turn(self) -> None:
-        """Let simulated time pass for one turn, then tell where it is."""
+        """Let simulated time pass for one turn, then publish the state."""
         self.owed_s += WALL_S * self.speed
         while self.owed_s >= TICK_S:
             self.owed_s -= TICK_S
@@ -188,7 +188,7 @@ class Px4:
                 DISARM_S if self.mode != State.NAVIGATION_STATE_OFFBOARD else 10.0
             ):
                 self.armed = False
-                tell("disarmed", self.t_s, ned=self.ned)
+                emit("disarmed", self.t_s, ned=self.ned)
             return
         self.fly(self.goal())
 
@@ -212,9 +212,9 @@ class Px4:
         self.ned[2] += max(-UP_MPS * TICK_S, min(DOWN_MPS * TICK_S, down))
         if self.ned[2] >= START[2] and goal[2] >= START[2]:
             self.ned[2], self.landed, self.ground_s = START[2], True, self.t_s
-            tell("landed", self.t_s, ned=self.ned)
+            emit("landed", self.t_s, ned=self.ned)
 
-    # What it tells.
+    # Out.
 
     def stamp(self) -> int:
         return round(self.t_s * 1e6) + (AGENT_US if self.t_s > LEAP_S else 0)
@@ -262,7 +262,7 @@ def main() -> None:
         closed.set()
 
     threading.Thread(target=listen, daemon=True).start()
-    tell("there", 0.0)
+    emit("there", 0.0)
     due_s = time.monotonic()
     while not closed.is_set():
         executor.spin_once(max(0.0, due_s - time.monotonic()))

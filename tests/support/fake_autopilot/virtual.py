@@ -60,7 +60,7 @@ class VirtualFlight(FlightRecord):
         looks: after so many of its ticks the bridge looks; 1: as often as its node.
 
     Attributes:
-        copter, autopilot: the fake; `events` is what it tells.
+        copter, autopilot: the fake; `events` are those that it emits.
         bridge: decides.
         link_is_up: may be set.
     """
@@ -81,7 +81,7 @@ class VirtualFlight(FlightRecord):
         scenario = scenario or short()
         self.events: list[dict[str, Any]] = []
         self.copter = Copter(kind, 3.0)
-        self.copter.tell = self._tell  # type: ignore[method-assign]
+        self.copter.emit = self._emit  # type: ignore[method-assign]
         self.autopilot = Autopilot(self.copter, system=1)
         self.channel = channel or (lambda sent, now_s: sent)
         start = scenario.mission.start_m
@@ -95,7 +95,7 @@ class VirtualFlight(FlightRecord):
         self.session.keep_alive(self.now_s)
         self.session.on_connected(self.now_s)
 
-    def _tell(self, event: str, **more: Any) -> None:
+    def _emit(self, event: str, **more: Any) -> None:
         self.events.append({"event": event, "t_s": self.copter.t_s, **more})
 
     def _note(self) -> None:
@@ -103,7 +103,7 @@ class VirtualFlight(FlightRecord):
 
     def _write(self, data: bytes) -> bool:
         if self.link_is_up:
-            self.autopilot.hear(data)
+            self.autopilot.receive(data)
         return self.link_is_up
 
     def do(self, line: str) -> None:
@@ -111,7 +111,7 @@ class VirtualFlight(FlightRecord):
         self._control._do(*line.split())
 
     def restart(self, system: int | None) -> None:
-        """Another bridge takes up the mission of this one, which was killed.
+        """Another bridge resumes the mission of this one, which was killed.
 
         Args:
             system: the vehicle that the journal names.
@@ -125,7 +125,7 @@ class VirtualFlight(FlightRecord):
 
     def all(self, event: str) -> list[dict[str, Any]]:
         """All events of a name so far."""
-        return [told for told in self.events if told["event"] == event]
+        return [each for each in self.events if each["event"] == event]
 
     def tick(self) -> None:
         """Until the bridge has looked once more."""
@@ -133,7 +133,7 @@ class VirtualFlight(FlightRecord):
             self.now_s += TICK_S / self.speed
             self.copter.tick()
             self.autopilot.answer()
-            self.autopilot.speak()
+            self.autopilot.send_due()
         out = bytes(self.autopilot.out)
         self.autopilot.out.clear()
         for data in self.channel(list(_split(out)) if self.link_is_up else [], self.now_s):
