@@ -81,8 +81,6 @@ class AutopilotBridge(MissionNode):
         self.vehicle: Vehicle = vehicles.make(
             self, self.values, self.scenario, datum, grid_origin, system, saved is not None
         )
-        self._ready_peers: set[str] = set()
-        self._peers_found = False
         self._started = checkpoint is not None and checkpoint.airborne
         self._journal_failed = False
         self._telemetry = Telemetry(system_id=system, grid_origin=grid_origin)
@@ -130,15 +128,6 @@ class AutopilotBridge(MissionNode):
 
     # Before the start.
 
-    def on_ready(self, payload: messages.Ready) -> None:
-        """Record that a peer is ready."""
-        self.check_peer(payload)
-        self._ready_peers.add(payload.node)
-
-    def on_peers(self) -> None:
-        """Record that all peers have been found."""
-        self._peers_found = True
-
     def _datum(self, saved: SavedMission | None) -> Geodetic | None:
         """Datum of the grid; None: the vehicle's position, or the saved grid origin, gives it."""
         if saved is not None and saved.grid_origin:
@@ -183,7 +172,7 @@ class AutopilotBridge(MissionNode):
         self._adapt_rate()
         self._publish_pose()
         self._log_grid()
-        if not self._started and self._peers_found and self._ready_peers.issuperset(self.peers):
+        if not self._started and self.all_ready:
             self.check_other_publishers()
             self._started = True
         if self._started:

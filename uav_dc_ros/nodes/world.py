@@ -127,8 +127,6 @@ class WorldNode(MissionNode):
 
     def activate(self) -> None:
         """Restore the state from the journal and wait for the peers."""
-        self._ready_peers: set[str] = set()
-        self._peers_found = False
         self._is_flying = False
         self._mission, self._step = -1, 0
         self._phase: Phase | None = None  # None before the first mission
@@ -159,8 +157,7 @@ class WorldNode(MissionNode):
 
     def on_ready(self, payload: messages.Ready) -> None:
         """Note that a peer is ready; one that was restarted receives the current step again."""
-        self.check_peer(payload)
-        self._ready_peers.add(payload.node)
+        super().on_ready(payload)
         if not self._is_flying:
             self._start_if_all_ready()
         elif payload.node in self.peers and self.rows[payload.node].needed:
@@ -169,12 +166,11 @@ class WorldNode(MissionNode):
     def on_peers(self) -> None:
         """Start if all peers are ready, too."""
         super().on_peers()
-        self._peers_found = True
         if self.external is None:
             self._start_if_all_ready()
 
     def _start_if_all_ready(self) -> None:
-        if self._is_flying or not self._peers_found or not self._ready_peers.issuperset(self.peers):
+        if self._is_flying or not self.all_ready:
             return
         if self._phase is None:
             self.check_other_publishers()

@@ -75,6 +75,7 @@ class MissionNode(ManagedNode):
         self._given_run = f'{{"run":"{self.run}"'.encode() if self.run else b""  # as our own payloads begin
         self.peers = [peer for peer in self.values["peers"] if peer != name]
         self.rows = mission_rows([name, *self.peers])
+        self._peers_found, self._ready_peers = False, set[str]()
         self._incompatible: set[tuple[str, str, str]] = set()  # at the last check: topic, peer, reason
         self._logged_incompatible: set[tuple[str, str]] = set()
 
@@ -108,6 +109,7 @@ class MissionNode(ManagedNode):
 
     def _activate(self) -> None:
         self.run = self.values["run"] or (messages.new_run() if self.is_vehicle else "")
+        self._peers_found, self._ready_peers = False, set[str]()
         super()._activate()
         self._until_inactive.callback(self.subscriptions_of.clear)
         for name in self.row.subscribes:
@@ -245,6 +247,7 @@ class MissionNode(ManagedNode):
             if peers and not self._are_matched(peers, self.get_publishers_info_by_topic(topic)):
                 return
         self._peers_timer.cancel()
+        self._peers_found = True
         self.on_peers()
 
     def _are_matched(self, peers: Sequence[str], endpoints: Sequence[TopicEndpointInfo]) -> bool:
@@ -264,11 +267,17 @@ class MissionNode(ManagedNode):
         if found:
             raise other_publishers.AnotherMissionError(found.description())
 
-    def check_peer(self, payload: messages.Ready) -> None:
-        """Raise MessageError for a node that is not in the table."""
+    def on_ready(self, payload: messages.Ready) -> None:
+        """Note that a peer is ready; raises MessageError for a node that is not in the table."""
         if payload.node not in self.rows:
             known = ", ".join(self.rows)
             raise MessageError("unknown_node", f"{payload.node!r}; expected some of {known}")
+        self._ready_peers.add(payload.node)
+
+    @property
+    def all_ready(self) -> bool:
+        """Whether this vehicle has found its peers, and all of them are ready."""
+        return self._peers_found and self._ready_peers.issuperset(self.peers)
 
     def on_peers(self) -> None:
         """Publish `ready`: all peers have been found."""

@@ -92,12 +92,8 @@ def main(
 ) -> NoReturn:
     """Run nodes until a stop request: the body of `python -m uav_dc_ros.nodes.NAME`.
 
-    Several nodes share one executor, and so one thread: their callbacks never run at the same time.
-
-    Args:
-        makes: constructors of the nodes, in the order in which they start.
-        arguments: ROS arguments; default: those of the command line, which may have no others.
-        batch_scheduling: see `use_batch_scheduling`.
+    Several nodes start in the order of their constructors and share one executor, and so one thread.
+    `arguments` are ROS arguments; default: those of the command line, which may have no others.
     """
     cli.open_streams()
     if arguments is None:
