@@ -16,7 +16,7 @@ NAMESPACE = ("-r", "__ns:=/uav1")
 
 
 def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
-    """World first, policy last: it waits for them. No recorder takes part, and a stranger listens."""
+    """World first, policy last: it waits for them. No recorder takes part, and a probe subscribes."""
     probe = ros.stranger("probe", "/uav1/mission")
     assert probe.stdin is not None
     assert probe.stdout is not None
@@ -41,19 +41,19 @@ def test_nodes_started_by_hand_fly_in_a_namespace(ros: Ros, small_scenario: Path
 
 
 def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario: Path) -> None:
-    """A stranger plays the policy, and lets the vehicle wait: nothing is flown or booked twice."""
+    """A probe plays the policy, and lets the vehicle wait: nothing is flown or booked twice."""
     heard = [f"/{topic}" for topic in ("mission", "rates")]
-    stranger = ros.stranger("probe", "name=policy", *heard)
-    assert stranger.stdin is not None
-    assert stranger.stdout is not None
+    probe = ros.stranger("probe", "name=policy", *heard)
+    assert probe.stdin is not None
+    assert probe.stdout is not None
 
-    def say(topic: str, payload: dict[str, object], hearing: int = 1) -> None:
+    def publish(topic: str, payload: dict[str, object], hearing: int = 1) -> None:
         command = {"topic": f"/{topic}", "data": json.dumps({"run": RUN} | payload), "hearing": hearing}
-        stranger.stdin.write(json.dumps(command) + "\n")
-        stranger.stdin.flush()
+        probe.stdin.write(json.dumps(command) + "\n")
+        probe.stdin.flush()
 
     def next_rates() -> dict[str, Any]:
-        line = wait_for(stranger.stdout, '"/rates"').splitlines()[-1]
+        line = wait_for(probe.stdout, '"/rates"').splitlines()[-1]
         return json.loads(json.loads(line)["data"])
 
     given = [
@@ -66,26 +66,27 @@ def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario:
         f"run:={RUN}",
     ]
     nodes = [ros.start(f"uav_dc_ros.nodes.{node}", *given) for node in ("world", "channel_monitor")]
-    say("move", {"mission": 9, "step": 9, "action": "hover"})  # makes the publisher that the world waits for
-    say("ready", {"node": "policy"})
+    # This creates the publisher that the world waits for.
+    publish("move", {"mission": 9, "step": 9, "action": "hover"})
+    publish("ready", {"node": "policy"})
     assert next_rates()["step"] == 0
-    say("move", {"mission": 0, "step": 0, "action": "right"})
+    publish("move", {"mission": 0, "step": 0, "action": "right"})
     first = next_rates()
     assert first["step"] == 1
     assert sum(first["data_bits"]) > 0
     assert next_rates() == first  # after the world's patience, without a new move
-    say("move", {"mission": 0, "step": 0, "action": "right"})  # late: it was flown already
-    say("move", {"mission": 0, "step": 1, "action": "forward"})
+    publish("move", {"mission": 0, "step": 0, "action": "right"})  # late: it was flown already
+    publish("move", {"mission": 0, "step": 1, "action": "forward"})
     while (second := next_rates()) == first:
         pass
     assert second["step"] == 2
-    stranger.stdin.close()
+    probe.stdin.close()
     for node in nodes:
         node.terminate()
     output = finish(nodes[0])[1]
     finish(nodes[1])
-    stranger.wait(90)
-    stranger.stdout.close()
+    probe.wait(90)
+    probe.stdout.close()
     assert "move wrong_step 2" in output
 
 

@@ -76,21 +76,23 @@ def test_a_composed_mission_says_who_shares_a_process(ros: Ros, flight: list[obj
     ids: dict[str, set[str]] = {}
     for topic, message in read_bag(ros.folder / "bag"):
         if topic == "/diagnostics":
-            for told in message.status:
-                values = {pair.key: pair.value for pair in told.values}
-                ids.setdefault(told.name, set()).add(values["process id"])
+            for reported in message.status:
+                values = {pair.key: pair.value for pair in reported.values}
+                ids.setdefault(reported.name, set()).add(values["process id"])
     shared = {node: ids[node] for node in COMPOSED}
     assert len(set.union(*shared.values())) == 1
     assert len(set.union(*ids.values())) == len(ids) - len(COMPOSED) + 1
 
 
 def test_composing_what_cannot_be_composed(ros: Ros) -> None:
-    told = refused(ros, "--compose", "--nodes", "policy,recorder")
-    assert "--compose: expected two of world, channel_monitor, policy among --nodes policy,recorder" in told
+    reported = refused(ros, "--compose", "--nodes", "policy,recorder")
+    assert (
+        "--compose: expected two of world, channel_monitor, policy among --nodes policy,recorder" in reported
+    )
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "reported"),
     [
         pytest.param((), "the following arguments are required: NODE", marks=pytest.mark.long),
         (("recorder",), "argument NODE: invalid choice: 'recorder' (choose from "),
@@ -102,10 +104,10 @@ def test_composing_what_cannot_be_composed(ros: Ros) -> None:
         (("world", "policy", "--ros-args", "-p", "seed:=1"), "seed: no such parameter of node policy"),
     ],
 )
-def test_mistakes(ros: Ros, given: tuple[str, ...], told: str) -> None:
+def test_mistakes(ros: Ros, given: tuple[str, ...], reported: str) -> None:
     status, output = ros.run_fork("uav_dc_ros.nodes.container", *given)
     assert status == 2, output
-    assert told in output
+    assert reported in output
     assert "Traceback" not in output
 
 
@@ -159,9 +161,9 @@ def test_a_line_of_a_shared_process_says_whose_it_is(ros: Ros, flight: list[obje
     given = (*flight, *ONLY_COMPOSED, "--pace", "lockstep", "--set", "channel_monitor.journal=/dev/full")
     status, output = ros.run_all(*given)
     assert status == 1, output
-    told = "journal /dev/full: it is no file; expected one, or a new one"
-    assert f"container: ERROR: channel_monitor: {told}" in output
-    assert f"error: node channel_monitor could not be configured: {told}" in output
+    reported = "journal /dev/full: it is no file; expected one, or a new one"
+    assert f"container: ERROR: channel_monitor: {reported}" in output
+    assert f"error: node channel_monitor could not be configured: {reported}" in output
 
 
 def test_a_node_that_gives_up_takes_the_others_with_it(ros: Ros, flight: list[object]) -> None:
@@ -173,7 +175,7 @@ def test_a_node_that_gives_up_takes_the_others_with_it(ros: Ros, flight: list[ob
     )
     status, output = finish(process)
     assert status == 1, output
-    told = "error: the container of world, channel_monitor, policy ended with 3: error: journal "
-    assert told in output
+    reported = "error: the container of world, channel_monitor, policy ended with 3: error: journal "
+    assert reported in output
     assert "File too large" in output
     assert "Traceback" not in output

@@ -28,7 +28,7 @@ def flown_with_hangs(ros: Ros, options: list[object], names: tuple[str, ...], *h
     for name in names:
         who = "the container of world, channel_monitor, policy" if name == "container" else f"node {name}"
         assert f"note: {who} gave no sign of life for " in output, output
-    assert output.count("no sign of life") == len(names), "nobody else is to blame"
+    assert output.count("no sign of life") == len(names), "no other node"
     told = json.loads((ros.folder / "summary.json").read_text())
     assert {each["steps"] for each in (told if isinstance(told, list) else [told])} == {30}
     return printed + output

@@ -38,13 +38,13 @@ def bag(module_ros: Ros, options: list[object]) -> Path:
 
 
 def payloads(bag: Path) -> dict[tuple[str, int], list[Any]]:
-    """What was said of each step of mission 0, without runs and repetitions, by topic and step."""
+    """What was published of each step of mission 0, without runs and repetitions, by topic and step."""
     found: dict[tuple[str, int], list[Any]] = {}
     for topic, payload in read_bag(bag):
         if topic in COMPARED and payload["mission"] == 0:
-            said = found.setdefault((topic, payload["step"]), [])
-            if but_run(payload) not in said:
-                said.append(but_run(payload))
+            published = found.setdefault((topic, payload["step"]), [])
+            if but_run(payload) not in published:
+                published.append(but_run(payload))
     return found
 
 
@@ -70,7 +70,7 @@ def stopped(process: subprocess.Popen[str]) -> tuple[int, str]:
 def test_a_mission_beside_a_looping_player_is_refused_by_the_player_s_name(
     ros: Ros, options: list[object], bag: Path, tries: int
 ) -> None:
-    """The bag's mission has the same seed: only its run tells it from the one that was to be flown."""
+    """The bag's mission has the same seed: only its run differs from the one that was to be flown."""
     (run,) = {payload["run"] for topic, payload in read_bag(bag) if topic == "/mission"}
     player = ros.start("uav_dc_ros.bag", "play", bag, "--loop", "--rate", 5)
     assert player.stdout is not None
@@ -121,7 +121,7 @@ def test_of_two_missions_that_start_at_once_one_is_flown(ros: Ros, options: list
     assert not (ros.folder / ("one", "other")[1 - flown]).exists()
 
 
-# A player that does not look who else is there, as those of other projects.
+# A player that does not check for other publishers, as those of other projects.
 HEEDLESS = """
 import sys
 from uav_dc_ros import bag

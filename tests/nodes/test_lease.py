@@ -20,13 +20,13 @@ TICK_S = 0.02
 def test_liveliness_that_comes_back_at_once_was_not_lost() -> None:
     now_s = 100.0
     confirmed = LivelinessFilter(lambda: now_s)
-    assert not confirmed.is_lost(False), "nobody was there yet"
+    assert not confirmed.is_lost(False), "no publisher yet"
     assert not confirmed.is_lost(True)
-    told = []
+    lost = []
     for alive in (*[False] * 10, True, *[False] * 14):
         now_s += TICK_S
-        told.append(confirmed.is_lost(alive))
-    assert told == [*[False] * 24, True]
+        lost.append(confirmed.is_lost(alive))
+    assert lost == [*[False] * 24, True]
     assert 12 * TICK_S < CONFIRMED_S <= 13 * TICK_S
     now_s += TICK_S
     assert not confirmed.is_lost(True)
@@ -35,7 +35,7 @@ def test_liveliness_that_comes_back_at_once_was_not_lost() -> None:
     confirmed.reset()
     for _ in range(20):
         now_s += TICK_S
-        assert not confirmed.is_lost(False), "another has published since, who offers no lease"
+        assert not confirmed.is_lost(False), "another publisher without a lease"
 
 
 def test_a_policy_that_was_killed_is_missed_and_one_that_was_held_up_is_not(ros: Ros) -> None:

@@ -1,4 +1,4 @@
-"""What the nodes tell about themselves: diagnostics, the clock, peers that do not match."""
+"""What the nodes report: diagnostics, the clock, peers that do not match."""
 
 import json
 from pathlib import Path
@@ -58,16 +58,18 @@ def diagnostics(bag: Path) -> dict[str, list[tuple[Any, dict[str, str]]]]:
 
 
 def test_every_node_tells_of_itself_once_a_second(observed: Observed) -> None:
-    told = diagnostics(observed.bag)
-    assert set(told) == {f"uav1/{name}" for name, row in NODES.items() if not row.on_request}
-    assert all(len(each) >= 2 for each in told.values()), {n: len(e) for n, e in told.items()}
-    for each in told.values():
+    reported = diagnostics(observed.bag)
+    assert set(reported) == {f"uav1/{name}" for name, row in NODES.items() if not row.on_request}
+    assert all(len(each) >= 2 for each in reported.values()), {n: len(e) for n, e in reported.items()}
+    for each in reported.values():
         assert {status.level for status, _ in each} <= {b"\0", 0, 1}  # a warning: a busy machine is late
         assert each[-1][1]["state"] == "active"
         assert each[-1][1]["restarts"] == "0"
-    assert len({each[-1][1]["process id"] for each in told.values()}) == len(told), "a process for each"
-    _, world = told["uav1/world"][-1]
-    assert "ready" in {values["phase"] for _, values in told["uav1/world"]}
+    assert len({each[-1][1]["process id"] for each in reported.values()}) == len(reported), (
+        "a process for each"
+    )
+    _, world = reported["uav1/world"][-1]
+    assert "ready" in {values["phase"] for _, values in reported["uav1/world"]}
     # Steps begin ten times a second, whatever else the machine does.
     assert float(world["pose published [Hz]"]) == pytest.approx(10.0, rel=0.5)
     assert float(world["move received [Hz]"]) > 0.0
@@ -77,12 +79,12 @@ def test_every_node_tells_of_itself_once_a_second(observed: Observed) -> None:
     )
     assert 0.0 < transport[0] <= transport[1]
     assert transport[0] <= handling[0] <= handling[1]
-    recorder = {key for _, values in told["uav1/recorder"] for key in values}
+    recorder = {key for _, values in reported["uav1/recorder"] for key in values}
     assert {f"move {kind} latency p50 [ms]" for kind in ("transport", "handling")} <= recorder
     assert float(world["step lateness p99 [ms]"]) >= 0.0
     assert {"step overruns", "hovered steps"} <= set(world)
-    assert float(told["uav1/channel_monitor"][-1][1]["users received [Hz]"]) > 0.0
-    assert told["uav1/mission_monitor"][-1][1]["restarts of policy"] == "0"
+    assert float(reported["uav1/channel_monitor"][-1][1]["users received [Hz]"]) > 0.0
+    assert reported["uav1/mission_monitor"][-1][1]["restarts of policy"] == "0"
 
 
 def test_the_clock_is_mission_time_and_the_nodes_go_by_it(observed: Observed) -> None:
@@ -90,7 +92,7 @@ def test_the_clock_is_mission_time_and_the_nodes_go_by_it(observed: Observed) ->
     times_s = [time_s for _, time_s in observed.times]
     assert times_s == sorted(times_s)
     passed_s, flown_s = observed.times[-1][0] - observed.times[0][0], times_s[-1] - times_s[0]
-    # A listener on a busy core hears in bursts: this tells mission time from the wall's, not a late clock.
+    # A subscriber on a busy core receives in bursts: this separates mission time from wall time.
     assert flown_s / passed_s > 20.0
     messages = read_bag(observed.bag, "/uav1/diagnostics")
     stamps = {
@@ -102,21 +104,21 @@ def test_the_clock_is_mission_time_and_the_nodes_go_by_it(observed: Observed) ->
 
 
 def test_the_world_goes_by_somebody_else_s_clock(ros: Ros, small_scenario: Path) -> None:
-    """Alone, with nobody to move it: steps of ten seconds, on a clock three hundred times too fast."""
-    heard = ros.stranger("probe", "/mission")
-    assert heard.stdout is not None
+    """Alone, without a policy: steps of ten seconds, on a clock three hundred times too fast."""
+    probe = ros.stranger("probe", "/mission")
+    assert probe.stdout is not None
     given = ("-p", f"scenario:={small_scenario}", "-p", "pace:=1", "-p", "peers:=[world]")
     world = ros.start("uav_dc_ros.nodes.world", "--ros-args", *given, "-p", "use_sim_time:=true")
-    assert '\\"step\\":0' in heard.stdout.readline()
+    assert '\\"step\\":0' in probe.stdout.readline()
     clock = python(ros, CLOCK)
-    said = wait_for(heard.stdout, '\\"remaining_steps\\":0').splitlines()
+    received = wait_for(probe.stdout, '\\"remaining_steps\\":0').splitlines()
     clock.kill()
     clock.communicate()
     world.terminate()
     status, output = finish(world)
-    heard.communicate()
+    probe.communicate()
     assert status == 0, output
-    assert [json.loads(json.loads(line)["data"])["step"] for line in said] == list(range(1, 31))
+    assert [json.loads(json.loads(line)["data"])["step"] for line in received] == list(range(1, 31))
     assert "30 steps were hovered" in output
 
 
@@ -135,16 +137,16 @@ def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[ob
     assert peer.stdout is not None
     wait_for(peer.stdout, "listening")
     given = ("--no-record", "--nodes", "world,channel_monitor,policy")
-    status, output = ros.run_all(*options, *given, "--pace", 40)  # the second look tells it
+    status, output = ros.run_all(*options, *given, "--pace", 40)  # the second check reports it
     peer.kill()
     peer.communicate()
     assert status == 0, output
     assert output.count("world: WARN: /pose: /somebody/demanding does not match: its QoS: ") == 1, output
-    assert output.count("does not match") == 1, "nobody else is to blame"
+    assert output.count("does not match") == 1, "no other node"
 
 
 def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
-    """A best-effort `mission`, which nobody who asks for reliability may hear: the monitor is not asked."""
+    """A best-effort `target` does not match a subscription that requests reliability."""
     peer = python(ros, DEMANDING.replace("/pose", "/target").replace("TRANSIENT_LOCAL", "VOLATILE"))
     assert peer.stdout is not None
     wait_for(peer.stdout, "listening")
@@ -154,9 +156,9 @@ def test_qos_is_overridden_the_ros_way(ros: Ros, small_scenario: Path) -> None:
         *("-p", "qos_overrides./target.publisher.reliability:=best_effort"),
     )
     assert world.stdout is not None
-    told = wait_for(world.stdout, "does not match")
-    assert "/target: /somebody/demanding does not match: its QoS: " in told
-    assert "Best effort publisher and reliable subscription; (logged once)" in told
+    reported = wait_for(world.stdout, "does not match")
+    assert "/target: /somebody/demanding does not match: its QoS: " in reported
+    assert "Best effort publisher and reliable subscription; (logged once)" in reported
     world.terminate()
     peer.kill()
     peer.communicate()

@@ -1,4 +1,4 @@
-"""Peers are found by name: a stranger who listens, or publishes, stands for none of them."""
+"""Peers are found by name: other nodes that subscribe or publish do not count."""
 
 from types import SimpleNamespace
 from typing import Any

@@ -1,4 +1,4 @@
-"""rclpy's private API, as far as it is in use: when rclpy changes, this test tells where."""
+"""The private API of rclpy that is in use: after a change in rclpy, this test shows where."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Who else publishes what a mission has one publisher of."""
+"""Other publishers of a mission's exclusive topics."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -66,14 +66,14 @@ def test_the_graph_may_still_tell_of_a_node_that_was_killed(twice: str) -> None:
 
 
 def test_nobody_is_a_rival_on_a_topic_that_this_mission_does_not_have() -> None:
-    """Beside a real vehicle nobody of ours makes a clock: a simulator may."""
+    """Beside a real vehicle no node of the mission publishes a clock: a simulator may."""
     around = {**NODES, "world": WORLD_BESIDE_BRIDGE}
     assert not other_publishers.find({"clock": ["/gazebo"]}, "/", around)
     assert other_publishers.find({"clock": ["/gazebo"]}, "/", NODES)
 
 
 def audience(publishers: dict[str, list[str]], *played: str) -> SubscriberMonitor:
-    """Who is there while topics are played, by what the graph tells: full names of nodes, by topic."""
+    """Who is there while topics are played, as in the graph: full names of nodes, by topic."""
 
     def ends(topic: str) -> list[Any]:
         names = [name.rpartition("/") for name in ("/player", *publishers.get(topic, ()))]
@@ -90,16 +90,16 @@ def audience(publishers: dict[str, list[str]], *played: str) -> SubscriberMonito
         ("/pose", "/world", True),
         ("/pose", "/bridge", True),
         ("/uav2/move", "/uav2/policy", True),
-        ("/uav2/pose", "/world", False),  # another's: a note says so
+        ("/uav2/pose", "/world", False),  # of another mission: a note reports it
         ("/pose", "/player", False),
         ("/pose", "/mavros", False),
-        ("/diagnostics", "/world", False),  # which anybody may publish
+        ("/diagnostics", "/world", False),  # which any node may publish
         ("/camera", "/world", False),
     ],
 )
 def test_a_bag_is_not_played_into_a_mission(topic: str, publisher: str, is_refused: bool) -> None:
-    told = audience({topic: [publisher]}, topic, "/other").mission()
-    assert told == (f"another mission is being flown here by {publisher}" if is_refused else None)
+    reported = audience({topic: [publisher]}, topic, "/other").mission()
+    assert reported == (f"another mission is being flown here by {publisher}" if is_refused else None)
     assert audience({topic: [publisher]}, f"/elsewhere{topic}").mission() is None, "by --namespace"
 
 

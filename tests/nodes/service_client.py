@@ -1,6 +1,6 @@
-"""A stranger who calls services of nodes, as `ros2 lifecycle` and `ros2 param` do.
+"""A node outside the mission that calls services, as `ros2 lifecycle` and `ros2 param` do.
 
-Commands come as JSON lines on standard input, answers go as JSON lines to standard output:
+Commands come as JSON lines on standard input, responses go as JSON lines to standard output:
 
     {"node": "/policy", "do": "configure"}            -> {"success": true, "state": "inactive"}
     {"node": "/policy", "set": {"policy": "nobody"}}  -> {"policy": {"success": false, "reason": "..."}}
@@ -20,15 +20,15 @@ from rclpy.parameter import Parameter
 TRANSITIONS = {"configure": 1, "cleanup": 2, "activate": 3, "deactivate": 4}
 
 
-class Asker(Node):
-    """Calls a service, and waits for its answer."""
+class ServiceClient(Node):
+    """Calls a service, and waits for its response."""
 
     def call(self, kind: Any, service: str, **request: Any) -> Any:
         client = self.create_client(kind, service)
         assert client.wait_for_service(20.0), f"no service {service}"
         future = client.call_async(kind.Request(**request))
         rclpy.spin_until_future_complete(self, future, timeout_sec=20.0)
-        assert future.done(), f"{service} did not answer"
+        assert future.done(), f"{service} did not respond"
         self.destroy_client(client)
         return future.result()
 
@@ -36,9 +36,9 @@ class Asker(Node):
         request = ChangeState.Request()
         request.transition.label = "" if transition in TRANSITIONS else transition
         request.transition.id = TRANSITIONS.get(transition, 0)
-        answer = self.call(ChangeState, f"{node}/change_state", transition=request.transition)
+        response = self.call(ChangeState, f"{node}/change_state", transition=request.transition)
         state = self.call(GetState, f"{node}/get_state").current_state.label
-        return {"success": answer.success, "state": state}
+        return {"success": response.success, "state": state}
 
     def set(self, node: str, values: dict[str, Any]) -> dict[str, Any]:
         given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
@@ -50,7 +50,7 @@ class Asker(Node):
 
     def describe(self, node: str) -> dict[str, Any]:
         names = self.call(ListParameters, f"{node}/list_parameters").result.names
-        told = self.call(DescribeParameters, f"{node}/describe_parameters", names=names).descriptors
+        descriptors = self.call(DescribeParameters, f"{node}/describe_parameters", names=names).descriptors
         return {
             row.name: {
                 "description": row.description,
@@ -61,22 +61,22 @@ class Asker(Node):
                     for bound in (*row.integer_range, *row.floating_point_range)
                 ],
             }
-            for row in told
+            for row in descriptors
         }
 
 
 def main() -> None:
     rclpy.init()
-    asker = Asker("asker")
+    client = ServiceClient("client")
     for line in sys.stdin:
         command = json.loads(line)
         if "do" in command:
-            answer = asker.change(command["node"], command["do"])
+            response = client.change(command["node"], command["do"])
         elif "set" in command:
-            answer = asker.set(command["node"], command["set"])
+            response = client.set(command["node"], command["set"])
         else:
-            answer = asker.describe(command["node"])
-        print(json.dumps(answer), flush=True)
+            response = client.describe(command["node"])
+        print(json.dumps(response), flush=True)
     rclpy.shutdown()
 
 
