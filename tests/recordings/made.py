@@ -1,4 +1,4 @@
-"""Bags of missions, made without nodes: what they say, in their words, and copies with something changed."""
+"""Bags of missions, made without nodes, and copies with changes."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence
@@ -33,7 +33,7 @@ def pose(position_m: Sequence[float], stamp_ns: int, frame: str = "map") -> byte
     return bytes(TYPES.serialize_cdr(made, topics.POSE))
 
 
-def said(topic: str, payload: messages.Payload | bytes, time_ns: int) -> BagMessage:
+def bag_message(topic: str, payload: messages.Payload | bytes, time_ns: int) -> BagMessage:
     """A message that was received when it was published; bytes are a pose."""
     data = payload if isinstance(payload, bytes) else cdr.encode_string(messages.encode(payload))
     return BagMessage(f"/{topic}", topics.TOPICS[topic].type, data, time_ns, time_ns)
@@ -48,7 +48,7 @@ def flight(
     begun_ns: int = BEGUN_NS,
     steps: int | None = None,
 ) -> list[BagMessage]:
-    """What the nodes say in a lockstep flight: pose, users, mission, rates and move of each step.
+    """What the nodes publish in a lockstep flight: pose, users, mission, rates and move of each step.
 
     Args:
         scenario: the world.
@@ -58,10 +58,10 @@ def flight(
         begun_ns: when.
         steps: after which the last mission is aborted.
     """
-    told: list[BagMessage] = []
+    recorded: list[BagMessage] = []
 
-    def say(topic: str, payload: messages.Payload | bytes) -> None:
-        told.append(said(topic, payload, begun_ns + APART_NS * len(told)))
+    def publish(topic: str, payload: messages.Payload | bytes) -> None:
+        recorded.append(bag_message(topic, payload, begun_ns + APART_NS * len(recorded)))
 
     max_steps = scenario.mission.max_steps
     for mission in range(missions):
@@ -74,9 +74,9 @@ def flight(
             uav_m = scenario.grid.centre_m(state.cell, like=state.users_m)
             if link is None:
                 link = world.measure(scenario, uav_m, state.users_m, state.collected)
-            say("pose", pose(uav_m.tolist(), time_ns))
+            publish("pose", pose(uav_m.tolist(), time_ns))
             at = {"mission": mission, "step": step}
-            say("users", payloads.users(scenario, state.users_m, time_ns=time_ns, **at))
+            publish("users", payloads.users(scenario, state.users_m, time_ns=time_ns, **at))
             status = messages.Mission(
                 **at,
                 phase=phase,
@@ -86,22 +86,22 @@ def flight(
                 scenario=scenario.name,
                 fingerprint=scenario.fingerprint,
             )
-            say("mission", status)
-            say("rates", payloads.rates(link, state.data_bits, state.collected, **at))
+            publish("mission", status)
+            publish("rates", payloads.rates(link, state.data_bits, state.collected, **at))
             if phase.is_over:
                 break
             if mission == missions - 1 and step == steps:
-                say("mission", msgspec.structs.replace(status, phase=messages.Phase.ABORTED))
+                publish("mission", msgspec.structs.replace(status, phase=messages.Phase.ABORTED))
                 break
             action = act(mission, step)
-            say("move", messages.Move(**at, action=ACTION_LABELS[action]))
+            publish("move", messages.Move(**at, action=ACTION_LABELS[action]))
             state, outcome = world.step(
                 scenario, state, np.asarray(action), rng.random((scenario.n_users, 2))
             )
             link = outcome.link
             if outcome.terminated or outcome.truncated:
                 phase = messages.Phase.LANDED if outcome.landed else messages.Phase.TIMEOUT
-    return told
+    return recorded
 
 
 def about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, str]:
@@ -118,12 +118,12 @@ def about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, str]:
 
 
 def write(
-    folder: Path, told: Iterable[BagMessage], about: dict[str, str] | None = None, namespace: str = ""
+    folder: Path, recorded: Iterable[BagMessage], about: dict[str, str] | None = None, namespace: str = ""
 ) -> Path:
     """A bag with messages, in their order; its folder."""
     with BagWriter(folder, about or {}) as writer:
         known = set()
-        for message in told:
+        for message in recorded:
             topic = namespace + message.topic
             if topic not in known:
                 writer.add_topic(topic, message.type)
@@ -159,7 +159,7 @@ def changing(
         if (payload.mission, payload.step) != (mission, step):
             return message
         made = change(payload)
-        return None if made is None else message._replace(data=said(topic, made, 0).data)
+        return None if made is None else message._replace(data=bag_message(topic, made, 0).data)
 
     return apply
 

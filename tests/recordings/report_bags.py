@@ -71,15 +71,15 @@ def write(
 
     Args:
         folder: of the new bag.
-        scenario: the world; it is told inside.
+        scenario: the world; the bag holds it.
         seeds: of the missions.
-        about: what is said inside beside the scenario.
+        about: further metadata.
         leave_out: messages that are missing, topic and step.
-        steps: after which a mission stops without an end; flown to its end unless told.
+        steps: after which a mission stops without an end; None: flown to its end.
         extra: messages at the end, topic, type and content, a second apart.
     """
-    told = {"scenario": scenario.name, "scenario_values": json.dumps(msgspec.to_builtins(scenario))}
-    with BagWriter(folder, told | (about or {})) as bag:
+    metadata = {"scenario": scenario.name, "scenario_values": json.dumps(msgspec.to_builtins(scenario))}
+    with BagWriter(folder, metadata | (about or {})) as bag:
         for name in ("pose", "users", "rates", "mission", "move", "diagnostics"):
             bag.add_topic(f"/{name}", topics.TOPICS[name].type)
         now_ns = START_NS
@@ -105,7 +105,7 @@ def step_messages(
     stamp_ns = scenario.time_ns(mission, step)
     _, _, landed = world.end_of_mission(scenario, state.step, state.cell)
     over = messages.Phase.LANDED if landed else messages.Phase.TIMEOUT
-    said: dict[str, messages.Payload] = {
+    by_topic: dict[str, messages.Payload] = {
         "users": payloads.users(scenario, state.users_m, mission=mission, step=step, time_ns=stamp_ns),
         "rates": payloads.rates(link, state.data_bits, state.collected, mission=mission, step=step),
         "mission": messages.Mission(
@@ -120,9 +120,9 @@ def step_messages(
         ),
     }
     if action >= 0:
-        said["move"] = messages.Move(mission=mission, step=step, action=ACTION_LABELS[action])
+        by_topic["move"] = messages.Move(mission=mission, step=step, action=ACTION_LABELS[action])
     yield "pose", pose(stamp_ns, scenario.grid.centre_m(state.cell, like=state.users_m))
-    for topic, payload in said.items():
+    for topic, payload in by_topic.items():
         yield topic, cdr.encode_string(messages.encode(payload))
 
 

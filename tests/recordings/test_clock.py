@@ -27,13 +27,13 @@ WHOLE = [plain(step) for step in read(FLIGHT)[0]]
 SECOND = 10**9
 
 
-def set_by(told: list[BagMessage], at: int, by_ns: int) -> list[BagMessage]:
+def set_by(recorded: list[BagMessage], at: int, by_ns: int) -> list[BagMessage]:
     """The messages with all times from one of them on by so much later."""
     return [
         m._replace(log_time_ns=m.log_time_ns + by_ns, publish_time_ns=m.publish_time_ns + by_ns)
         if i >= at
         else m
-        for i, m in enumerate(told)
+        for i, m in enumerate(recorded)
     ]
 
 
@@ -52,23 +52,23 @@ def test_a_clock_that_is_set_back_makes_no_other_missions_of_ours(tmp_path: Path
 
 
 def test_nor_without_an_index_nor_in_several_parts(tmp_path: Path) -> None:
-    told = set_by(FLIGHT, 40, -5 * SECOND)
-    bag = write(tmp_path / "bare", told)
+    recorded = set_by(FLIGHT, 40, -5 * SECOND)
+    bag = write(tmp_path / "bare", recorded)
     (part,) = bag.glob("*.mcap")
     bare(part)
     assert steps_of(bag) == WHOLE
     with BagWriter(tmp_path / "split", {}, split_bytes=6000) as writer:
-        for name, type in sorted({(m.topic, m.type) for m in told}):
+        for name, type in sorted({(m.topic, m.type) for m in recorded}):
             writer.add_topic(name, type)
-        for m in told:
+        for m in recorded:
             writer.write(m.topic, m.data, log_time_ns=m.log_time_ns, publish_time_ns=m.publish_time_ns)
     assert len(list((tmp_path / "split").glob("*.mcap"))) > 2
     assert steps_of(tmp_path / "split") == WHOLE
 
 
 def test_it_may_be_set_back_twice_and_forward(tmp_path: Path) -> None:
-    told = set_by(set_by(set_by(FLIGHT, 20, -5 * SECOND), 33, 60 * SECOND), 50, -7 * SECOND)
-    assert steps_of(write(tmp_path / "bag", told)) == WHOLE
+    recorded = set_by(set_by(set_by(FLIGHT, 20, -5 * SECOND), 33, 60 * SECOND), 50, -7 * SECOND)
+    assert steps_of(write(tmp_path / "bag", recorded)) == WHOLE
 
 
 def test_a_second_flight_that_begins_before_the_first_one_by_its_clock(tmp_path: Path) -> None:
@@ -82,9 +82,9 @@ def test_a_second_flight_that_begins_before_the_first_one_by_its_clock(tmp_path:
 
 def test_what_waited_when_the_recorder_was_stopped_lies_topic_by_topic(tmp_path: Path) -> None:
     """As it is written down then; also with a clock that was set back."""
-    told = set_by(FLIGHT, 30, -5 * SECOND)
-    tail = sorted(told[60:], key=lambda message: message.topic)
-    assert steps_of(write(tmp_path / "bag", told[:60] + tail)) == WHOLE
+    recorded = set_by(FLIGHT, 30, -5 * SECOND)
+    tail = sorted(recorded[60:], key=lambda message: message.topic)
+    assert steps_of(write(tmp_path / "bag", recorded[:60] + tail)) == WHOLE
 
 
 MILLISECONDS = st.integers(-9000, -20) | st.integers(20, 9000)
@@ -97,12 +97,12 @@ def test_any_setting_of_the_clock_and_any_delay_in_writing_give_the_same_steps(
 ) -> None:
     """Topics are written down late, each in its order; the clock is set by up to nine seconds."""
     rng = random.Random(seed)
-    told = FLIGHT
+    recorded = FLIGHT
     for at, by_ms in settings_of_the_clock:
-        told = set_by(told, at, by_ms * 10**6)
+        recorded = set_by(recorded, at, by_ms * 10**6)
     late: dict[str, float] = {}
     places = []
-    for i, message in enumerate(told):
+    for i, message in enumerate(recorded):
         late[message.topic] = max(late.get(message.topic, 0.0), i + rng.randrange(20))
         places.append((late[message.topic], i, message))
 
@@ -110,7 +110,7 @@ def test_any_setting_of_the_clock_and_any_delay_in_writing_give_the_same_steps(
         def received(self, names: object) -> Iterator[tuple[int, BagMessage]]:
             return receive_order.in_order(message for *_, message in sorted(places, key=itemgetter(0, 1)))
 
-    stream = Steps(Recorded(told), "", STEP_NS)
+    stream = Steps(Recorded(recorded), "", STEP_NS)
     assert [plain(step) for step in stream] == WHOLE
     assert not stream.orphans + stream.repeated + stream.rejected
 
@@ -118,17 +118,19 @@ def test_any_setting_of_the_clock_and_any_delay_in_writing_give_the_same_steps(
 def test_the_order_of_receipt() -> None:
     """A message that was lost and sent again is no clock; memory is bounded."""
     rng = random.Random(0)
-    told = [
+    recorded = [
         BagMessage(f"/{i % 3}", "", b"", BEGUN_NS + i * 10**6 + rng.randrange(10**6), BEGUN_NS + i * 10**6)
         for i in range(3000)
     ]
-    late = told[:100] + told[101:103] + [told[100]] + told[103:]
-    assert list(receive_order.in_order(late)) == [(0, m) for m in told]
-    resent = [*told]
-    resent[100] = told[100]._replace(log_time_ns=told[100].log_time_ns + SECOND)
+    late = recorded[:100] + recorded[101:103] + [recorded[100]] + recorded[103:]
+    assert list(receive_order.in_order(late)) == [(0, m) for m in recorded]
+    resent = [*recorded]
+    resent[100] = recorded[100]._replace(log_time_ns=recorded[100].log_time_ns + SECOND)
     assert receive_order.set_back_ns(resent) == 0
-    alone = [m._replace(log_time_ns=m.log_time_ns - SECOND) if i >= 1500 else m for i, m in enumerate(told)]
-    for back in (alone, set_by(told, 1500, -SECOND)):
+    alone = [
+        m._replace(log_time_ns=m.log_time_ns - SECOND) if i >= 1500 else m for i, m in enumerate(recorded)
+    ]
+    for back in (alone, set_by(recorded, 1500, -SECOND)):
         assert list(receive_order.in_order(back)) == [(int(i >= 1500), m) for i, m in enumerate(back)]
         assert receive_order.set_back_ns(back) > SECOND * 0.99
 
@@ -148,8 +150,8 @@ def test_memory_of_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_it_is_reported_and_nothing_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = set_by(FLIGHT, 40, -5 * SECOND)
-    bag = write(tmp_path / "bag", told, about(SCENARIO, missions="3"))
+    recorded = set_by(FLIGHT, 40, -5 * SECOND)
+    bag = write(tmp_path / "bag", recorded, about(SCENARIO, missions="3"))
     printed = run(capsys, "info", bag)
     assert "bag complete" in printed
     assert "set back by 5.000 s during the recording" in printed
@@ -174,10 +176,10 @@ def test_beside_an_autopilot(
             the.set_clock(by_s)
             done = True
 
-    told = flights.Flight(SCENARIO, beat=set_back).fly()
+    recorded = flights.Flight(SCENARIO, beat=set_back).fly()
     expected = flights.Flight(SCENARIO).fly()
     assert done
-    bag = write(tmp_path / "bag", told, about(SCENARIO, vehicle="mavlink"))
+    bag = write(tmp_path / "bag", recorded, about(SCENARIO, vehicle="mavlink"))
     (same, stream), found = read(expected), steps_of(bag)
     assert [step[0] for step in found] == [plain(step)[0] for step in same]
     assert not stream.orphans

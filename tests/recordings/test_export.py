@@ -40,8 +40,8 @@ def export(capsys, bag, *options):
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    told = flight(TINY, act=act, seed=SEED, missions=MISSIONS)
-    return write(tmp_path_factory.mktemp("made") / "bag", told, ABOUT)
+    recorded = flight(TINY, act=act, seed=SEED, missions=MISSIONS)
+    return write(tmp_path_factory.mktemp("made") / "bag", recorded, ABOUT)
 
 
 def rows_of(path):
@@ -150,11 +150,13 @@ def test_other_observations_and_the_immediate_reward(bag, tmp_path, capsys, obse
 
 
 def check_transitions(capsys, bag, out, observation, form):
-    status, told = export(
+    status, printed = export(
         capsys, bag, "--transitions", "--out", out, "--observation", observation, "--reward-form", form
     )
     assert status == 0
-    assert f"24 transitions of {len(DataCollectionEnv(TINY, observation).reset(seed=0)[0])} numbers" in told
+    assert (
+        f"24 transitions of {len(DataCollectionEnv(TINY, observation).reset(seed=0)[0])} numbers" in printed
+    )
     made = np.load(out)
     env = DataCollectionEnv(tiny(reward={"form": form}), observation)
     i = 0
@@ -179,8 +181,10 @@ def check_transitions(capsys, bag, out, observation, form):
 def test_on_arrival_a_mission_terminates_at_the_dock_and_truncates_elsewhere(tmp_path, capsys):
     world = tiny(mission={"episode_end": "on_arrival"})
     way = [1, 1, 2, 2]
-    told = flight(world, act=lambda mission, step: way[step] if mission == 0 and step < 4 else 6, missions=2)
-    bag = write(tmp_path / "bag", told, about(world))
+    recorded = flight(
+        world, act=lambda mission, step: way[step] if mission == 0 and step < 4 else 6, missions=2
+    )
+    bag = write(tmp_path / "bag", recorded, about(world))
     assert export(capsys, bag, "--transitions", "--out", tmp_path / "t.npz")[0] == 0
     made = np.load(tmp_path / "t.npz")
     assert made["terminated"].tolist() == [False] * 3 + [True] + [False] * 8
@@ -189,12 +193,12 @@ def test_on_arrival_a_mission_terminates_at_the_dock_and_truncates_elsewhere(tmp
 
 def test_the_action_of_a_transition_is_what_was_flown(tmp_path, capsys):
     """A move that came too late was not; one that the bag lacks shows in the cells."""
-    told = flight(TINY, act=lambda mission, step: [6, 1, 2][step % 3])
+    recorded = flight(TINY, act=lambda mission, step: [6, 1, 2][step % 3])
     right = messages.Move(mission=0, step=0, action="right")
     late = changing("move", 0, 0, lambda _: right)
     lost = changing("move", 0, 1, lambda _: None)
-    told = [kept for message in told if (kept := lost(late(message))) is not None]
-    bag = write(tmp_path / "bag", told, about(TINY, pace="10.0"))
+    recorded = [kept for message in recorded if (kept := lost(late(message))) is not None]
+    bag = write(tmp_path / "bag", recorded, about(TINY, pace="10.0"))
     status, out = export(capsys, bag, "--transitions", "--out", tmp_path / "t.npz")
     assert status == 0
     assert "2 actions are deduced from the cells" in out
@@ -204,8 +208,8 @@ def test_the_action_of_a_transition_is_what_was_flown(tmp_path, capsys):
 def test_what_is_no_transition_is_skipped_and_counted(tmp_path, capsys):
     hovering = flight(TINY, act=lambda mission, step: 6)
     jump = changing("mission", 0, 6, lambda one: msgspec.structs.replace(one, cell=(2, 0, 0)))
-    told = [jump(m) for m in map(changing("rates", 0, 3, lambda _: None), hovering) if m]
-    bag = write(tmp_path / "bag", told, about(TINY))
+    recorded = [jump(m) for m in map(changing("rates", 0, 3, lambda _: None), hovering) if m]
+    bag = write(tmp_path / "bag", recorded, about(TINY))
     status, out = export(capsys, bag, "--transitions", "--out", tmp_path / "t.npz")
     assert status == 0
     assert "2 skipped: a step whose start or end is not recorded" in out

@@ -14,7 +14,7 @@ from tests.conftest import Ros, finish
 from tests.nodes.conftest import low  # noqa: F401
 from tests.nodes.test_bridge import flies_east, killed, until
 from tests.recordings import report_bags
-from tests.recordings.made import changing, copy, flight, said, write
+from tests.recordings.made import bag_message, changing, copy, flight, write
 from tests.recordings.test_steps import LATER_NS, STEP_NS, InMemory, read
 from tests.support import flights
 from tests.support.fake_autopilot.flight import fake
@@ -43,9 +43,9 @@ def bags(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flown")
     made = {name: flights.bag(folder / name, TINY, name, seed=5) for name in flights.FAULTS}
     own = policies.load(saved(folder / "p", TINY, name="own"))
-    told = flights.Flight(TINY, seed=5, policy=own, settings=SafetySettings(arm=True)).fly()
+    recorded = flights.Flight(TINY, seed=5, policy=own, settings=SafetySettings(arm=True)).fly()
     made["policy"] = write(
-        folder / "policy", told, flights.flown_about(TINY, 5, policy="own", policy_sha256=own.sha256)
+        folder / "policy", recorded, flights.flown_about(TINY, 5, policy="own", policy_sha256=own.sha256)
     )
     return made
 
@@ -69,15 +69,15 @@ def steps_of(bag):
 @pytest.fixture(scope="module")
 def not_reached(tmp_path_factory):
     """A bag of a flight of which two steps were not reached; one of them while it lasted."""
-    told = flights.Flight(TINY, seed=5).fly()
+    recorded = flights.Flight(TINY, seed=5).fly()
     changed = []
-    for message in told:
+    for message in recorded:
         if message.topic == "/mission":
             payload = messages.decode(cdr.decode_string(message.data), messages.Mission)
             late = payload.step == 2 and payload.phase is not Phase.READY
             n = (payload.step > 1) + (payload.step > 2 or late)
             payload = msgspec.structs.replace(payload, steps_not_reached=n)
-            message = message._replace(data=said("mission", payload, 0).data)
+            message = message._replace(data=bag_message("mission", payload, 0).data)
         changed.append(message)
     return write(tmp_path_factory.mktemp("late") / "bag", changed, flights.flown_about(TINY, 5))
 
@@ -101,14 +101,16 @@ def test_steps_that_were_not_reached_are_reported(not_reached, capsys, tmp_path)
 
 def test_the_last_reason_of_an_aborted_mission_is_its_reason(tmp_path, capsys):
     """An earlier one for the same end is not."""
-    told = flights.Flight(TINY, seed=5).fly()
-    last = max(i for i, message in enumerate(told) if message.topic == "/mission")
-    payload = messages.decode(cdr.decode_string(told[last].data), messages.Mission)
+    recorded = flights.Flight(TINY, seed=5).fly()
+    last = max(i for i, message in enumerate(recorded) if message.topic == "/mission")
+    payload = messages.decode(cdr.decode_string(recorded[last].data), messages.Mission)
     for i, reason in enumerate(("step 4: there", "the motors were stopped: by hand")):
         ended = msgspec.structs.replace(payload, phase=Phase.ABORTED, reason=reason)
-        told.insert(last + i, said("mission", ended, told[last + i - 1].publish_time_ns + 1000))
-    del told[last + 2 :]
-    bag = write(tmp_path / "bag", told, flights.flown_about(TINY, 5))
+        recorded.insert(
+            last + i, bag_message("mission", ended, recorded[last + i - 1].publish_time_ns + 1000)
+        )
+    del recorded[last + 2 :]
+    bag = write(tmp_path / "bag", recorded, flights.flown_about(TINY, 5))
     assert "the motors were stopped: by hand" in run(capsys, "info", bag)[1]
     run(capsys, "export", bag, "--out", tmp_path / "tables", "--format", "csv")
     (row,) = csv.DictReader((tmp_path / "tables" / "missions.csv").open())
@@ -127,7 +129,9 @@ def test_a_step_has_all_phase_reports_of_its_vehicle(bags, fault):
     found, stream = steps_of(bags[fault])
     with BagReader(bags[fault]) as reader:
         words = flights.phases(list(reader.messages()))
-    assert [(step.step, told.phase, told.reason) for step in found for told in step.phase_reports] == words
+    assert [
+        (step.step, report.phase, report.reason) for step in found for report in step.phase_reports
+    ] == words
     assert not stream.orphans + stream.repeated + stream.rejected
     assert not any(step.conflicts or step.n_dropped_reports for step in found)
     ends = flights.FAULTS[fault][1]
@@ -141,15 +145,15 @@ def test_a_step_has_all_phase_reports_of_its_vehicle(bags, fault):
 
 
 def test_the_status_is_the_same_in_any_order():
-    told = flights.Flight(TINY, beat=flights.FAULTS["battery"][0]).fly()
-    words = [m for m in told if m.topic == "/mission"]
-    expected, _ = read(told)
+    recorded = flights.Flight(TINY, beat=flights.FAULTS["battery"][0]).fly()
+    words = [m for m in recorded if m.topic == "/mission"]
+    expected, _ = read(recorded)
     times = {m.log_ns: step.step for step in expected for m in step.phase_reports}
     late = []
     for number in range(len(expected)):  # those of a step the other way round
         of_step = [m for m in words if times[m.log_time_ns] == number]
         late += [m._replace(log_time_ns=o.log_time_ns) for m, o in zip(of_step, of_step[::-1], strict=True)]
-    found, _ = read([*(m for m in told if m.topic != "/mission"), *late])
+    found, _ = read([*(m for m in recorded if m.topic != "/mission"), *late])
     assert [step.status for step in found] == [step.status for step in expected]
     assert [[t[:2] for t in step.phase_reports] for step in found] == [
         [t[:2] for t in step.phase_reports] for step in expected
@@ -164,9 +168,9 @@ def test_a_vehicle_that_is_ready_again_has_the_same_users_at_another_time():
     )
     flight = flights.Flight(TINY, beat=frozen, patience_s=5.0)
     found, stream = read(flight.fly())
-    reasons = [told.reason for told in found[0].phase_reports if told.phase is Phase.READY]
+    reasons = [one.reason for one in found[0].phase_reports if one.phase is Phase.READY]
     assert reasons[1:] == ["no position for 0.5 s", f"resumed after: {reasons[1]}"]
-    kinds = [told.fault for told in found[0].phase_reports if told.phase is Phase.READY]
+    kinds = [one.fault for one in found[0].phase_reports if one.phase is Phase.READY]
     assert kinds == [None, FaultKind.POSITION, None]
     assert found[0].flight == found[-1].flight == 0, "it is no other flight"
     assert found[0].conflicts["users"].stamp_ns > found[0].users.stamp_ns
@@ -175,28 +179,30 @@ def test_a_vehicle_that_is_ready_again_has_the_same_users_at_another_time():
 
 
 def test_what_a_middleware_repeats_is_counted_and_kept_once():
-    told = flights.Flight(TINY).fly()
+    recorded = flights.Flight(TINY).fly()
     words = [
-        m._replace(log_time_ns=told[-1].log_time_ns + i) for i, m in enumerate(told) if m.topic == "/mission"
+        m._replace(log_time_ns=recorded[-1].log_time_ns + i)
+        for i, m in enumerate(recorded)
+        if m.topic == "/mission"
     ]
-    found, stream = read([*told, *words])
+    found, stream = read([*recorded, *words])
     assert stream.repeated == {"mission": len(words)}
     assert not stream.orphans
-    assert [step.phase_reports for step in found] == [step.phase_reports for step in read(told)[0]]
+    assert [step.phase_reports for step in found] == [step.phase_reports for step in read(recorded)[0]]
 
 
 def test_a_vehicle_that_waits_for_hours_fills_no_memory():
-    told = flights.Flight(TINY, beat=flights.FAULTS["ground"][0]).fly()
-    i, word = next((i, m) for i, m in enumerate(told) if m.topic == "/mission")
+    recorded = flights.Flight(TINY, beat=flights.FAULTS["ground"][0]).fly()
+    i, word = next((i, m) for i, m in enumerate(recorded) if m.topic == "/mission")
     status = messages.decode(cdr.decode_string(word.data), messages.Mission)
     again = [
-        said("mission", msgspec.structs.replace(status, reason=f"waits {n}"), word.log_time_ns + n)
+        bag_message("mission", msgspec.structs.replace(status, reason=f"waits {n}"), word.log_time_ns + n)
         for n in range(1, PHASE_REPORTS_MAX + 50)
     ]
-    told[i:i] = again
-    (step,), stream = read(told)
+    recorded[i:i] = again
+    (step,), stream = read(recorded)
     assert len(step.phase_reports) == PHASE_REPORTS_MAX
-    assert step.n_dropped_reports == len(flights.phases(told)) - PHASE_REPORTS_MAX
+    assert step.n_dropped_reports == len(flights.phases(recorded)) - PHASE_REPORTS_MAX
     assert step.status.phase is step.phase_reports[-1].phase is Phase.ABORTED
     assert not stream.repeated
 
@@ -295,22 +301,22 @@ def test_what_is_changed_in_it_is_found(bags, capsys, tmp_path, topic, step, cha
 def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
     """What a bridge would publish that restarted a move after it was killed."""
     with BagReader(bags["none"]) as reader:
-        told = list(reader.messages())
-    where = [i for i, m in enumerate(told) if m.topic == "/mission"]
+        recorded = list(reader.messages())
+    where = [i for i, m in enumerate(recorded) if m.topic == "/mission"]
     moving = next(
         i
         for i in where
-        if (p := messages.decode(cdr.decode_string(told[i].data), messages.Mission)).step == 3
+        if (p := messages.decode(cdr.decode_string(recorded[i].data), messages.Mission)).step == 3
         and p.phase is Phase.MOVING
     )
     ready = max(i for i in where if i < moving)
-    later_ns = told[moving].publish_time_ns
+    later_ns = recorded[moving].publish_time_ns
     twice = [
-        m._replace(publish_time_ns=later_ns + 1 + n, log_time_ns=told[moving].log_time_ns + 1 + n)
-        for n, m in enumerate((told[ready], told[moving]))
+        m._replace(publish_time_ns=later_ns + 1 + n, log_time_ns=recorded[moving].log_time_ns + 1 + n)
+        for n, m in enumerate((recorded[ready], recorded[moving]))
     ]
-    told[moving + 1 : moving + 1] = twice
-    bag = write(tmp_path / "bag", told, flights.flown_about(TINY, 5))
+    recorded[moving + 1 : moving + 1] = twice
+    bag = write(tmp_path / "bag", recorded, flights.flown_about(TINY, 5))
     status, out = run(capsys, "verify", bag)
     assert status == 1
     assert "phases of 9 of 9 steps checked, 1 have a change that is not allowed; first:" in out
@@ -319,10 +325,10 @@ def test_a_move_that_was_flown_twice_is_found(bags, capsys, tmp_path):
 
 def test_the_vehicle_of_another_recorders_bag_is_known_by_its_statuses(bags, capsys, tmp_path):
     with BagReader(bags["hold"]) as reader:
-        told = list(reader.messages())
+        recorded = list(reader.messages())
         assert vehicle(reader, "") == "mavlink"
     about = {"scenario_values": json.dumps(msgspec.to_builtins(TINY))}
-    bag = write(tmp_path / "real", told, about)
+    bag = write(tmp_path / "real", recorded, about)
     with BagReader(bag) as reader:
         assert vehicle(reader, "") == "external"
     status, out = run(capsys, "verify", bag)
@@ -341,8 +347,8 @@ def test_whatever_happens_on_the_way_the_bag_verifies(tmp_path, seeds):
     """Faults at random moments: no report of a bridge counts as a difference."""
     ends = set()
     for seed in seeds:
-        told = flights.Flight(TINY, seed=seed, beat=flights.at_random(seed)).fly(cut_s=400.0)
-        bag = write(tmp_path / str(seed), told, flights.flown_about(TINY, seed))
+        recorded = flights.Flight(TINY, seed=seed, beat=flights.at_random(seed)).fly(cut_s=400.0)
+        bag = write(tmp_path / str(seed), recorded, flights.flown_about(TINY, seed))
         with BagReader(bag) as reader:
             found = verify(reader, "", TINY)
             assert not found.differs, (seed, found.lines)
@@ -381,10 +387,10 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
     assert status == 0, out
     assert out.endswith("\nverified\n")
     assert "phases of 8 of 8 steps checked, all changes are allowed; 7 moves were started" in out
-    told = [one for step in steps_of(bag)[0] for one in step.phase_reports]
+    recorded = [one for step in steps_of(bag)[0] for one in step.phase_reports]
     gone = (True, FaultKind.POLICY, "policy lost")
-    assert gone in {(one.held, one.fault, one.reason) for one in told}
-    assert sum(one.phase is Phase.TAKEOFF for one in told) == 2
+    assert gone in {(one.held, one.fault, one.reason) for one in recorded}
+    assert sum(one.phase is Phase.TAKEOFF for one in recorded) == 2
     status, out = run(capsys, "info", bag)
     assert "vehicle   mavlink" in out
     assert "pace" not in out, "it has its own"
@@ -403,8 +409,8 @@ def as_version_0_1(message):
 
 
 def test_a_bag_of_version_0_1_is_read_as_before(bags, capsys, tmp_path):
-    told = flights.Flight(TINY, seed=5, beat=flights.FAULTS["hold"][0]).fly()
-    old = [as_version_0_1(one) if one.topic == "/mission" else one for one in told]
+    recorded = flights.Flight(TINY, seed=5, beat=flights.FAULTS["hold"][0]).fly()
+    old = [as_version_0_1(one) if one.topic == "/mission" else one for one in recorded]
     bag = write(tmp_path / "old", old, flights.flown_about(TINY, 5))
     words = [[one for step in steps_of(it)[0] for one in step.phase_reports] for it in (bag, bags["hold"])]
     assert [one.held for one in words[0]] == [one.held for one in words[1]]
@@ -506,16 +512,18 @@ def page_of(capsys, bag, tmp_path):
 def test_a_report_shows_phases_faults_and_the_path(bags, capsys, tmp_path, fault):
     data = page_of(capsys, bags[fault], tmp_path)
     found, _ = steps_of(bags[fault])
-    told = [(step.step, one.phase.value, one.reason) for step in found for one in step.phase_reports]
+    recorded = [(step.step, one.phase.value, one.reason) for step in found for one in step.phase_reports]
     timeline = data["mission-0"]["timeline"]
-    assert [(row["step"], row["phase"], row["reason"]) for row in timeline["phases"]] == told
+    assert [(row["step"], row["phase"], row["reason"]) for row in timeline["phases"]] == recorded
     assert [row["s"] for row in timeline["phases"]] == sorted(row["s"] for row in timeline["phases"])
     (mission,) = data["data"]["missions"]
-    assert (mission["outcome"], mission["reason"]) == (told[-1][1], told[-1][2])
+    assert (mission["outcome"], mission["reason"]) == (recorded[-1][1], recorded[-1][2])
     whats = [one["what"] for one in data["data"]["health"]["faults"]]
     held = [f"step {step.step}: {one.reason}" for step in found for one in step.phase_reports if one.held]
     assert bool(held) == (fault in ("hold", "frozen"))
-    ended = [f"aborted, after step {found[-1].step}: {told[-1][2]}"] if told[-1][1] == "aborted" else []
+    ended = (
+        [f"aborted, after step {found[-1].step}: {recorded[-1][2]}"] if recorded[-1][1] == "aborted" else []
+    )
     assert whats == held + ended
     cells = timeline["cells"]
     assert cells["step"] == ([] if fault == "ground" else [step.step for step in found])

@@ -26,7 +26,7 @@ def write_step(
 ) -> None:
     """All messages of a step; the users are collected one after the other."""
     stamp_ns = (mission * (last + 1) + step) * STEP_NS
-    said: dict[str, messages.Payload] = {
+    payloads: dict[str, messages.Payload] = {
         "users": messages.Users(
             mission=mission, step=step, stamp_ns=stamp_ns, cluster=[0] * N_USERS,
             x_m=[1.0] * N_USERS, y_m=[2.0] * N_USERS,
@@ -44,7 +44,7 @@ def write_step(
         ),
     }  # fmt: skip
     if step < last:
-        said["move"] = messages.Move(mission=mission, step=step, action="left")
+        payloads["move"] = messages.Move(mission=mission, step=step, action="left")
     t = TYPES.types
     pose = t["geometry_msgs/msg/PoseStamped"](
         t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](stamp_ns // 10**9, 0), "map"),
@@ -53,7 +53,7 @@ def write_step(
             t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
         ),
     )
-    serialised = {name: cdr.encode_string(messages.encode(payload)) for name, payload in said.items()}
+    serialised = {name: cdr.encode_string(messages.encode(payload)) for name, payload in payloads.items()}
     serialised["pose"] = bytes(TYPES.serialize_cdr(pose, topics.POSE))
     for i, (name, data) in enumerate(serialised.items()):
         if name not in without:
@@ -79,7 +79,7 @@ def flown(
     close: bool = True,
 ) -> Path:
     """Two missions of three steps, 0.1 s each, 2 s between them; `without` some in mission 1, step 1."""
-    told = {
+    metadata = {
         "version": "0.2.0",
         "scenario": "five_clusters",
         "policy": "p",
@@ -87,7 +87,7 @@ def flown(
         "seed": "7",
         "missions": "2",
     }
-    bag = BagWriter(folder, told | (about or {}))
+    bag = BagWriter(folder, metadata | (about or {}))
     for name in ("pose", "users", "rates", "mission", "move", "diagnostics"):
         bag.add_topic(f"/{name}", topics.TOPICS[name].type)
     for mission in range(2):
@@ -110,26 +110,30 @@ def info(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
     """What the verb prints."""
     with pytest.raises(SystemExit) as stopped:
         command.main(["info", str(path), *options])
-    told = capsys.readouterr()
-    assert (stopped.value.code, told.err) == (0, "")
-    return told.out
+    captured = capsys.readouterr()
+    assert (stopped.value.code, captured.err) == (0, "")
+    return captured.out
 
 
 def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = flown(tmp_path / "bag")
     before = content(bag)
-    told = json.loads(info(bag, capsys, "--json"))
-    assert (told["complete"], told["problems"], told["recoverable"]) == (True, [], False)
-    assert (told["messages"], told["ros_distro"], told["about"]["policy_sha256"]) == (39, "jazzy", "ab12")
-    assert told["duration_s"] == pytest.approx(2.6, abs=1e-6)
-    assert told["restarts"] == {"policy": 2}
-    assert told["parts"][0]["library"].startswith("uav_dc_ros ")
+    survey = json.loads(info(bag, capsys, "--json"))
+    assert (survey["complete"], survey["problems"], survey["recoverable"]) == (True, [], False)
+    assert (survey["messages"], survey["ros_distro"], survey["about"]["policy_sha256"]) == (
+        39,
+        "jazzy",
+        "ab12",
+    )
+    assert survey["duration_s"] == pytest.approx(2.6, abs=1e-6)
+    assert survey["restarts"] == {"policy": 2}
+    assert survey["parts"][0]["library"].startswith("uav_dc_ros ")
     missions = [
-        (m["mission"], m["outcome"], m["steps"], m["collected"], m["users"]) for m in told["missions"]
+        (m["mission"], m["outcome"], m["steps"], m["collected"], m["users"]) for m in survey["missions"]
     ]
     assert missions == [(0, "landed", 3, 3, 4), (1, "landed", 3, 3, 4)]
-    assert [(m["seed"], m["missing"]) for m in told["missions"]] == [(7, {}), (8, {})]
-    [users] = [topic for topic in told["topics"] if topic["name"] == "/users"]
+    assert [(m["seed"], m["missing"]) for m in survey["missions"]] == [(7, {}), (8, {})]
+    [users] = [topic for topic in survey["topics"] if topic["name"] == "/users"]
     assert users["mean_hz"] == pytest.approx(7 / 2.6)
     assert (users["gap_s"], users["gap_at_s"]) == pytest.approx((2.0, 0.3))
     text = info(bag, capsys)
@@ -147,12 +151,12 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert max(map(len, text.splitlines()[1:])) <= 80
     assert content(bag) == before
     info(bag, capsys, "--json", str(tmp_path / "info.json"))
-    assert json.loads((tmp_path / "info.json").read_text()) == told
+    assert json.loads((tmp_path / "info.json").read_text()) == survey
     (tmp_path / "link.json").symlink_to("info.json")
     (tmp_path / "info.json").unlink()
     info(bag, capsys, "--json", str(tmp_path / "link.json"))
     assert (tmp_path / "link.json").is_symlink()
-    assert json.loads((tmp_path / "info.json").read_text()) == told
+    assert json.loads((tmp_path / "info.json").read_text()) == survey
 
 
 def test_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -160,15 +164,15 @@ def test_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         tmp_path / "bag", {"missions": "3"}, without=("rates", "pose"), dropped={"/pose": 5, "/users": 0}
     )
     (bag / "metadata.yaml").unlink()
-    told = json.loads(info(bag, capsys, "--json"))
-    assert not told["complete"]
-    assert told["problems"] == [
+    survey = json.loads(info(bag, capsys, "--json"))
+    assert not survey["complete"]
+    assert survey["problems"] == [
         "metadata.yaml is missing",
         "5 messages of /pose were dropped",
         "steps lack messages: 1 pose, 1 rates",
         "2 of 3 missions have an end",
     ]
-    assert {topic["name"]: topic["dropped"] for topic in told["topics"]}["/pose"] == 5
+    assert {topic["name"]: topic["dropped"] for topic in survey["topics"]}["/pose"] == 5
     assert "dropped" in info(bag, capsys)
 
 
@@ -194,10 +198,10 @@ def test_a_torn_bag_and_a_damaged_one(tmp_path: Path, capsys: pytest.CaptureFixt
     damaged = bytearray(file)
     damaged[file.index(b"\4\0\0\0zstd") + 100] ^= 1  # in the only chunk
     torn.write_bytes(damaged)
-    told = json.loads(info(torn, capsys, "--json"))
-    assert (told["complete"], told["recoverable"], told["messages"]) == (False, True, 0)
-    assert "a chunk whose content is damaged" in told["problems"][0]
-    assert told["about"]["seed"] == "7"
+    survey = json.loads(info(torn, capsys, "--json"))
+    assert (survey["complete"], survey["recoverable"], survey["messages"]) == (False, True, 0)
+    assert "a chunk whose content is damaged" in survey["problems"][0]
+    assert survey["about"]["seed"] == "7"
 
 
 def test_a_bag_of_another_recorder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -273,8 +277,8 @@ def test_payloads_that_cannot_be_decoded_are_reported_by_every_verb(
         tmp_path / "spoilt",
         lambda message: message._replace(data=spoil(message.data)),
     )
-    told = json.loads(info(bag, capsys, "--json"))
-    problems = [problem for problem in told["problems"] if "cannot be read" in problem]
+    survey = json.loads(info(bag, capsys, "--json"))
+    problems = [problem for problem in survey["problems"] if "cannot be read" in problem]
     assert [problem.split(" cannot")[0] for problem in problems] == [
         f"{n} messages of {topic}"
         for topic, n in (("mission", 8), ("move", 6), ("pose", 8), ("rates", 8), ("users", 8))
@@ -308,10 +312,10 @@ def test_a_bag_of_several_parts(tmp_path: Path, capsys: pytest.CaptureFixture[st
             bag.write("/a", text(f"{i}"), log_time_ns=log_ns + 1, publish_time_ns=log_ns + 1)
     recover(tmp_path / "bag", tmp_path / "again")
     for folder in (tmp_path / "bag", tmp_path / "again"):
-        told = json.loads(info(folder, capsys, "--json"))
-        assert told["problems"] == []
-        assert told["messages"] == 9
-        parts = [(part["messages"], part["repeated"]) for part in told["parts"]]
+        survey = json.loads(info(folder, capsys, "--json"))
+        assert survey["problems"] == []
+        assert survey["messages"] == 9
+        parts = [(part["messages"], part["repeated"]) for part in survey["parts"]]
         assert len(parts) == 5
         assert parts == [
             (counts["message_count"], int(part > 0))

@@ -53,16 +53,16 @@ def test_the_page_of_missions_equals_the_summary_of_run_all(module_ros):
     saved(ros.folder / "untrained", scenarios.load(ros.folder / "small.toml"), name="untrained")
     # Two seconds: long enough for every node to publish its diagnostics.
     flown = ("--scenario", "small.toml", "--policy", "untrained", "--pace", 300, "--missions", 2)
-    status, output = ros.run_all(*flown, "--bag", "flown", "--summary", "told.json")
+    status, output = ros.run_all(*flown, "--bag", "flown", "--summary", "summary.json")
     assert status == 0, output
     status, output = ros.run("uav_dc_ros.bag", "report", "flown")
     assert status == 0, output
     assert re.fullmatch(r"flown\.html: 2 missions, \d\.\d\d MB\n", output)
 
     data = report_bags.unpacked(ros.folder / "flown.html")
-    told = json.loads((ros.folder / "told.json").read_text())
-    assert len(data["data"]["missions"]) == len(told) == 2
-    for summary, wanted in zip(data["data"]["missions"], told, strict=True):
+    summaries = json.loads((ros.folder / "summary.json").read_text())
+    assert len(data["data"]["missions"]) == len(summaries) == 2
+    for summary, wanted in zip(data["data"]["missions"], summaries, strict=True):
         for key in ("seed", "outcome", "steps", "users_collected", "users_total"):
             assert summary[key] == wanted[key], key
         for key in ("data_bits", "sum_rate_bps", "distance_m", "reward"):
@@ -184,14 +184,14 @@ def test_as_many_missions_as_fit_and_the_others_on_request(tmp_path, capsys, mon
     out = tmp_path / "page.html"
     monkeypatch.setattr(pages, "PAGE_MAX", 2_250_000)  # some of eight
     assert report(folder, "--out", out) == 0
-    data, told = report_bags.unpacked(out), capsys.readouterr().out
+    data, printed = report_bags.unpacked(out), capsys.readouterr().out
     shown = data["data"]["shown"]
     assert shown == list(range(len(shown)))
     assert 0 < len(shown) < 8
     assert out.stat().st_size <= 2_250_000
     assert set(data) == {"data", *(f"mission-{i}" for i in shown)}
     assert len(data["data"]["missions"]) == data["data"]["missions_total"] == 8
-    assert f"{len(shown)} of 8 (as many as fit; --mission N shows others) missions" in told
+    assert f"{len(shown)} of 8 (as many as fit; --mission N shows others) missions" in printed
     assert report(folder, "--out", out, "--mission", 7) == 0
     assert [summary["mission"] for summary in report_bags.unpacked(out)["data"]["missions"]] == [7]
 
@@ -240,9 +240,9 @@ def test_a_comparison_pairs_equal_seeds(tmp_path, capsys):
     assert groups[2]["paired"] is None, "no seed in common"
     ends = [list(report_bags.states(scenario, seed))[-1][0] for seed in (1, 2, 3, 4)]
     collected = [int(state.collected.sum()) for state in ends]
-    told = groups[0]["metrics"]["users_collected"]
-    assert told["mean"] == pytest.approx(np.mean(collected))
-    assert min(collected) <= told["low"] <= told["mean"] <= told["high"] <= max(collected)
+    interval = groups[0]["metrics"]["users_collected"]
+    assert interval["mean"] == pytest.approx(np.mean(collected))
+    assert min(collected) <= interval["low"] <= interval["mean"] <= interval["high"] <= max(collected)
     curve = groups[0]["curves"]["n_collected"]
     assert len(curve["mean"]) == 21
     assert curve["mean"][-1] == pytest.approx(np.mean(collected), rel=1e-3)
@@ -285,9 +285,9 @@ def test_bad_input_gets_one_line(tmp_path, capsys):
     for arguments, wanted in cases.items():
         out = () if "--out" in arguments else ("--out", tmp_path / "page.html")
         assert report(*arguments, *out) == 2, arguments
-        told = capsys.readouterr().err
-        assert wanted in told
-        assert told.count("\n") == 1, told
+        error = capsys.readouterr().err
+        assert wanted in error
+        assert error.count("\n") == 1, error
     assert precious.read_text() == "mine"
     assert not (tmp_path / "page.html").exists()
 

@@ -64,13 +64,15 @@ def mission_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page of two missions of a bag whose every text is hostile."""
     folder = tmp_path_factory.mktemp("report")
     scenario = tiny(mission={"max_steps": 12, "r_min_bits": 4e6, "d_cons_m": 150.0})
-    told = report_bags.diagnostics(HOSTILE, 2, HOSTILE, {HOSTILE: HOSTILE, "restarts": "3", "cpu [%]": "12"})
+    diagnostics = report_bags.diagnostics(
+        HOSTILE, 2, HOSTILE, {HOSTILE: HOSTILE, "restarts": "3", "cpu [%]": "12"}
+    )
     bag = report_bags.write(
         folder / "<script>window.hacked=1<",
         scenario,
         seeds=(5, 6),
         about={"policy": HOSTILE, "pace": HOSTILE},
-        extra=(("/diagnostics", "", told), ("/diagnostics", "", told)),
+        extra=(("/diagnostics", "", diagnostics), ("/diagnostics", "", diagnostics)),
     )
     assert report(bag, "--out", folder / "page.html") == 0
     return folder / "page.html"
@@ -170,9 +172,9 @@ def test_the_slider_moves_the_uav_and_colours_the_users(page, mission_page):
 def test_play_flies_step_by_step_to_the_end(page):
     page.evaluate("""() => {
         window.seen = [];
-        const told = document.getElementById("position");
-        const note = () => window.seen.push(Number(told.textContent.match(/step (\\d+)/)[1]));
-        new MutationObserver(note).observe(told, { childList: true });
+        const output = document.getElementById("position");
+        const note = () => window.seen.push(Number(output.textContent.match(/step (\\d+)/)[1]));
+        new MutationObserver(note).observe(output, { childList: true });
     }""")
     page.get_by_role("button", name="Play").click()
     page.get_by_role("button", name="Pause").click()
@@ -263,17 +265,17 @@ def test_the_flight_of_a_real_vehicle(browser, tmp_path):
     """The page shows its reason and phases, and draws its path up to the slider's step."""
     scenario = tiny()
     flight = flights.Flight(scenario, beat=flights.FAULTS["battery"][0])
-    said = [cdr.decode_string(m.data) for m in flight.fly() if m.topic == "/mission"]
-    words = [messages.decode(text, messages.Mission) for text in said]
-    told = [said_with(m, words[-1], HOSTILE) for m in flight.told]
-    bag = flights.write(tmp_path / "bag", told, flights.flown_about(scenario))
+    texts = [cdr.decode_string(m.data) for m in flight.fly() if m.topic == "/mission"]
+    statuses = [messages.decode(text, messages.Mission) for text in texts]
+    recorded = [with_reason(m, statuses[-1], HOSTILE) for m in flight.told]
+    bag = flights.write(tmp_path / "bag", recorded, flights.flown_about(scenario))
     assert report(bag, "--out", tmp_path / "page.html") == 0
     timeline = report_bags.unpacked(tmp_path / "page.html")["mission-0"]["timeline"]
     opened = Opened(browser, tmp_path / "page.html", DESKTOP)
     page = opened.page
     assert page.locator("#why").inner_text() == f"aborted: {HOSTILE}"
     rows = page.get_by_role("region", name="Phases").locator("tbody tr")
-    assert rows.count() == len(timeline["phases"]) == len(words)
+    assert rows.count() == len(timeline["phases"]) == len(statuses)
     drawn = "() => document.getElementById('altitude').data.find((trace) => trace.name === 'flown').y"
     assert page.evaluate(drawn) == timeline["path"]["z"]
     flown_x = "() => document.getElementById('scene').data.find((trace) => trace.name === 'flown').x"
@@ -291,8 +293,8 @@ def test_the_flight_of_a_real_vehicle(browser, tmp_path):
     opened.context.close()
 
 
-def said_with(message: Any, last: messages.Mission, reason: str) -> Any:
-    """The message, with another reason if it is the last word."""
+def with_reason(message: Any, last: messages.Mission, reason: str) -> Any:
+    """The message, with another reason if it is the last status."""
     if message.data != cdr.encode_string(messages.encode(last)):
         return message
     other = msgspec.structs.replace(last, reason=reason)

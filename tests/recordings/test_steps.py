@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.recordings.made import APART_NS, BEGUN_NS, flight, pose, said, write
+from tests.recordings.made import APART_NS, BEGUN_NS, bag_message, flight, pose, write
 from tests.support.bags import text
 from tests.support.worlds import tiny
 from uav_dc_ros import messages
@@ -28,11 +28,11 @@ LATER_NS = BEGUN_NS + 3600 * 10**9
 class InMemory:
     """A reader of messages that lie in no file."""
 
-    def __init__(self, told: list[BagMessage]) -> None:
+    def __init__(self, recorded: list[BagMessage]) -> None:
         self.path, self.about = "memory", {}
-        self._told = sorted(told, key=lambda message: message.log_time_ns)
+        self._told = sorted(recorded, key=lambda message: message.log_time_ns)
         self.topics: dict[str, RecordedTopic] = {}
-        for message in told:
+        for message in recorded:
             row = RecordedTopic(name=message.topic, type=message.type)
             self.topics.setdefault(message.topic, row).count += 1
 
@@ -43,13 +43,13 @@ class InMemory:
         return ((0, message) for message in self.messages(names))
 
 
-def read(told, namespace="", step_ns=STEP_NS):
-    stream = Steps(InMemory(told), namespace, step_ns)
+def read(recorded, namespace="", step_ns=STEP_NS):
+    stream = Steps(InMemory(recorded), namespace, step_ns)
     return list(stream), stream
 
 
 def plain(step):
-    """What a step tells, without times."""
+    """A step without its times."""
     position = None if step.position_m is None else tuple(step.position_m)
     return (step.flight, step.mission, step.step), position, step.users, step.rates, step.status, step.move
 
@@ -72,11 +72,11 @@ def test_a_flight_in_order():
     assert not stream.orphans + stream.repeated + stream.rejected
 
 
-def shuffled(told, rng, reach, topics_in_order=False):
-    """As received: each message by up to `reach` messages late, if told those of a topic in their order."""
+def shuffled(recorded, rng, reach, topics_in_order=False):
+    """As received: each message up to `reach` messages late; optionally in order within each topic."""
     latest = {}
     late = []
-    for message in told:
+    for message in recorded:
         log_ns = message.log_time_ns + APART_NS * rng.randint(0, reach)
         if topics_in_order:
             log_ns = max(log_ns, latest.get(message.topic, 0))
@@ -96,22 +96,24 @@ def test_any_order_within_a_few_steps_gives_the_same_steps(seed, reach):
 @given(st.data())
 @settings(max_examples=30, deadline=None)
 def test_repetitions_change_nothing_and_are_counted(data):
-    """A lockstep that stands still says its step again; a middleware repeats what it said, as of then."""
+    """A lockstep that stands still publishes its step again; a middleware repeats old messages."""
     rng = random.Random(data.draw(st.integers(0, 2**32)))
-    told = list(FLIGHT)
+    recorded = list(FLIGHT)
     n = 0
     for _ in range(data.draw(st.integers(1, 5))):
         i = rng.randrange(len(FLIGHT))
         one = FLIGHT[i]
         if one.topic == "/pose":
             continue
-        if rng.random() < 0.5:  # said again at once, and published anew
+        if rng.random() < 0.5:  # bag_message again at once, and published anew
             again_ns = one.log_time_ns + rng.randrange(1, APART_NS)
-            told.append(one._replace(log_time_ns=again_ns, publish_time_ns=again_ns))
+            recorded.append(one._replace(log_time_ns=again_ns, publish_time_ns=again_ns))
         else:  # repeated at any time later
-            told.append(one._replace(log_time_ns=one.log_time_ns + rng.randrange(1, APART_NS * len(FLIGHT))))
+            recorded.append(
+                one._replace(log_time_ns=one.log_time_ns + rng.randrange(1, APART_NS * len(FLIGHT)))
+            )
         n += 1
-    found, stream = read(told)
+    found, stream = read(recorded)
     assert [plain(step) for step in found] == WHOLE
     assert (stream.repeated.total(), stream.orphans.total()) == (n, 0)
 
@@ -134,12 +136,12 @@ def test_what_is_missing_is_none_and_nothing_else_changes(lost):
     kept = [message for i, message in enumerate(FLIGHT) if i not in lost]
     found = {(step.mission, step.step): step for step in read(kept)[0]}
     begins = [i for i, message in enumerate(FLIGHT) if message.topic == "/pose"]
-    for first, (key, position, *told) in zip(begins, WHOLE, strict=True):
+    for first, (key, position, *recorded) in zip(begins, WHOLE, strict=True):
         names = ("users", "rates", "status", "move")
         at = dict(zip(("pose", "users", "status", "rates", "move"), range(first, first + 5), strict=True))
         step = found.get(key[1:])
         expected = {
-            name: None if at[name] in lost else value for name, value in zip(names, told, strict=True)
+            name: None if at[name] in lost else value for name, value in zip(names, recorded, strict=True)
         }
         if step is None:
             assert not any(expected.values())
@@ -154,19 +156,21 @@ def test_what_is_missing_is_none_and_nothing_else_changes(lost):
 @pytest.mark.parametrize("topic", ["users", "rates", "mission", "move", "pose"])
 def test_a_message_that_was_lost_and_sent_again_much_later_finds_its_step(topic):
     scenario = tiny(mission={"max_steps": 300})
-    told = flight(scenario)
-    i = next(i for i, m in enumerate(told) if m.topic == f"/{topic}" and i > 50)
-    told[i] = told[i]._replace(log_time_ns=told[i].log_time_ns + 200 * PER_STEP * APART_NS)
-    found, stream = read(told)
+    recorded = flight(scenario)
+    i = next(i for i, m in enumerate(recorded) if m.topic == f"/{topic}" and i > 50)
+    recorded[i] = recorded[i]._replace(log_time_ns=recorded[i].log_time_ns + 200 * PER_STEP * APART_NS)
+    found, stream = read(recorded)
     assert [plain(step) for step in found] == [plain(step) for step in read(flight(scenario))[0]]
     assert not stream.orphans
 
 
 def test_one_that_comes_too_late_is_an_orphan_and_few_steps_are_held():
-    told = flight(tiny(mission={"max_steps": 3 * OPEN_MAX}))
-    i = next(i for i, m in enumerate(told) if m.topic == "/rates" and i > 50)
-    told[i] = told[i]._replace(log_time_ns=told[i].log_time_ns + (OPEN_MAX + 10) * PER_STEP * APART_NS)
-    stream = Steps(InMemory(told), "", STEP_NS)
+    recorded = flight(tiny(mission={"max_steps": 3 * OPEN_MAX}))
+    i = next(i for i, m in enumerate(recorded) if m.topic == "/rates" and i > 50)
+    recorded[i] = recorded[i]._replace(
+        log_time_ns=recorded[i].log_time_ns + (OPEN_MAX + 10) * PER_STEP * APART_NS
+    )
+    stream = Steps(InMemory(recorded), "", STEP_NS)
     most = 0
     for _ in stream:
         most = max(most, len(stream._open))
@@ -181,14 +185,14 @@ def test_steps_in_memory_are_few_where_nothing_is_missing():
 
 @pytest.mark.parametrize(
     ("steps_of_first", "same_seed"),
-    # Not (0, True): of a flight that never moved, and one that begins the same, nothing tells two.
+    # Not (0, True): a flight that never moved cannot be distinguished from one with the same start.
     [(0, False), (1, False), (1, True), (2, True), (5, True), (None, True), (None, False)],
 )
 def test_two_flights_in_one_bag(steps_of_first, same_seed):
     first = flight(SCENARIO, steps=steps_of_first)
     second = flight(SCENARIO, missions=2, seed=0 if same_seed else 9, begun_ns=LATER_NS)
     found, stream = read(first + second)
-    one, two = ([plain(s)[1:] for s in read(told)[0]] for told in (first, second))
+    one, two = ([plain(s)[1:] for s in read(recorded)[0]] for recorded in (first, second))
     assert [plain(s)[1:] for s in found if s.flight == 0] == one
     assert [plain(s)[1:] for s in found if s.flight == 1] == two
     assert not stream.orphans + stream.repeated
@@ -201,7 +205,9 @@ def test_two_flights_of_which_topics_are_late(seed):
     """Each writer's messages come in its order: by that a start that comes again is known."""
     rng = random.Random(seed)
     second = flight(SCENARIO, seed=4, begun_ns=LATER_NS)
-    found, stream = read([m for told in (FLIGHT, second) for m in shuffled(told, rng, 2 * PER_STEP, True)])
+    found, stream = read(
+        [m for recorded in (FLIGHT, second) for m in shuffled(recorded, rng, 2 * PER_STEP, True)]
+    )
     assert [plain(step) for step in found if step.flight == 0] == WHOLE
     assert len([step for step in found if step.flight == 1]) == LAST + 1 == len(found) - len(WHOLE)
     assert all(None not in plain(step)[1:-1] for step in found)
@@ -215,13 +221,13 @@ def test_an_abort_ends_the_step_that_was_ready():
 
 
 def test_a_vehicle_that_was_stopped_and_goes_on_is_ready_again():
-    told = flight(SCENARIO)
-    i, ready = next((i, m) for i, m in enumerate(told) if m.topic == "/mission" and i > 10)
-    status = next(s.status for s in read(told)[0] if s.publish_ns["mission"] == ready.publish_time_ns)
+    recorded = flight(SCENARIO)
+    i, ready = next((i, m) for i, m in enumerate(recorded) if m.topic == "/mission" and i > 10)
+    status = next(s.status for s in read(recorded)[0] if s.publish_ns["mission"] == ready.publish_time_ns)
     aborted = msgspec.structs.replace(status, phase=Phase.ABORTED)
-    told.insert(i + 1, said("mission", aborted, ready.log_time_ns + 1))
-    told.insert(i + 2, said("mission", status, ready.log_time_ns + 2))
-    found, stream = read(told)
+    recorded.insert(i + 1, bag_message("mission", aborted, ready.log_time_ns + 1))
+    recorded.insert(i + 2, bag_message("mission", status, ready.log_time_ns + 2))
+    found, stream = read(recorded)
     assert not any(step.conflicts for step in found)
     assert stream.repeated == {"mission": 1}
     assert found[-1].status.phase is not Phase.ABORTED
@@ -230,8 +236,8 @@ def test_a_vehicle_that_was_stopped_and_goes_on_is_ready_again():
 def test_what_is_said_again_differently_is_kept_beside_the_first():
     i, one = next((i, m) for i, m in enumerate(FLIGHT) if m.topic == "/move")
     other = messages.Move(mission=0, step=0, action="hover")
-    told = [*FLIGHT, said("move", other, one.log_time_ns + 1)]
-    found, _ = read(told)
+    recorded = [*FLIGHT, bag_message("move", other, one.log_time_ns + 1)]
+    found, _ = read(recorded)
     assert found[0].move.action == "left"
     assert found[0].conflicts == {"move": other}
     assert [plain(step) for step in found] == WHOLE
@@ -239,22 +245,22 @@ def test_what_is_said_again_differently_is_kept_beside_the_first():
 
 
 def test_the_first_pose_of_the_steps_own_time_is_its_position():
-    """An aircraft tells many; stamps of another time, true or not, are none of the step's."""
+    """An aircraft publishes many; stamps of another time do not belong to the step."""
     users = next(m for m in FLIGHT if m.topic == "/users")
     now_ns = users.log_time_ns
-    told = [
-        said("pose", pose((9, 9, 9), 10 * STEP_NS), now_ns - 3),  # of the future
+    recorded = [
+        bag_message("pose", pose((9, 9, 9), 10 * STEP_NS), now_ns - 3),  # of the future
         users,
-        said("pose", pose((3, 3, 3), 700), now_ns + 3),
-        said("pose", pose((1, 1, 1), 500), now_ns + 4),  # overtaken on its way
-        said("pose", pose((1, 1, 1), 500), now_ns + 5),
-        said("pose", pose((2, 2, 2), 500), now_ns + 6),
-        said("pose", pose((4, 4, 4), STEP_NS), now_ns + 7),  # of the next step
-        said("pose", pose((5, 5, 5), 100, frame="odom"), now_ns + 8),
-        said("pose", pose((float("nan"), 5, 5), 100), now_ns + 9),
-        said("pose", pose((5, 5, 5), 100)[:40], now_ns + 10),
+        bag_message("pose", pose((3, 3, 3), 700), now_ns + 3),
+        bag_message("pose", pose((1, 1, 1), 500), now_ns + 4),  # overtaken on its way
+        bag_message("pose", pose((1, 1, 1), 500), now_ns + 5),
+        bag_message("pose", pose((2, 2, 2), 500), now_ns + 6),
+        bag_message("pose", pose((4, 4, 4), STEP_NS), now_ns + 7),  # of the next step
+        bag_message("pose", pose((5, 5, 5), 100, frame="odom"), now_ns + 8),
+        bag_message("pose", pose((float("nan"), 5, 5), 100), now_ns + 9),
+        bag_message("pose", pose((5, 5, 5), 100)[:40], now_ns + 10),
     ]
-    (step,), stream = read(told)
+    (step,), stream = read(recorded)
     assert step.position_m.tolist() == [1.0, 1.0, 1.0]
     assert [p.position_m[0] for p in step.poses] == [1.0, 2.0, 3.0]
     assert (step.log_ns["pose"], step.publish_ns["pose"]) == (now_ns + 4, now_ns + 4)
@@ -262,10 +268,11 @@ def test_the_first_pose_of_the_steps_own_time_is_its_position():
 
 
 def test_poses_without_users_do_not_fill_the_memory():
-    told = [
-        said("pose", pose((0, 0, 100), i * 10**6), BEGUN_NS + i) for i in range(step_reader.POSES_MAX + 50)
+    recorded = [
+        bag_message("pose", pose((0, 0, 100), i * 10**6), BEGUN_NS + i)
+        for i in range(step_reader.POSES_MAX + 50)
     ]
-    stream = Steps(InMemory(told), "")
+    stream = Steps(InMemory(recorded), "")
     assert list(stream) == []
     assert len(stream._poses) == step_reader.POSES_MAX
 
@@ -282,11 +289,11 @@ def test_what_cannot_be_read_is_counted(tmp_path):
 
 
 def test_namespaces(tmp_path):
-    """Each namespace has its own missions; topics of another type are somebody else's."""
+    """Each namespace has its own missions; topics of another type do not count."""
     second = [m._replace(topic=f"/uav2{m.topic}") for m in flight(SCENARIO, seed=5)]
-    stranger = BagMessage("/uav3/mission", "std_msgs/msg/Bool", b"\0\1\0\0\1", BEGUN_NS, BEGUN_NS)
-    told = sorted([*FLIGHT, *second], key=lambda message: message.log_time_ns)
-    bag = write(tmp_path / "bag", [stranger, *told])
+    foreign = BagMessage("/uav3/mission", "std_msgs/msg/Bool", b"\0\1\0\0\1", BEGUN_NS, BEGUN_NS)
+    recorded = sorted([*FLIGHT, *second], key=lambda message: message.log_time_ns)
+    bag = write(tmp_path / "bag", [foreign, *recorded])
     with BagReader(bag) as reader:
         assert step_reader.namespaces(reader) == ["", "/uav2"]
         with pytest.raises(BagError, match=r"holds missions in /, /uav2; expected one of them"):
@@ -313,7 +320,7 @@ def test_the_scenario_of_a_bag(tmp_path):
     shipped = scenarios.load("three_clusters")
     bag = write(tmp_path / "foreign", flight(shipped, steps=1))
     with BagReader(bag) as reader:
-        assert step_reader.scenario(reader, "") == shipped, "by the fingerprint that its missions tell"
+        assert step_reader.scenario(reader, "") == shipped, "by the fingerprint of its missions"
         assert step_reader.scenario(reader, "", "five_clusters").name == "five_clusters"
     bag = write(tmp_path / "unknown", flight(SCENARIO, steps=1))
     with (

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import Ros, finish, wait_for
-from tests.recordings.made import about, changing, copy, flight, nudged, pose, said, write
+from tests.recordings.made import about, bag_message, changing, copy, flight, nudged, pose, write
 from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, files, messages, payloads, scenarios
@@ -87,7 +87,7 @@ def upward(payload):
 
 
 @pytest.mark.parametrize(
-    ("topic", "column", "change", "told"),
+    ("topic", "column", "change", "expected"),
     [
         ("rates", "sinr", nudged("sinr", 13), "rates: mission 1, step 31, user 13, sinr"),
         ("rates", "rate_bps", nudged("rate_bps", 0), "rates: mission 1, step 31, user 0, rate_bps"),
@@ -119,13 +119,13 @@ def upward(payload):
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 16 else "",
 )
-def test_one_value_changed_is_found(flown, tmp_path, capsys, topic, column, change, told):
+def test_one_value_changed_is_found(flown, tmp_path, capsys, topic, column, change, expected):
     bag = copy(flown, tmp_path / "bag", changing(topic, 1, 31, change))
     before, after = payload(flown, topic, 1, 31), payload(bag, topic, 1, 31)
     assert getattr(before, column) != getattr(after, column)
     status, out = verify(capsys, bag)
     assert status == 1
-    assert told in out
+    assert expected in out
     assert out.splitlines()[-1] == "differs"
     values = [getattr(one, column) for one in (after, before)]
     if isinstance(values[0], list):
@@ -179,14 +179,14 @@ def test_a_user_collected_early_is_one_difference_and_what_follows_stands_on_wha
 
 
 def test_a_differing_repetition_is_found(flown, tmp_path, capsys):
-    other = said("rates", nudged("data_bits", 2)(payload(flown, "rates", 1, 31)), 0)
-    told = []
+    other = bag_message("rates", nudged("data_bits", 2)(payload(flown, "rates", 1, 31)), 0)
+    recorded = []
     with BagReader(flown) as reader:
         for message in reader.messages():
-            told.append(message)
+            recorded.append(message)
             if changing("rates", 1, 31, lambda _: None)(message) is None:
-                told.append(message._replace(data=other.data, log_time_ns=message.log_time_ns + 1))
-        bag = write(tmp_path / "bag", told, reader.about)
+                recorded.append(message._replace(data=other.data, log_time_ns=message.log_time_ns + 1))
+        bag = write(tmp_path / "bag", recorded, reader.about)
     status, out = verify(capsys, bag)
     assert status == 1
     assert "rates: mission 1, step 31, data_bits[2], repeated: recorded" in out
@@ -243,15 +243,15 @@ def test_another_policy(flown, capsys):
 
 def test_a_missing_policy_is_reported_and_found_by_its_hash(flown, tmp_path, capsys):
     with BagReader(flown) as reader:
-        told, told_about = list(reader.messages()), reader.about
-    bag = write(tmp_path / "elsewhere", told, told_about | {"policy": "mine"})
+        recorded, metadata = list(reader.messages()), reader.about
+    bag = write(tmp_path / "elsewhere", recorded, metadata | {"policy": "mine"})
     assert verify(capsys, bag)[0] == 0, "a shipped policy is known by its hash, whatever its name"
-    bag = write(tmp_path / "other", told, told_about | {"policy_sha256": "ab" * 32})
+    bag = write(tmp_path / "other", recorded, metadata | {"policy_sha256": "ab" * 32})
     status, out = verify(capsys, bag)
     assert status == 0
     assert f"decisions: not verified: policy '{POLICY}' (sha256 abababababab) is missing" in out
     assert (
-        f"'{POLICY}' is another one (sha256 {told_about['policy_sha256'][:12]}); expected it from --po" in out
+        f"'{POLICY}' is another one (sha256 {metadata['policy_sha256'][:12]}); expected it from --po" in out
     )
     assert out.splitlines()[-1] == "verified in part"
     assert verify(capsys, bag, "--complete")[0] == 1
@@ -268,8 +268,8 @@ def test_a_policy_of_ones_own(tmp_path, capsys, inside):
     (tmp_path / "mine" / "broken").mkdir()
     (tmp_path / "mine" / "broken" / policies.CONFIG).write_text("{")
     own = policies.load(folder)
-    told_about = about(TINY, policy="own", policy_sha256=own.sha256)
-    bag = write(tmp_path / "bag", flight(TINY, missions=2), told_about)
+    metadata = about(TINY, policy="own", policy_sha256=own.sha256)
+    bag = write(tmp_path / "bag", flight(TINY, missions=2), metadata)
     status, out = verify(capsys, bag, "--policy-dir", folder if inside else folder.parent)
     assert "decisions: 16 of 16 steps recomputed" in out
     assert status == 1, "its moves were made up"
@@ -296,8 +296,8 @@ def test_tolerance_lets_the_last_bit_pass_and_counts_it(flown, tmp_path, capsys)
 
 @pytest.mark.parametrize("topic", ["pose", "users", "rates", "mission"])
 def test_a_bag_without_a_topic_is_refused(tmp_path, capsys, topic):
-    told = [message for message in flight(TINY) if message.topic != f"/{topic}"]
-    status, err = verify(capsys, write(tmp_path / "bag", told, about(TINY)))
+    recorded = [message for message in flight(TINY) if message.topic != f"/{topic}"]
+    status, err = verify(capsys, write(tmp_path / "bag", recorded, about(TINY)))
     assert status == 2
     if topic != "mission":
         assert f"holds nothing on /{topic}; expected pose, users, rates, mission" in err
@@ -325,33 +325,33 @@ def test_a_bag_of_another_recorder(tmp_path, capsys):
 def test_where_rates_are_missing_both_pasts_are_possible(tmp_path, capsys):
     """The monitor counted a step whose rates were lost, or missed it."""
     scenario = tiny(mission={"r_min_bits": 6e7})
-    told = flight(scenario, act=lambda mission, step: 6 if step else 1)  # to the users, and stay
+    recorded = flight(scenario, act=lambda mission, step: 6 if step else 1)  # to the users, and stay
 
     def found(name, messages_of_bag, *changes):
         for change in (changing("rates", 0, 3, lambda _: None), *changes):
             messages_of_bag = [kept for m in messages_of_bag if (kept := change(m)) is not None]
         return verify(capsys, write(tmp_path / name, messages_of_bag, about(scenario)))
 
-    status, out = found("booked", told)
+    status, out = found("booked", recorded)
     assert (status, "channel: 8 of 9 steps recomputed, equal to the last bit" in out) == (0, True)
 
-    missed = without_step(told, scenario, 3)
-    assert missed[-1] != told[-1]
+    missed = without_step(recorded, scenario, 3)
+    assert missed[-1] != recorded[-1]
     status, out = found("missed", missed)
     assert (status, "channel: 8 of 9 steps recomputed, equal to the last bit" in out) == (0, True)
 
     # What fits neither is unknown, and no difference; but SINR and rate do not depend on it.
-    status, out = found("odd", told, changing("rates", 0, 4, more_data))
+    status, out = found("odd", recorded, changing("rates", 0, 4, more_data))
     assert "1 not recomputed: what was collected before it is not recorded" in out
-    status, out = found("false", told, changing("rates", 0, 4, nudged("sinr", 1)))
+    status, out = found("false", recorded, changing("rates", 0, 4, nudged("sinr", 1)))
     assert (status, "step 4, user 1, sinr: recorded" in out) == (1, True)
 
 
-def without_step(told, scenario, number):
+def without_step(recorded, scenario, number):
     """A flight whose monitor missed a step."""
     made, collection = [], None
     uav_m = users_m = None
-    for message in told:
+    for message in recorded:
         kind = messages.PAYLOADS.get(message.topic[1:])
         one = messages.decode(cdr.decode_string(message.data), kind) if kind else None
         if one is None:
@@ -364,7 +364,7 @@ def without_step(told, scenario, number):
             link = world.measure(scenario, uav_m, users_m, collection[1])
             collection = world.collect(scenario, link, *collection)
             rates = payloads.rates(link, *collection, mission=one.mission, step=one.step)
-            message = message._replace(data=said("rates", rates, 0).data)
+            message = message._replace(data=bag_message("rates", rates, 0).data)
         made.append(message)
     return made
 
@@ -402,13 +402,13 @@ def test_another_seed_in_the_metadata_is_no_difference(tmp_path, capsys):
 
 def test_a_paced_flight_may_hover_where_a_move_came_too_late(tmp_path, capsys):
     """In lockstep no move comes too late: there the same is a difference."""
-    told = flight(TINY, act=lambda mission, step: 6)
+    recorded = flight(TINY, act=lambda mission, step: 6)
     late = changing("move", 0, 2, lambda move: msgspec.structs.replace(move, action="right"))
-    told = [late(message) for message in told]
-    status, out = verify(capsys, write(tmp_path / "paced", told, about(TINY, pace="10.0")))
+    recorded = [late(message) for message in recorded]
+    status, out = verify(capsys, write(tmp_path / "paced", recorded, about(TINY, pace="10.0")))
     assert status == 0
     assert "1 moves came too late and were not flown: the vehicle hovered" in out
-    status, out = verify(capsys, write(tmp_path / "lockstep", told, about(TINY)))
+    status, out = verify(capsys, write(tmp_path / "lockstep", recorded, about(TINY)))
     assert status == 1
     assert "mission: mission 0, step 3, cell: recorded [0, 0, 0], recomputed [1, 0, 0]" in out
 
@@ -432,7 +432,7 @@ def test_missions_whose_nodes_were_killed_verify(ros: Ros, capsys):
         r"^channel: (\d+) of 1525 steps recomputed, equal to the last bit", out, re.MULTILINE
     )
     assert recomputed is not None, out
-    # What a killed node had published last may not have left it: the bag lacks it, and verify says so.
+    # The last messages of a killed node may be lost: the bag lacks them, and verify reports it.
     assert int(recomputed[1]) >= 1522, out
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from tests.recordings.made import BEGUN_NS, about, pose, said, write
+from tests.recordings.made import BEGUN_NS, about, bag_message, pose, write
 from tests.support.fake_autopilot.common import way_home
 from tests.support.fake_autopilot.simulated import Vehicle
 from uav_dc_ros import cdr, messages, payloads
@@ -134,7 +134,7 @@ class Flight:
 
     def _say(self, topic: str, payload: messages.Payload | bytes) -> None:
         sent_ns = self._sent_ns = max(self.now_ns, self._sent_ns + 1000)
-        self.told.append(said(topic, payload, sent_ns)._replace(log_time_ns=sent_ns + LATENCY_NS))
+        self.told.append(bag_message(topic, payload, sent_ns)._replace(log_time_ns=sent_ns + LATENCY_NS))
 
     def _tell(self) -> None:
         """What the bridge says at every change."""

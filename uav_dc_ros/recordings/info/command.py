@@ -143,9 +143,9 @@ def _missions(missions: list[MissionSurvey]) -> Table:
             "outcome": mission.outcome,
             "steps": f"{mission.steps}",
             "not reached": f"{mission.steps_not_reached}",
-            "users collected": "-"
-            if mission.users is None
-            else f"{mission.collected:,} of {mission.users:,}",
+            "users collected": f"{mission.collected:,} of {mission.users:,}"
+            if mission.users is not None
+            else "-",
             "seed": "-" if mission.seed is None else f"{mission.seed}",
             "lacks": ", ".join(f"{n} {topic}" for topic, n in mission.missing.items()),
         }

@@ -132,16 +132,11 @@ def verify(
     """Recompute the missions in a namespace; raises BagError if nothing can be recomputed."""
     about = reader.about
     vehicle = step_reader.vehicle(reader, namespace)
+    seed, lockstep, real = about.get("seed"), about.get("pace") == pace.LOCKSTEP, vehicle != SIMULATED
     policy, missing_policy = _policy(about, scenario, policy_dir)
     channel = ChannelCheck(scenario, tolerance)
-    world = WorldCheck(
-        scenario,
-        seed=about.get("seed"),
-        lockstep=about.get("pace") == pace.LOCKSTEP,
-        real=vehicle != SIMULATED,
-        tolerance=tolerance,
-    )
-    flights = VehicleCheck(scenario, vehicle) if vehicle != SIMULATED else None
+    world = WorldCheck(scenario, seed=seed, lockstep=lockstep, real=real, tolerance=tolerance)
+    flights = VehicleCheck(scenario, vehicle) if real else None
     decisions = DecisionCheck(scenario, policy) if policy else None
     recorded = Steps(reader, namespace, scenario.step_ns)
     n_missions = n_steps = 0
@@ -171,7 +166,7 @@ def verify(
         f"{missions}, {n_steps} steps in scenario {scenario.name!r}{by}",
         lines + losses + (other.lines() if other else []),
         differs=any(check.differing for check in checks),
-        gaps=any(check.skipped for check in checks) or not decisions or bool(losses) or "seed" not in about,
+        gaps=any(check.skipped for check in checks) or not decisions or bool(losses) or seed is None,
     )
 
 
@@ -208,10 +203,8 @@ def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> t
             return policy, ""
         if policy.name == name and not other:
             other = f"; {str(candidate)!r} is another one (sha256 {policy.sha256[:12]})"
-    return (
-        None,
-        f"policy {name!r} (sha256 {sha256[:12]}) is missing{other}; expected it from --policy-dir DIR",
-    )
+    missing = f"policy {name!r} (sha256 {sha256[:12]}) is missing{other}"
+    return None, f"{missing}; expected it from --policy-dir DIR"
 
 
 def _candidates(name: str, folder: Path | None) -> Iterator[str | Path]:
