@@ -165,7 +165,7 @@ def test_resume_keeps_the_prefilled_replay(tmp_path, train, monkeypatch):
     monkeypatch.setattr(Training, "fly_episode", stop_after_three)
     status, out = train("made", "--from-bags", bag)
     assert status == 130
-    assert "--resume goes on" in out
+    assert "--resume continues" in out
     monkeypatch.undo()
     status, out = train("made", "--resume")
     assert status == 2

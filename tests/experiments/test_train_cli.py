@@ -206,7 +206,7 @@ def test_ctrl_c_keeps_the_best_checkpoint(tmp_path, field, forks):
     last = err.splitlines()[-1]
     assert "stopped; the best policy until now is" in last
     folder, _, hint = last.rpartition(" is ")[-1].partition("; ")
-    assert hint == "--resume goes on"
+    assert hint == "--resume continues"
     assert policy.load(folder).config.episode >= 2
     assert not (tmp_path / "made").exists()
 

@@ -83,7 +83,7 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         try:
             results, networks = _train(options, command)
         except KeyboardInterrupt:
-            hint = "; --resume goes on" if out.exists() else ""
+            hint = "; --resume continues" if out.exists() else ""
             print(f"{PROG}: stopped{hint}", file=sys.stderr)
             return cli.INTERRUPTED
     report.write(results, sweep.roll_out_trajectories(networks, scale), out, options.only)

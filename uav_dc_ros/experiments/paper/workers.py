@@ -63,7 +63,7 @@ def train_locally(shards: Sequence[Shard], folder: Path, n_workers: int, on_prog
                         if attempt == _TRIES:
                             raise TrainingError(
                                 f"the worker of {shard.name} died {_TRIES} times, at last with exit code "
-                                f"{worker.exitcode}; finished shards are saved, and --resume goes on"
+                                f"{worker.exitcode}; finished shards are saved, and --resume continues"
                             ) from None
                         waiting.insert(0, (shard, attempt + 1))
                     continue

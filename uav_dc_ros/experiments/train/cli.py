@@ -7,7 +7,6 @@ import shlex
 import shutil
 import sys
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -134,10 +133,10 @@ def _train(options: argparse.Namespace, command: str) -> int:
     _reserve(folder, options.resume, training.n_flown)
     started = time.monotonic() - progress.seconds
     try:
-        with ExitStack() as stack:
-            stack.callback(_discard_empty, folder)
-            display = stack.enter_context(TrainingProgress(training, every))
-            scalars = stack.enter_context(TensorBoardLog(options.tensorboard, options.out.name, training))
+        with (
+            TrainingProgress(training, every) as display,
+            TensorBoardLog(options.tensorboard, options.out.name, training) as scalars,
+        ):
             while training.n_flown < population.n_episodes:
                 training.fly_episode()
                 scalars.add_episode()
@@ -155,12 +154,14 @@ def _train(options: argparse.Namespace, command: str) -> int:
                 display.show(math.nan if progress.score is None else progress.score)
     except KeyboardInterrupt:
         if saved.is_file():
-            kept = f"the best policy until now is {folder / progress.best}; --resume goes on"
+            kept = f"the best policy until now is {folder / progress.best}; --resume continues"
         else:
             shutil.rmtree(folder, ignore_errors=True)
             kept = "there is no checkpoint yet"
         print(f"{PROG}: stopped; {kept}", file=sys.stderr)
         return cli.INTERRUPTED
+    finally:
+        _discard_empty(folder)
     best = policy.load(folder / progress.best)
     assert progress.score is not None, "the last episode is validated"
     text = (shipped, command, options.runs, progress.seconds, progress.score, progress.prefilled)
