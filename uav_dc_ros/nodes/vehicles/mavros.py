@@ -8,7 +8,6 @@ When this process dies, MAVROS lives on, and no failsafe for a lost ground stati
 setpoints (COM_OF_LOSS_T); ArduPilot stays at the last one until this process restarts, or a pilot acts.
 """
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -129,7 +128,7 @@ class MavrosVehicle:
         )
         telemetry = self._telemetry.snapshot(now_s, self._other_publishers())
         if telemetry.missing is None and (problem := self._graph_problem()) is not None:
-            return dataclasses.replace(telemetry, missing=problem)
+            return telemetry.replace(missing=problem)
         return telemetry
 
     def set_setpoint(self, setpoint: Enu | None) -> None:

@@ -6,7 +6,6 @@ over (COM_OF_LOSS_T, COM_OBL_RC_ACT), as it does when the process has died.
 Messages are sent with time 0, which PX4 replaces by their arrival, so clocks need not be synchronised.
 """
 
-import dataclasses
 import importlib
 import math
 import re
@@ -132,7 +131,7 @@ class Px4Vehicle:
             return telemetry
         topics = ", ".join(self._topic(name) for name in silent)
         missing = f"nothing received on {topics} yet{self._other_release() or ''}"
-        return dataclasses.replace(telemetry, missing=missing)
+        return telemetry.replace(missing=missing)
 
     def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, from now on; or none. To be called at 2 Hz or more."""

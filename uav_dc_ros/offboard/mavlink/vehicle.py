@@ -5,7 +5,6 @@ Python's global lock delays it: the rest of the process should have that priorit
 """
 
 import contextlib
-import dataclasses
 import importlib
 import math
 import os
@@ -119,7 +118,7 @@ class MavlinkVehicle:
         with self._lock:
             telemetry = self._telemetry.snapshot(time.monotonic())
             if self._down is not None and telemetry.missing is not None:
-                telemetry = dataclasses.replace(telemetry, missing=self._down)
+                telemetry = telemetry.replace(missing=self._down)
             return telemetry
 
     def set_setpoint(self, setpoint: Enu | None) -> None:

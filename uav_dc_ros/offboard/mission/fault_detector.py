@@ -1,6 +1,5 @@
 """Safety settings, and faults of link, position estimate, position, clock and battery."""
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -95,7 +94,7 @@ class FaultDetector:
             self._clock = telemetry.vehicle_s, now_s
         if not telemetry.armed and telemetry.on_ground is not False and telemetry.position is not None:
             self.home = telemetry.position
-        return dataclasses.replace(telemetry, home=telemetry.home or self.home)
+        return telemetry.replace(home=telemetry.home or self.home)
 
     def link_lost(self, now_s: float, telemetry: Telemetry) -> bool:
         """Whether the last heartbeat is older than `heartbeat_timeout_s`."""

@@ -1,6 +1,5 @@
 """Removes impossible values from telemetry, and counts them."""
 
-import dataclasses
 import math
 
 from uav_dc_ros.offboard.frames import Enu
@@ -45,8 +44,7 @@ class PlausibilityFilter:
         if telemetry.position is not None and telemetry.position_s is not None:
             self._check(now_s, telemetry.position, telemetry.position_s)
         position, position_s = self._accepted or (None, None)
-        self._last = dataclasses.replace(
-            telemetry,
+        self._last = telemetry.replace(
             vehicle_s=self._vehicle_s,
             position=position,
             position_s=position_s,
