@@ -240,6 +240,8 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert "griffe:" not in said
     assert "mkdocstrings:" not in said
     site = tmp_path / "site"
+    api = (site / "api.html").read_text("utf-8")
+    assert "Maximum 3D distance at which a user is served, metres" in api, "comments beside fields are shown"
     pages = list(site.rglob("*.html"))
     assert len(pages) >= 15
     fetched = r"<(?:script|img|iframe)[^>]+src=\"?https?:|<link[^>]+rel=\"?stylesheet[^>]+href=\"?https?:"

@@ -49,10 +49,8 @@ def whole_number(minimum: int, maximum: int | None = None, expected: str = "") -
     """The type of an option that is a whole number within a range, its ends included."""
 
     def whole(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = minimum - 1
+        # int() also reads blanks, underscores and the digits of other scripts.
+        value = int(text) if re.fullmatch(r"-?[0-9]{1,19}", text) else minimum - 1
         if not minimum <= value < (2**62 if maximum is None else maximum + 1):  # sums of it fit into 64 bits
             default = f"a whole number of at least {minimum}, and below 2^62"
             raise argparse.ArgumentTypeError(f"{text!r}; expected {expected or default}")
@@ -69,7 +67,7 @@ def number(minimum: float, maximum: float, expected: str) -> Callable[[str], flo
 
     def parse(text: str) -> float:
         try:
-            value = float(text)
+            value = math.nan if "_" in text else float(text)
         except ValueError:
             value = math.nan
         if not minimum <= value <= maximum:

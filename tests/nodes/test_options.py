@@ -38,6 +38,8 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--policy", "three_clusters_dueling"), "clusters is 5; expected 3"),
         (("--seed", "-1"), "argument --seed: '-1'; expected a whole number of at least 0"),
         (("--seed", "x"), "argument --seed: 'x'; expected a whole number"),
+        (("--seed", "1_0"), "argument --seed: '1_0'; expected a whole number"),
+        (("--seed", "\u0663"), "argument --seed: '\u0663'; expected a whole number"),
         (("--missions", "0"), "argument --missions: '0'; expected a whole number of at least 1"),
         (("--system", "256"), "argument --system: '256'; expected a MAVLink system number from 1 to 255"),
         (("--system", "7"), "--system: expected --vehicle mavlink, mavros, px4 with it"),
