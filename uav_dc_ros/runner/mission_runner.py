@@ -63,8 +63,7 @@ class Network:
 class MissionRunner:
     """A run of missions; prints progress and summary if `show`.
 
-    Raises:
-        UavDcError: the run cannot be flown; nothing was started or written.
+    Raises UavDcError before anything was started or written, if the run cannot be flown.
     """
 
     def __init__(self, config: RunConfig, *, show: bool = True) -> None:

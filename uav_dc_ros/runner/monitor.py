@@ -115,12 +115,8 @@ class MissionMonitor(MissionNode):
     def check_publishers(self, have_started: bool) -> None:
         """Check periodically for other publishers. After the mission has begun they are noted and ignored.
 
-        Args:
-            have_started: whether the nodes of this run_all have started: on a busy machine discovery takes as
-                long as that.
-
-        Raises:
-            AnotherMissionError: another mission is flown, and this one has not begun.
+        Before, another mission raises AnotherMissionError. `have_started`: whether the nodes of this run_all
+        have started, since discovery takes as long on a busy machine.
         """
         now_s = time.monotonic()
         if now_s < self._check_s:
@@ -154,11 +150,7 @@ class MissionMonitor(MissionNode):
             super()._publish_diagnostics()
 
     def check_run(self, topic: str, run: str) -> None:
-        """Note another run before this mission has begun.
-
-        Raises:
-            MessageError: the message belongs to another run.
-        """
+        """Note another run before this mission has begun; raises MessageError for it."""
         try:
             super().check_run(topic, run)
         except MessageError:
@@ -216,12 +208,7 @@ class MissionMonitor(MissionNode):
             self._report_end(now)
 
     def report_ends(self, waited_s: float = 0.0, before: int | None = None) -> None:
-        """Report missions that are over, also without the rates of their last steps.
-
-        Args:
-            waited_s: time since the last of them was over.
-            before: only missions before this one.
-        """
+        """Report missions `before` this one that are over since `waited_s`, even without their last rates."""
         if not self._unreported or time.monotonic() - self._ended_s < waited_s:
             return
         for index in sorted(self._unreported):

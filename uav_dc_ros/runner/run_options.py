@@ -21,11 +21,7 @@ OPTIONS = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", *
 
 
 def nodes(config: RunConfig) -> list[str]:
-    """Names of the nodes to start on this host.
-
-    Raises:
-        ParameterError: an unknown node, or one that contradicts another option.
-    """
+    """Names of the nodes to start on this host; raises ParameterError for a contradiction."""
     known = [row.name for row in NODES.values() if row.process]
     selected = list(config.nodes or ())
     if config.nodes is None:
@@ -49,11 +45,7 @@ def nodes(config: RunConfig) -> list[str]:
 
 
 def composed(config: RunConfig, nodes: list[str]) -> list[str]:
-    """Names of the nodes that share a process; by default, in lockstep, all composable ones.
-
-    Raises:
-        ParameterError: `compose` without two composable nodes.
-    """
+    """Names of the nodes that share a process, by default in lockstep; may raise ParameterError."""
     if not (config.factor is None if config.compose is None else config.compose):
         return []
     found = [name for name in nodes if name in COMPOSABLE]
@@ -64,11 +56,7 @@ def composed(config: RunConfig, nodes: list[str]) -> list[str]:
 
 
 def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]]:
-    """Checked values of `--set`, by node and parameter.
-
-    Raises:
-        ParameterError: a node that is not started here, an unknown parameter, or an invalid value.
-    """
+    """Values of `--set`, by node and parameter; raises ParameterError for an invalid one."""
     checked: dict[str, dict[str, object]] = {}
     for key, value in config.settings.items():
         node, _, name = key.partition(".")
@@ -94,11 +82,7 @@ def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]
 
 
 def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> None:
-    """Check the options of a vehicle, and the connection to it.
-
-    Raises:
-        UavDcError: they contradict one another, or this machine has no such connection.
-    """
+    """Raise UavDcError for contradicting options of a vehicle, or a connection that this machine lacks."""
     simulated = config.vehicle == SIMULATED
     for name in VEHICLE_OPTIONS:
         value = getattr(config, name)
@@ -121,11 +105,7 @@ def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> No
 
 
 def check_summary(summary: Path, bag: Path | None) -> None:
-    """Check that the summary can be written.
-
-    Raises:
-        ParameterError: it cannot.
-    """
+    """Raise ParameterError if the summary cannot be written."""
     if summary.absolute() == bag:
         raise ParameterError(f"--summary {summary}: it is the folder of the bag; expected another path")
     try:
@@ -135,11 +115,7 @@ def check_summary(summary: Path, bag: Path | None) -> None:
 
 
 def new_bag(wanted: Path | None) -> Path:
-    """Folder of the new bag; by default a dated one.
-
-    Raises:
-        BagError: it exists, or cannot be created.
-    """
+    """Folder of the new bag, by default a dated one; raises BagError if it exists or cannot be created."""
     bag = wanted
     if bag is None:
         dated = bag = Path("bags") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")

@@ -43,11 +43,7 @@ class SupervisedNode:
         self.process, self.state, self._commanded = process, None, None
 
     def bring_up(self, may_activate: bool) -> None:
-        """Command the next transition towards active, once.
-
-        Raises:
-            NodeError: the node rejects it, or was shut down.
-        """
+        """Command the next transition towards active, once; raises NodeError if the node rejects it."""
         assert self.process is not None
         report = self.process.reports.get(self.row.name)
         if report is None:
@@ -126,10 +122,7 @@ class Supervisor:
             node.attach(process)
 
     def tick(self, may_bring_up: bool) -> None:
-        """Bring nodes up and restart them; to be called often.
-
-        Args:
-            may_bring_up: whether nodes may be configured and activated.
+        """Bring nodes up, if they may be, and restart them; to be called often.
 
         Raises:
             NodeError: a required node cannot be brought up, gave up, or has too many restarts.
@@ -210,10 +203,7 @@ class Supervisor:
         """Stop all nodes, higher ranks first; returns exit statuses by process name.
 
         A rank gets SIGTERM when all higher ranks are finalized, so that the recorder receives their last
-        messages. The processes then end in parallel.
-
-        Args:
-            meanwhile: called after the last SIGTERM, before the ends are waited for.
+        messages. The processes then end in parallel; `meanwhile` is called before their ends are waited for.
         """
         deadlines_s: dict[NodeProcess, float] = {}
         running = {node.row.name: node.process for node in self.nodes if node.process is not None}

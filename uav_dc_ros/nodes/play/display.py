@@ -15,11 +15,7 @@ OVERDUE_S = 1.0
 
 
 class PlaybackDisplay(LiveDisplay):
-    """Shows the playback position; draws only when `progress` is called.
-
-    Args:
-        begin_s, end_s: range to play, seconds from the bag's beginning.
-    """
+    """Shows the position in the played range, seconds of the bag; draws only when `progress` is called."""
 
     def __init__(self, begin_s: float, end_s: float) -> None:
         # A drawing thread would delay messages.

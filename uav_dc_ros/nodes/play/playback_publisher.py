@@ -16,11 +16,7 @@ NO_WAIT = Duration()
 
 
 def message_class(topic: RecordedTopic) -> type:
-    """The class of a topic's messages, from the installed ROS packages.
-
-    Raises:
-        NodeError: no such class, several types, or another serialization than CDR.
-    """
+    """The class of a topic's messages, from the installed ROS packages; raises NodeError without one."""
     if topic.serialization != CDR:
         raise NodeError(f"its messages are in {topic.serialization!r}; expected {CDR!r}")
     if topic.other_types:
@@ -38,7 +34,6 @@ class PlaybackPublisher:
     """Publishes the messages of one recorded topic.
 
     Args:
-        name: full name of the topic to publish.
         message_bytes, per_s: size and rate of its messages, see `recorded_qos.profile`.
 
     Raises:

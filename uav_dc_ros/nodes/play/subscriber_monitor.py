@@ -30,11 +30,7 @@ class SubscriberMonitor:
         return ", ".join(sorted(qos.full_name(end) for end in ends))
 
     def mission(self, also: Collection[str] = ()) -> str | None:
-        """Description of a mission that publishes a played exclusive topic; None without one.
-
-        Args:
-            also: full names of further topics that the player publishes.
-        """
+        """Description of a mission that publishes a played exclusive topic, or one of `also`; else None."""
         publishers: dict[str, dict[str, list[str]]] = defaultdict(dict)  # by namespace and relative name
         for name in sorted({*also, *(each.name for each in self._publishers)}):
             namespace, _, relative = name.rpartition("/")

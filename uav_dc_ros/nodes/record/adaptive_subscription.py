@@ -27,13 +27,7 @@ def common_qos(ends: Sequence[TopicEndpointInfo]) -> QoSProfile:
 
 
 class AdaptiveSubscription:
-    """Subscribes to a recorded topic.
-
-    Args:
-        name: full name.
-        type: ROS 2 message type.
-        callback: receives each message and its info.
-    """
+    """Subscribes to a recorded topic; passes each serialized message and its info to the callback."""
 
     def __init__(self, node: Node, name: str, type: str, callback: Callback) -> None:
         self.name = name
@@ -125,9 +119,7 @@ class AdaptiveSubscription:
     def drain(self, until_ns: int, deadline_s: float) -> int:
         """Handle messages that have arrived; returns the number of unhandled ones at the deadline.
 
-        Args:
-            until_ns: latest publication time, nanoseconds since the epoch.
-            deadline_s: on the monotonic clock.
+        `until_ns` is the latest publication time, `deadline_s` on the monotonic clock.
         """
         unhandled = 0
         for subscription in self._losses:

@@ -65,11 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Record until Ctrl-C or SIGTERM; exits the process.
-
-    Raises:
-        ParameterError: an invalid value.
-    """
+    """Record until Ctrl-C or SIGTERM; exits the process, or raises ParameterError."""
     values = {
         "bag": str(options.out),
         "resume": options.resume,

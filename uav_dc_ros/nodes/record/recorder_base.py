@@ -48,11 +48,7 @@ class RecorderBase(MissionNode):
         self._undrained: dict[str, int] = {}
 
     def about(self) -> Mapping[str, str]:
-        """Custom data of the bag.
-
-        Raises:
-            UavDcError: a parameter is invalid.
-        """
+        """Custom data of the bag."""
         raise NotImplementedError
 
     # Life cycle.
@@ -93,11 +89,7 @@ class RecorderBase(MissionNode):
             raise ParameterError(f"topics: {name!r}: {reason}; expected the name of a topic") from None
 
     def activate(self) -> None:
-        """Start recording.
-
-        Raises:
-            ParameterError: the bag of this configuration is closed.
-        """
+        """Start recording; raises ParameterError if the bag of this configuration is closed."""
         if self.writer is None:
             raise ParameterError(
                 f"bag: {self.values['bag']} is closed; clean the node up, and configure it with a new folder"

@@ -17,11 +17,7 @@ MISSING = "the live view needs foxglove-sdk: no module foxglove; pip install 'ua
 
 
 def check(*, address: str, port: int) -> None:
-    """Check whether a server could be started.
-
-    Raises:
-        NodeError, ParameterError: as FoxgloveServer.
-    """
+    """Raise the errors of FoxgloveServer, if a server cannot be started."""
     if importlib.util.find_spec("foxglove") is None:
         raise NodeError(MISSING)
     family = socket.AF_INET6 if ":" in address else socket.AF_INET

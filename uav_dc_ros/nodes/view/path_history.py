@@ -59,8 +59,7 @@ class PathHistory:
     def add_users(self, *, mission: int, step: int, stamp_ns: int, published_ns: int) -> int | None:
         """Assign a mission and a step to a time.
 
-        Returns:
-            Of a new mission: publication time of the last `users` before it; else None.
+        Returns the publication time of the last `users` before a new mission; else None.
         """
         before_ns, self._users_ns = self._users_ns, published_ns
         last, self._current = self._current, (mission, step)
