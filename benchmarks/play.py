@@ -31,7 +31,7 @@ from uav_dc_ros.nodes.ros import recorded_qos
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 STRING = "std_msgs/msg/String"
 QOS = recorded_qos.offered(QoSProfile(depth=10), 10)
-LISTENER = Path(__file__).parents[1] / "tests" / "nodes" / "listener.py"
+LISTENER = Path(__file__).parents[1] / "tests" / "nodes" / "play" / "listener.py"
 ENVIRONMENT = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 START_NS = 1_700_000_000 * 10**9
 HZ = {"/fast": 200, "/medium": 100, "/slow": 10}

@@ -43,7 +43,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # Where the longest tests are, in this order: at the end, short files are left for the workers to share.
-LONGEST_FIRST = ("test_house_rules.py", "nodes", "experiments", "offboard", "recordings", "bags")
+LONGEST_FIRST = ("test_house_rules.py", "nodes", "runner", "experiments", "offboard", "recordings", "bags")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -56,7 +56,7 @@ def numbers(topic: str, n: int, each_ms: float) -> Messages:
 def listener(ros: Ros, *topics: str, each_s: float = 0.0, **row: Any) -> "subprocess.Popen[str]":
     """A subscriber to some topics of strings, that listens by now."""
     rows = {topic: {"type": STRING, **row} for topic in topics}
-    process = ros.stranger("listener", json.dumps({"topics": rows, "each_s": each_s}))
+    process = ros.stranger("play/listener", json.dumps({"topics": rows, "each_s": each_s}))
     assert process.stdout is not None
     assert process.stdout.readline() == "there\n"
     return process
@@ -189,7 +189,7 @@ def test_options_choose_what_is_played_and_how(ros: Ros, tmp_path: Path) -> None
     bag = made(tmp_path / "bag", dict.fromkeys(("/a", "/b", "/c"), VOLATILE), messages)
     listens = listener(ros, "/a", "/b", "/c", "/other", "/uav1/b")
     clock = {"topics": {"/clock": {"type": "rosgraph_msgs/msg/Clock", "reliable": False}}}
-    clocks = ros.stranger("listener", json.dumps(clock))
+    clocks = ros.stranger("play/listener", json.dumps(clock))
     assert clocks.stdout is not None
     assert clocks.stdout.readline() == "there\n"
     options = ["--rate", 0.5, "--start", 1, "--duration", 1, "--exclude", "/c", "--namespace", "/uav1"]

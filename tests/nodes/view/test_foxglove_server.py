@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from tests.nodes.foxglove_client import FoxgloveClient, is_free
+from tests.nodes.view.foxglove_client import FoxgloveClient, is_free
 from uav_dc_ros import cdr
 from uav_dc_ros.errors import NodeError, ParameterError
 from uav_dc_ros.nodes.view.foxglove_server import FoxgloveServer, check

@@ -29,7 +29,7 @@ def record(ros: Ros, *options: object) -> subprocess.Popen[str]:
 
 def talk(ros: Ros, *rows: dict[str, Any]) -> subprocess.Popen[str]:
     """Start a publisher outside the mission."""
-    process = ros.stranger("talker", json.dumps(rows))
+    process = ros.stranger("record/talker", json.dumps(rows))
     assert process.stdout is not None
     wait_for(process.stdout, "publishing")
     return process

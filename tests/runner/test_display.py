@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from tests.nodes.test_drawing import MISSION, SCENARIO
+from tests.nodes.view.test_drawing import MISSION, SCENARIO
 from uav_dc_ros.cli import Output
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.runner.console import MissionConsole

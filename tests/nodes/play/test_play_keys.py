@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import Ros, until
-from tests.nodes.test_play import (
+from tests.nodes.play.test_play import (
     LATCHED,
     VOLATILE,
     Messages,

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import Ros, finish, read_bag, wait_for
-from tests.nodes.test_options import refused
+from tests.runner.test_options import refused
 
 COMPOSED = ("world", "channel_monitor", "policy")
 ONLY_COMPOSED = ("--no-record", "--nodes", ",".join(COMPOSED))

@@ -23,7 +23,7 @@ class ServiceClient:
     """Calls services of nodes, in a process of its own."""
 
     def __init__(self, ros: Ros) -> None:
-        self.process = ros.stranger("service_client")
+        self.process = ros.stranger("framework/service_client")
 
     def call(self, **command: Any) -> dict[str, Any]:
         assert self.process.stdin is not None

@@ -14,7 +14,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from tests.conftest import Ros, finish, wait_for
-from tests.nodes.foxglove_client import FoxgloveClient, Received, is_free
+from tests.nodes.view.foxglove_client import FoxgloveClient, Received, is_free
 from uav_dc_ros import cli, messages
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.topics import TOPICS

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Ros, each_once, finish, read_bag, wait_for
-from tests.nodes.test_container import modules
+from tests.runner.test_container import modules
 
 # Each fixture `ros` asserts at its end that no process of the test is left.
 
