@@ -67,7 +67,7 @@ def number(minimum: float, maximum: float, expected: str) -> Callable[[str], flo
 
     def parse(text: str) -> float:
         try:
-            value = math.nan if "_" in text else float(text)
+            value = math.nan if "_" in text else float(text)  # Python's own notation
         except ValueError:
             value = math.nan
         if not minimum <= value <= maximum:

@@ -56,6 +56,7 @@ def refused(ros: Ros, *arguments: object) -> str:
         ),
         (("--bag", "x", "--summary", "x"), "--summary x: it is the folder of the bag; expected another path"),
         (("--pace", "nan"), "argument --pace: 'nan'; expected 'lockstep' or a number above 0"),
+        (("--pace", "1_0"), "argument --pace: '1_0'; expected 'lockstep' or a number above 0"),
         (("--pace", "fast"), "argument --pace: 'fast'; expected 'lockstep' or a number above 0"),
         (("--no-record", "--bag", "b"), "not allowed with argument"),
         (

@@ -19,7 +19,7 @@ def parse(text: str) -> float | None:
     if text == LOCKSTEP:
         return None
     try:
-        pace = float(text)
+        pace = 0.0 if "_" in text else float(text)  # Python's own notation
     except ValueError:
         pace = 0.0
     if not 0.0 < pace <= PACE_MAX:
