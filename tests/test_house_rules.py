@@ -75,8 +75,7 @@ REFUSED = re.compile(
     r"|whoever|deaf|wish(?:es)?|wished|utters?|uttered)(?![a-z])",
     re.IGNORECASE,
 )
-# A method of Python's files, and a key of the bridge's journal, which another version may have written.
-ALLOWED = {"bags/part_writer.py": ["tell"], "offboard/mission/progress.py": ["asked"]}
+ALLOWED = {"bags/part_writer.py": ["tell"]}  # a method of Python's files
 
 
 def refused(source):

@@ -15,17 +15,8 @@ from uav_dc_ros.offboard.vehicle import Mode
 
 Cell = tuple[int, int, int]
 
-# Names in the journal, which a bridge of another version may have written.
-JOURNAL_KEYS = {
-    "airborne": "flies",
-    "pilot_has_control": "is_a_pilots",
-    "landing_mode": "down",
-    "landing_requested": "asked",
-    "landing_confirmed": "obeyed",
-}
 
-
-class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, rename=JOURNAL_KEYS):
+class Checkpoint(msgspec.Struct, frozen=True, kw_only=True):
     """State of a mission, for a bridge that was killed and resumes it."""
 
     step: int
