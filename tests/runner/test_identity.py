@@ -131,6 +131,7 @@ sys.exit(bag.main())
 """
 
 
+@pytest.mark.long
 def test_a_player_that_comes_later_changes_nothing(ros: Ros, options: list[object], bag: Path) -> None:
     """The bag has another seed, so that every payload and, but for the first, every pose is another."""
     given = (*options, "--seed", 7, "--pace", "lockstep")
