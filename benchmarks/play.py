@@ -44,7 +44,7 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.nodes.ros import fastdds
-from uav_dc_ros.nodes.play import PRIORITY
+from uav_dc_ros.nodes.play.bag_play import PRIORITY
 fastdds.use_profiles()
 if sys.argv[2] == "sleeps":
     with contextlib.suppress(PermissionError):

@@ -18,7 +18,7 @@ from tests.doc_commands import blocks, commands, parameter, parsed
 from uav_dc_ros import bag, files, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
-from uav_dc_ros.nodes.framework import node_cli
+from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.phases import TRANSITIONS
 from uav_dc_ros.topics import TOPICS
@@ -153,7 +153,7 @@ def test_words_of_help_are_the_field_s(
 
 @pytest.mark.parametrize("node", [row.name for row in NODES.values() if row.process])
 def test_words_of_a_node_s_help_are_the_field_s(node: str) -> None:
-    assert REFUSED.findall(node_cli.parser(node, "").format_help()) == []
+    assert REFUSED.findall(node_main.parser(node, "").format_help()) == []
 
 
 def test_generated_files_are_current() -> None:

@@ -167,7 +167,7 @@ def test_a_whole_mission_that_arms(kind: str, monkeypatch: pytest.MonkeyPatch) -
     node = Node(kind, clock)
     monkeypatch.setattr(mavros, "time", clock)
     monkeypatch.setattr(mavros, "SetpointStream", Direct)
-    monkeypatch.setattr(mavros.mavros_commands, "load_messages", lambda needed_for: PACKAGE)
+    monkeypatch.setattr(mavros, "load_messages", lambda needed_for: PACKAGE)
     vehicle = MavrosVehicle(node, start=START, arms=True)  # type: ignore[arg-type]
     vehicle.open()
     log: list[tuple[Phase, str]] = []

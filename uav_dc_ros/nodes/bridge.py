@@ -136,11 +136,7 @@ class AutopilotBridge(MissionNode):
         return datums.parse(values["datum"], self.scenario, values["vehicle"], arm=values["arm"])
 
     def _restore(self) -> SavedMission | None:
-        """The mission in the journal.
-
-        Raises:
-            NodeError: the journal belongs to another mission.
-        """
+        """The mission in the journal; raises NodeError if the journal belongs to another mission."""
         lines = self.journal.lines()
         if not lines:
             return None

@@ -34,12 +34,8 @@ class ChannelMonitorNode(MissionNode):
         self._last: messages.Rates | None = None
         self._reset()
         self._restore()
-        core.measure(  # the first call is the slowest
-            self.scenario,
-            np.asarray(self.scenario.mission.start_m),
-            np.asarray(self.scenario.user_centres_m),
-            self._collected,
-        )
+        start_m, users_m = map(np.asarray, (self.scenario.mission.start_m, self.scenario.user_centres_m))
+        core.measure(self.scenario, start_m, users_m, self._collected)  # the first call is the slowest
 
     def activate(self) -> None:
         """Begin with no pose and no users; the collected data stay."""
@@ -88,14 +84,16 @@ class ChannelMonitorNode(MissionNode):
         """
         for waiting in tuple(self._users):
             users, users_m, published_ns = waiting
-            begun_ns = users.stamp_ns
-            poses = [
-                entry for entry in self._poses if 0 <= entry[0].stamp_ns - begun_ns < self.scenario.step_ns
-            ]
+            begun_ns, step_ns = users.stamp_ns, self.scenario.step_ns
+            poses = [entry for entry in self._poses if 0 <= entry[0].stamp_ns - begun_ns < step_ns]
             if not poses:
                 continue
             while (skipped := self._users.popleft()) is not waiting:
-                self.reject("users", self._no_pose(skipped[0]))
+                why = (
+                    f"step {skipped[0].step} of mission {skipped[0].mission}: no pose of the step's "
+                    f"{self.scenario.mission.step_s:g} s came before a later step had both"
+                )
+                self.reject("users", MessageError("no_pose", why))
             for entry in [entry for entry in self._poses if entry[0].stamp_ns < begun_ns]:
                 self._poses.remove(entry)  # older than any users to come
             # A pose names no run. Of several with one stamp, our vehicle's was published with the users.
@@ -105,13 +103,6 @@ class ChannelMonitorNode(MissionNode):
             except MessageError as error:
                 self.reject("users", error)
 
-    def _no_pose(self, users: messages.Users) -> MessageError:
-        return MessageError(
-            "no_pose",
-            f"step {users.step} of mission {users.mission}: no pose of the step's "
-            f"{self.scenario.mission.step_s:g} s came before a later step had both",
-        )
-
     def _measure(self, users: messages.Users, users_m: Array, uav_m: Array, published_ns: int) -> None:
         last = self._last if self._last is not None and self._last.run == users.run else None
         step, last_step = (users.mission, users.step), (last.mission, last.step) if last else (-1, 0)
@@ -120,8 +111,7 @@ class ChannelMonitorNode(MissionNode):
             return
         if step < last_step and published_ns <= self._measured_ns:
             raise MessageError(
-                "stale_step",
-                f"mission, step {step} after {last_step}: the middleware sent it again",
+                "stale_step", f"mission, step {step} after {last_step}: the middleware sent it again"
             )
         measured_ns, self._measured_ns = self._measured_ns, published_ns
         if step < last_step or users.mission != last_step[0]:

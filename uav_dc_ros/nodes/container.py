@@ -12,7 +12,7 @@ import sys
 from typing import NoReturn
 
 from uav_dc_ros import cli
-from uav_dc_ros.nodes.framework import node_cli, node_main
+from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
 
@@ -37,7 +37,7 @@ def _node_class(name: str) -> type[MissionNode]:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the nodes until a stop request."""
-    own, for_ros = node_cli.split(sys.argv[1:] if arguments is None else arguments)
+    own, for_ros = node_main.split(sys.argv[1:] if arguments is None else arguments)
     names = dict.fromkeys(parser().parse_args(own).nodes)
     in_order = sorted(names, key=lambda name: NODES[name].rank)
     node_main.main(*map(_node_class, in_order), arguments=for_ros)

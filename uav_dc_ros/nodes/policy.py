@@ -26,8 +26,8 @@ class PolicyNode(MissionNode):
         scenario = self.values["scenario"]
         self.scenario = scenarios.load(scenario) if scenario else self.policy.scenario
         self.policy.check(self.scenario)
-        zeros = np.zeros(self.scenario.n_users)
-        self._decide(self.scenario.start_cell, 0, zeros, zeros > 0)  # the first call is the slowest
+        cell, zeros = np.asarray(self.scenario.start_cell), np.zeros(self.scenario.n_users)
+        self._decide(cell, np.asarray(0), zeros, zeros > 0)  # the first call is the slowest
 
     def activate(self) -> None:
         """Begin without a pending step."""
@@ -45,25 +45,18 @@ class PolicyNode(MissionNode):
         self._add(payload)
 
     def _add(self, payload: messages.Mission | messages.Rates) -> None:
-        pair = self._steps.add(payload)
-        if pair is None:
+        if (pair := self._steps.add(payload)) is None:
             return
         mission, rates = pair
         data_bits, collected = payloads.collection(rates, self.scenario)
         steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
-        action = self._decide(mission.cell, steps_flown, data_bits, collected)
+        action = self._decide(np.asarray(mission.cell), np.asarray(steps_flown), data_bits, collected)
         move = messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label)
         self.publish_payload("move", move)
 
-    def _decide(
-        self, cell: tuple[int, int, int], steps_flown: int, data_bits: Array, collected: Array
-    ) -> Action:
+    def _decide(self, cell: Array, step: Array, data_bits: Array, collected: Array) -> Action:
         observation = self.policy.observe(
-            self.scenario,
-            cell=np.asarray(cell),
-            step=np.asarray(steps_flown),
-            data_bits=data_bits,
-            collected=collected,
+            self.scenario, cell=cell, step=step, data_bits=data_bits, collected=collected
         )
         return Action(int(self.policy.act(observation)))
 

@@ -54,13 +54,9 @@ class RecorderNode(RecorderBase):
 
     def other_missions(self, found: Mapping[str, list[str]]) -> set[str]:
         """Namespaces inside ours in which another mission is flown: that has a bag of its own."""
+        parts = (name.rpartition("/") for name, types in found.items() if JSON in types)
         own = self.get_namespace().rstrip("/")
-        payload_topics = (
-            name.rsplit("/", 1)
-            for name, types in found.items()
-            if name.rsplit("/", 1)[-1] in PAYLOADS and JSON in types
-        )
-        return {namespace for namespace, _ in payload_topics if namespace != own}
+        return {namespace for namespace, _, name in parts if name in PAYLOADS} - {own}
 
 
 if __name__ == "__main__":

@@ -60,14 +60,11 @@ class ExternalUsers:
 
     The bridge publishes in `mission` which step it has reached. The users of that step have the time of the
     next pose, so that the monitor measures them from the vehicle's position at that time.
-
-    Attributes:
-        status: the last payload of `mission`; None before the first.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._scenario, self._seed = scenario, seed
-        self.status: messages.Mission | None = None
+        self.status: messages.Mission | None = None  # the last payload of `mission`
         self._users: WalkingUsers | None = None
         self._mission = -1  # of these users
         self._is_due = False

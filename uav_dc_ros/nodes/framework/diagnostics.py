@@ -20,10 +20,9 @@ as bytes (recorder, visualizer, live view).
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 PERIOD_S = 1.0
 LATENCIES = ("transport", "handling")
@@ -31,14 +30,10 @@ LATENCIES_KEPT = 4096  # the newest of one topic and period
 
 
 class MessageStatistics:
-    """Counts the messages of a node, and measures their latencies.
-
-    Attributes:
-        rejected: rejected messages since the start, by topic and reason.
-    """
+    """Counts the messages of a node, and measures their latencies."""
 
     def __init__(self) -> None:
-        self.rejected: Counter[tuple[str, str]] = Counter()
+        self.rejected: Counter[tuple[str, str]] = Counter()  # since the start, by topic and reason
         self._received: Counter[str] = Counter()
         self._published: Counter[str] = Counter()
         self._latencies_ns: dict[str, deque[tuple[int, int]]] = {}  # in the order of LATENCIES
@@ -84,14 +79,3 @@ class MessageStatistics:
             for topic in counts:
                 counts[topic] = 0
         return has_rejected, values
-
-
-def status(name: str, warnings: Sequence[str], message: str, values: Mapping[str, str]) -> DiagnosticStatus:
-    """A node's status: WARN with its warnings, if there are any, else OK with a message."""
-    return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK,
-        name=name,
-        message="; ".join(warnings) or message,
-        hardware_id="uav_dc_ros",
-        values=[KeyValue(key=key, value=value) for key, value in values.items()],
-    )

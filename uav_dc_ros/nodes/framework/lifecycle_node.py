@@ -7,12 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.context import Context
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -28,11 +23,6 @@ class ManagedNode(LifecycleNode):
 
     `overrides` replace parameter values of the command line. Raises ParameterError for an invalid value, and
     for a parameter that the node does not have.
-
-    Attributes:
-        row: its row of the node table.
-        values: values of its parameters, checked when it is configured.
-        failure: error of the last transition, if it failed.
     """
 
     def __init__(
@@ -43,8 +33,8 @@ class ManagedNode(LifecycleNode):
         except InvalidParameterTypeException as error:  # of a parameter that rclpy declares itself
             raise ParameterError(str(error)) from None
         self.row = NODES[name]
-        self.values: dict[str, Any] = {}
-        self.failure: UavDcError | None = None
+        self.values: dict[str, Any] = {}  # of its parameters, checked when it is configured
+        self.failure: UavDcError | None = None  # of the last transition, if it failed
         self._is_active = False
         self._until_cleanup, self._until_inactive = ExitStack(), ExitStack()  # destroy what they hold
         self._change_state = rclpy_private.replace_change_state(self, self._reject_impossible)
@@ -84,16 +74,14 @@ class ManagedNode(LifecycleNode):
         """Reject invalid values, and every value while the node is configured."""
         rows = {row.name: row for row in self.row.parameters}
         for parameter in given:
-            row = rows.get(parameter.name)
-            if row is None:
+            if (row := rows.get(parameter.name)) is None:
                 continue
-            if self.state != "unconfigured":
-                return SetParametersResult(
-                    successful=False,
-                    reason=f"{row.name}: the node is {self.state}; expected it to be unconfigured, "
-                    "since it reads its parameters only when it is configured",
-                )
             try:
+                if self.state != "unconfigured":
+                    raise ParameterError(
+                        f"{row.name}: the node is {self.state}; expected it to be unconfigured, since it "
+                        "reads its parameters only when it is configured"
+                    )
                 row.value(parameter.value)
             except ParameterError as error:
                 return SetParametersResult(successful=False, reason=str(error))
@@ -163,9 +151,7 @@ class ManagedNode(LifecycleNode):
         """Transition to finalized, from any state."""
         return self._attempt(self._shut_down)
 
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Return to unconfigured after an unexpected error in a transition."""
-        return self._attempt(self._shut_down)
+    on_error = on_shutdown  # to unconfigured, after an unexpected error in a transition
 
     def _shut_down(self) -> None:
         if self._is_active:

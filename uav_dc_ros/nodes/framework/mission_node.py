@@ -6,12 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -40,41 +39,29 @@ class MissionNode(ManagedNode):
 
     Messages of another run are counted and dropped. Without the parameter `run` the vehicle draws a run, and
     another node adopts that of the only publisher that it receives from.
-
-    Attributes:
-        drains: whether the node handles the messages that have arrived before it stops.
-        pause_s: pause of its executor, see `DirectExecutor`.
-        run: identity of the run; empty while it is not known.
-        statistics: message counts for its diagnostics.
-        is_supervised: whether run_all started it.
-        restarts: how often it has been restarted.
-        peers: the other nodes of the mission.
-        rows: the node table of this mission.
-        message_bytes: approximate size of large messages that it publishes, by topic; set by `configure`.
-        published_ns: publication time of the message being handled, nanoseconds since the epoch.
-        spin_once: handles callbacks for so many seconds, inside a callback; set by `node_main`.
     """
 
-    drains = False
-    pause_s = 0.0
+    drains = False  # whether it handles the messages that have arrived before it stops
+    pause_s = 0.0  # of its executor, see `DirectExecutor`
 
     def __init__(
         self, name: str, overrides: Sequence[rclpy.Parameter] = (), context: Context | None = None
     ) -> None:
         super().__init__(name, overrides, context)
         self.statistics = MessageStatistics()
-        self.is_supervised = SUPERVISED in os.environ
-        self.restarts = int(os.environ.get(SUPERVISED) or 0)
+        self.is_supervised = SUPERVISED in os.environ  # by run_all
+        self.restarts = int(os.environ.get(SUPERVISED) or 0)  # of its process
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.message_bytes: dict[str, int] = {}
-        self.published_ns = 0
+        self.message_bytes: dict[str, int] = {}  # about, of large messages, by topic; `configure` sets it
+        self.published_ns = 0  # publication time of the message being handled, nanoseconds since the epoch
+        # Handles callbacks for so many seconds, inside a callback; `node_main` sets it.
         self.spin_once: Callable[[float], None] = time.sleep
         self.publishers_of: dict[str, Publisher] = {}
         self.subscriptions_of: dict[str, Any] = {}
-        self.run: str = self.values["run"]
+        self.run: str = self.values["run"]  # empty while it is not known
         self._given_run = f'{{"run":"{self.run}"'.encode() if self.run else b""  # as our own payloads begin
         self.peers = [peer for peer in self.values["peers"] if peer != name]
-        self.rows = mission_rows([name, *self.peers])
+        self.rows = mission_rows([name, *self.peers])  # the node table of this mission
         self._peers_found, self._ready_peers = False, set[str]()
         self._incompatible: set[tuple[str, str, str]] = set()  # at the last check: topic, peer, reason
         self._logged_incompatible: set[tuple[str, str]] = set()
@@ -89,13 +76,10 @@ class MissionNode(ManagedNode):
         self._until_cleanup.callback(self.publishers_of.clear)
         for name in self.row.publishes:
             topic = TOPICS[name]
+            kind, profile = qos.MESSAGE_TYPES[topic.type], qos.offered(topic, self.message_bytes.get(name, 0))
             with qos.overridden(name):
-                publisher = self.create_publisher(
-                    qos.MESSAGE_TYPES[topic.type],
-                    name,
-                    qos.offered(topic, self.message_bytes.get(name, 0)),
-                    event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
-                    qos_overriding_options=qos.OVERRIDES,
+                publisher = qos.create_publisher(
+                    self, kind, name, profile, qos_overriding_options=qos.OVERRIDES
                 )
             self.publishers_of[name] = publisher
             self._until_cleanup.callback(self.destroy_publisher, publisher)
@@ -174,10 +158,9 @@ class MissionNode(ManagedNode):
         if data.startswith(self._given_run, CDR_HEADER):
             return False
         other = messages.read_run(data[CDR_HEADER:].rstrip(b"\0"))
-        if other is None:  # malformed: its decoder rejects it
-            return False
         try:
-            self.check_run(topic, other)
+            if other is not None:  # otherwise it is malformed: its decoder rejects it
+                self.check_run(topic, other)
         except MessageError as error:
             self.reject(topic, error)
             return True
@@ -185,16 +168,10 @@ class MissionNode(ManagedNode):
 
     def create_raw_subscription(self, topic: Topic, callback: Callable[[bytes, Any], None]) -> Any:
         """Subscribe with the table's QoS, as overridden; the callback takes serialised messages and info."""
-        handler: Any = callback  # rclpy inspects its signature; rclpy's types do not allow it
+        kind, profile = qos.MESSAGE_TYPES[topic.type], qos.requested(topic, keep_all=self.row.keeps_all)
         with qos.overridden(topic.name):
-            return self.create_subscription(
-                qos.MESSAGE_TYPES[topic.type],
-                topic.name,
-                handler,
-                qos.requested(topic, keep_all=self.row.keeps_all),
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-                qos_overriding_options=qos.OVERRIDES,
-                raw=True,
+            return qos.create_subscription(
+                self, kind, topic.name, callback, profile, qos_overriding_options=qos.OVERRIDES
             )
 
     def subscribe_serialised(self, topic: Topic, handle: Callable[[bytes, Any], None]) -> Any:
@@ -261,17 +238,14 @@ class MissionNode(ManagedNode):
         The graph may still list nodes that were killed: a second node of a name counts only for this one.
         """
         others = [name for name in self.rows if name != self.row.name]
-        found = other_publishers.find(
-            other_publishers.publishers(self), self.get_namespace(), self.rows, restarted=others
-        )
-        if found:
+        publishers = other_publishers.publishers(self)
+        if found := other_publishers.find(publishers, self.get_namespace(), self.rows, restarted=others):
             raise other_publishers.AnotherMissionError(found.description())
 
     def on_ready(self, payload: messages.Ready) -> None:
         """Note that a peer is ready; raises MessageError for a node that is not in the table."""
         if payload.node not in self.rows:
-            known = ", ".join(self.rows)
-            raise MessageError("unknown_node", f"{payload.node!r}; expected some of {known}")
+            raise MessageError("unknown_node", f"{payload.node!r}; expected some of {', '.join(self.rows)}")
         self._ready_peers.add(payload.node)
 
     @property
@@ -304,11 +278,13 @@ class MissionNode(ManagedNode):
         warnings = [*warnings, *(f"{peer} does not match on {at}" for at, peer in self._logged_incompatible)]
         if has_rejected:
             warnings.append("messages were rejected")
-        status = diagnostics.status(
-            self.get_fully_qualified_name()[1:],
-            warnings,
-            self.state,
-            {"state": self.state, "restarts": str(self.restarts)} | own | values,
+        values = {"state": self.state, "restarts": str(self.restarts)} | own | values
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK,
+            name=self.get_fully_qualified_name()[1:],
+            message="; ".join(warnings) or self.state,
+            hardware_id="uav_dc_ros",
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

@@ -1,15 +1,18 @@
-"""Runs one or several nodes as a process, from start to exit."""
+"""Runs one or several nodes as a process, from its command line to its exit."""
 
+import argparse
 import contextlib
 import gc
 import os
 import select
 import signal
 import socket
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 import rclpy
@@ -17,12 +20,15 @@ from rclpy.signals import SignalHandlerOptions
 
 from uav_dc_ros import cli
 from uav_dc_ros.errors import ParameterError, UavDcError
-from uav_dc_ros.nodes.framework import node_cli, process_control
+from uav_dc_ros.nodes.framework import process_control
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
-from uav_dc_ros.nodes.framework.process_control import SUPERVISED
+from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.framework.parameters import COMMON, Parameter
+from uav_dc_ros.nodes.framework.process_control import SUPERVISED, Reporter
 from uav_dc_ros.nodes.ros import environment, fastdds, rclpy_private
 from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 
+ROS_ARGUMENTS = "--ros-args"
 DRAIN_S = 2.0
 DRAIN_QUIET_S = 0.2  # a lost message is sent again within a tenth of a second
 EXIT_TIMEOUT_S = 3.0  # for the middleware to close
@@ -37,15 +43,11 @@ class StopMonitor:
 
     A waiting executor sleeps in C, where Python's signal handlers do not run: signals arrive through a file
     descriptor in a thread that wakes it.
-
-    Attributes:
-        requested: whether a stop was requested.
-        commands: lines of run_all that are not yet executed, the oldest first.
     """
 
     def __init__(self, wake: Callable[[], None]) -> None:
-        self.requested = False
-        self.commands: deque[str] = deque()
+        self.requested = False  # whether a stop was requested
+        self.commands: deque[str] = deque()  # lines of run_all that are not yet executed, the oldest first
         self._wake = wake
         self._receiver, self._sender = socket.socketpair()
         self._sender.setblocking(False)
@@ -77,6 +79,40 @@ class StopMonitor:
                     sources.remove(source)
 
 
+def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Arguments before those for ROS, and those for ROS."""
+    at = arguments.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in arguments else len(arguments)
+    return list(arguments[:at]), list(arguments[at:])
+
+
+def parser(name: str, description: str) -> cli.Parser:
+    """The command line of a node of the table, or of another program that runs one."""
+    own = NODES[name].parameters if name in NODES else ()
+    return cli.Parser(
+        prog=f"python -m uav_dc_ros.nodes.{name}",
+        usage="%(prog)s [-h] [--ros-args -p PARAMETER:=VALUE ... -r __ns:=/NAMESPACE ...]",
+        description=description,
+        epilog="\n".join(["parameters:", *map(_line, (*own, *COMMON))]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _line(row: Parameter) -> str:
+    value = str(row.default).lower() if isinstance(row.default, bool) else row.default  # as ROS reads it
+    default = "" if value == "" else f" (default: {value})"
+    return f"  {row.name:<20}  {row.help}{default}"
+
+
+def ros_arguments(description: str) -> list[str]:
+    """The ROS arguments of a node's command line; exits with 2 if there are others: ROS ignores those."""
+    others, for_ros = split(sys.argv[1:])
+    command = parser(Path(sys.argv[0]).stem, description)
+    _, unknown = command.parse_known_args(others)
+    if unknown:
+        command.error(f"{' '.join(unknown)!r}; expected {ROS_ARGUMENTS} first, and -p PARAMETER:=VALUE")
+    return for_ros
+
+
 def use_batch_scheduling() -> None:
     """Schedule this process as a batch job: a message that wakes its threads preempts no other thread.
 
@@ -97,7 +133,7 @@ def main(
     """
     cli.open_streams()
     if arguments is None:
-        arguments = node_cli.ros_arguments(makes[0].__doc__ or "")
+        arguments = ros_arguments(makes[0].__doc__ or "")
     if batch_scheduling:
         use_batch_scheduling()
     status = _run(makes, arguments)
@@ -125,7 +161,7 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> in
             executor.add_node(node)
             node.spin_once = executor.spin_once
         stop = StopMonitor(executor.wake)
-        reporter = process_control.Reporter(nodes)
+        reporter = Reporter(nodes)
         reporter.report()
         for node in nodes:
             node.prepare()
@@ -147,10 +183,7 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> in
 
 
 def _spin(
-    nodes: Sequence[MissionNode],
-    executor: DirectExecutor,
-    stop: StopMonitor,
-    reporter: process_control.Reporter,
+    nodes: Sequence[MissionNode], executor: DirectExecutor, stop: StopMonitor, reporter: Reporter
 ) -> int:
     """Spin until a stop request; then, or when a callback failed, shut the nodes down."""
     try:

@@ -9,39 +9,25 @@ from uav_dc_ros.topics import TOPICS
 
 @dataclass(frozen=True, kw_only=True)
 class NodeRow:
-    """A node: its topics and parameters, and how run_all supervises it.
+    """A node: its topics and parameters, and how run_all supervises it."""
 
-    Attributes:
-        name: name in the ROS graph.
-        publishes, subscribes: names of topics.
-        parameters: own parameters, beside `parameters.COMMON`.
-        keeps_all: subscriptions keep every message until it is handled, not only the newest hundred.
-        process: the node is a process of its own, `python -m uav_dc_ros.nodes.NAME`.
-        composable: the node may share a process with the others that wait for it in every step.
-        rank: nodes of a lower rank start first and stop last: the recorder receives the first and the last
-            message, and the world starts the mission.
-        max_restarts: restarts within `supervisor.RESTART_WINDOW_S`. One more failure ends the mission or, if
-            the node is not needed, its restarts.
-        hang_timeout_s: time without a report of an active node after which its process is killed and
-            restarted: longer than any callback takes on a busy computer.
-        needed: the mission cannot fly without this node (the bridge: only with a real vehicle).
-        on_request: the node starts only if the user requests it.
-        restart_parameters: parameters that a restart adds.
-    """
-
-    name: str
-    publishes: tuple[str, ...]
+    name: str  # in the ROS graph
+    publishes: tuple[str, ...]  # names of topics
     subscribes: tuple[str, ...]
-    parameters: tuple[p.Parameter, ...] = ()
-    keeps_all: bool = False
-    process: bool = True
-    composable: bool = False
+    parameters: tuple[p.Parameter, ...] = ()  # its own, beside `parameters.COMMON`
+    keeps_all: bool = False  # subscriptions keep every message until it is handled, not only the newest 100
+    process: bool = True  # it is a process of its own, `python -m uav_dc_ros.nodes.NAME`
+    composable: bool = False  # it may share a process with the others that wait for it in every step
+    # Nodes of a lower rank start first and stop last: the recorder receives the first and the last message,
+    # and the world starts the mission.
     rank: int = 1
+    # Within `supervisor.RESTART_WINDOW_S`. One more failure ends the mission or, if not needed, its restarts.
     max_restarts: int = 3
+    # An active node without a report for this time is killed and restarted: no callback takes as long.
     hang_timeout_s: float = 5.0
-    needed: bool = True
-    on_request: bool = False
-    restart_parameters: Mapping[str, object] = field(default_factory=dict)
+    needed: bool = True  # the mission cannot fly without it (the bridge: only with a real vehicle)
+    on_request: bool = False  # it starts only if the user requests it
+    restart_parameters: Mapping[str, object] = field(default_factory=dict)  # that a restart adds
 
 
 NODES: dict[str, NodeRow] = {

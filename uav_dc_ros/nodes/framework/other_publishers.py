@@ -14,30 +14,23 @@ from uav_dc_ros.nodes.framework.node_table import NodeRow
 from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.topics import TOPICS
 
-ADVICE = (
-    "give this one a namespace of its own (--namespace uav2), or a network (export ROS_DOMAIN_ID=1, or any "
-    "number up to 101)"
-)
-
 
 class AnotherMissionError(NodeError):
     """A mission cannot begin: other nodes publish its topics."""
 
     def __init__(self, description: str) -> None:
-        super().__init__(f"{description}: {ADVICE}")
+        super().__init__(
+            f"{description}: give this one a namespace of its own (--namespace uav2), or a network (export "
+            "ROS_DOMAIN_ID=1, or any number up to 101)"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class OtherPublishers:
-    """Publishers that do not belong to this mission; false if there are none.
+    """Publishers that do not belong to this mission: topics by full name of a node; false: there are none."""
 
-    Attributes:
-        foreign: topics by full name of a node that is not in this mission's table.
-        doubles: topics by full name of a node of the table that another mission has, too.
-    """
-
-    foreign: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    doubles: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    foreign: Mapping[str, Sequence[str]] = field(default_factory=dict)  # not in this mission's table
+    doubles: Mapping[str, Sequence[str]] = field(default_factory=dict)  # in it, and in another mission, too
 
     def __bool__(self) -> bool:
         """Whether there are any."""
@@ -54,27 +47,18 @@ class OtherPublishers:
 
 
 def find(
-    publishers: Mapping[str, Sequence[str]],
+    publishers: Mapping[str, Sequence[str]],  # full names of their nodes, by topic, see `publishers`
     namespace: str,
     rows: Mapping[str, NodeRow],
-    restarted: Collection[str] = (),
-    absent: Collection[str] = (),
+    restarted: Collection[str] = (),  # nodes of which the graph may still list the killed ones
+    absent: Collection[str] = (),  # nodes of the mission that do not publish yet
 ) -> OtherPublishers:
-    """Find the publishers that do not belong to a mission.
-
-    Args:
-        publishers: full names of the publishers' nodes, by topic, see `publishers`.
-        namespace: of the mission.
-        rows: the node table of the mission.
-        restarted: nodes that were restarted: the graph may still list the killed ones.
-        absent: nodes of the mission that do not publish yet.
-    """
+    """Find the publishers that do not belong to the mission of a namespace and a node table."""
     foreign: dict[str, list[str]] = {}
     doubles: dict[str, list[str]] = {}
     for topic, names in publishers.items():
-        own = {
-            f"{namespace.rstrip('/')}/{row.name}": row.name for row in rows.values() if topic in row.publishes
-        }
+        within = namespace.rstrip("/")
+        own = {f"{within}/{row.name}": row.name for row in rows.values() if topic in row.publishes}
         if not own:
             continue  # no node of this mission publishes it, nor relies on it
         for name, count in Counter(names).items():
@@ -87,12 +71,9 @@ def find(
 
 def publishers(node: Node) -> dict[str, list[str]]:
     """Full names of the publishers' nodes, one for each publisher, by exclusive topic, from the graph."""
-    return {
-        topic.name: [
-            name
-            for end in node.get_publishers_info_by_topic(topic.name)
-            if qos.UNKNOWN not in (name := qos.full_name(end))
-        ]
-        for topic in TOPICS.values()
-        if topic.exclusive
-    }
+    found = {}
+    for topic in TOPICS.values():
+        if topic.exclusive:
+            names = map(qos.full_name, node.get_publishers_info_by_topic(topic.name))
+            found[topic.name] = [name for name in names if qos.UNKNOWN not in name]
+    return found

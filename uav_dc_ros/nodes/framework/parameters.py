@@ -21,26 +21,18 @@ INTEGER_MAX = 2**63 - 1  # of a ROS integer
 
 @dataclass(frozen=True)
 class Parameter:
-    """A ROS parameter, of the type of its default. It can be set while its node is unconfigured.
-
-    Attributes:
-        unit: unit of the value; empty for names, counts and switches.
-        min, max: range of a number.
-        choices: allowed texts; empty: any.
-        read_only: the value is fixed when the node starts.
-        parse: returns the value that the node uses; raises ParameterError.
-    """
+    """A ROS parameter, of the type of its default. It can be set while its node is unconfigured."""
 
     name: str
     default: bool | int | float | str | list[str]
     description: str
-    unit: str = ""
-    min: float | None = None
+    unit: str = ""  # empty for names, counts and switches
+    min: float | None = None  # of a number
     max: float | None = None
     _: KW_ONLY
-    choices: tuple[str, ...] = ()
-    read_only: bool = False
-    parse: Callable[[Any], Any] | None = None
+    choices: tuple[str, ...] = ()  # allowed texts; empty: any
+    read_only: bool = False  # the value is fixed when the node starts
+    parse: Callable[[Any], Any] | None = None  # returns what the node uses; raises ParameterError
 
     @property
     def help(self) -> str:

@@ -6,7 +6,7 @@ another mission in the same namespace. A pipe connects two processes only, and n
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -30,17 +30,12 @@ class NodeReport(msgspec.Struct, frozen=True):
     refused: str | None = None
 
 
-_decoder = msgspec.json.Decoder(dict[str, NodeReport])
+decode = msgspec.json.Decoder(dict[str, NodeReport]).decode  # a line of reports, by name of the node
 
 
 def command(transition: str, node: str) -> bytes:
     """A line that commands a transition of a node."""
     return f"{transition} {node}\n".encode()
-
-
-def decode(line: bytes) -> Mapping[str, NodeReport]:
-    """Decode a line of reports, by name of the node."""
-    return _decoder.decode(line)
 
 
 def make_transition(node: "ManagedNode", transition: str) -> bool:

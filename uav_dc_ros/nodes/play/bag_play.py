@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,12 +92,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Play.
-
-    Raises:
-        UavDcError: an option or a bag that cannot be played.
-        KeyboardInterrupt: Ctrl-C, or SIGTERM.
-    """
+    """Play; raises UavDcError for an option or a bag that cannot be played, KeyboardInterrupt for SIGTERM."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A bag with moves and poses must not reach a vehicle on the network by accident.
     environment.prepare(local_only=True)
@@ -118,7 +113,6 @@ def _playback_options(reader: BagReader, options: argparse.Namespace) -> "Playba
     if options.paused and (sys.stdin is None or not sys.stdin.isatty()):
         raise ParameterError("--paused: standard input is no terminal, so no key could end the pause")
     return PlaybackOptions(
-        path=options.bag,
         names=_names(reader, options),
         start_s=options.start,
         duration_s=options.duration,
@@ -137,9 +131,11 @@ def _names(reader: BagReader, options: argparse.Namespace) -> dict[str, str]:
     from rclpy.validate_full_topic_name import validate_full_topic_name
 
     remapped = dict(options.remap)
-    _check_known(reader, "--topics", options.topics or ())
-    _check_known(reader, "--exclude", options.exclude or ())
-    _check_known(reader, "--remap", remapped)
+    given = {"--topics": options.topics or (), "--exclude": options.exclude or (), "--remap": remapped}
+    for option, topic in ((option, topic) for option, topics in given.items() for topic in topics):
+        if topic not in reader.topics:
+            known = ", ".join(sorted(reader.topics)) or "none"
+            raise ParameterError(f"{option} {topic}: no such topic in bag {reader.path}; it has {known}")
     excluded = {*(options.exclude or ()), *([CLOCK_TOPIC] if options.clock else ())}
     prefix = options.namespace.rstrip("/")
     names = {
@@ -167,13 +163,6 @@ def _names(reader: BagReader, options: argparse.Namespace) -> dict[str, str]:
     return names
 
 
-def _check_known(reader: BagReader, option: str, topics: Iterable[str]) -> None:
-    for topic in topics:
-        if topic not in reader.topics:
-            known = ", ".join(sorted(reader.topics)) or "none"
-            raise ParameterError(f"{option} {topic}: no such topic in bag {reader.path}; it has {known}")
-
-
 def _play(reader: BagReader, options: "PlaybackOptions") -> None:
     import rclpy
     from rclpy.node import Node
@@ -194,7 +183,7 @@ def _play(reader: BagReader, options: "PlaybackOptions") -> None:
             node = Node("player", start_parameter_services=False, enable_rosout=False)
             player = Player(node, options, display, reader)
             display.info(
-                f"playing {options.path}: {len(player.publishers)} topics, {end_s - options.start_s:.3f} s, "
+                f"playing {reader.path}: {len(player.publishers)} topics, {end_s - options.start_s:.3f} s, "
                 f"rate {rate_text(options.rate)}"
             )
             began_s = time.monotonic()

@@ -9,12 +9,7 @@ RATE_MIN, RATE_MAX = 1e-3, 1e6
 
 
 class PlaybackClock:
-    """Maps log times of a bag to the steady clock, from one reference point: a late message delays no other.
-
-    Args:
-        rate: seconds of the bag per second; infinite: no message waits for its time.
-        now: the steady clock, seconds.
-    """
+    """Maps log times of a bag to the steady clock, from one reference point: no late message delays others."""
 
     def __init__(
         self, rate: float, *, paused: bool = False, now: Callable[[], float] = time.monotonic
@@ -27,7 +22,7 @@ class PlaybackClock:
 
     @property
     def rate(self) -> float:
-        """Seconds of the bag per second."""
+        """Seconds of the bag per second; infinite: no message waits for its time."""
         return self._rate
 
     @rate.setter

@@ -25,10 +25,7 @@ class Keyboard:
     """Reads keys if standard input is a terminal and the command is in its foreground.
 
     A context manager: inside, the terminal delivers keys at once and does not echo them. Ctrl-C and Ctrl-Z
-    keep their meaning.
-
-    Args:
-        on_resumed: called after Ctrl-Z and `fg`, with the seconds between them.
+    keep their meaning. After Ctrl-Z and `fg`, `on_resumed` is called with the seconds between them.
     """
 
     def __init__(self, on_resumed: Callable[[float], None]) -> None:

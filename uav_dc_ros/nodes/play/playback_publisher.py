@@ -1,7 +1,6 @@
 """Publishes one recorded topic again, and tracks acknowledgements and repeated messages."""
 
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -10,7 +9,7 @@ from uav_dc_ros.bags.message_definitions import ENCODING
 from uav_dc_ros.bags.read import BagMessage, RecordedTopic
 from uav_dc_ros.bags.records import CDR
 from uav_dc_ros.errors import NodeError
-from uav_dc_ros.nodes.ros import message_types, recorded_qos
+from uav_dc_ros.nodes.ros import message_types, qos, recorded_qos
 
 NO_WAIT = Duration()
 
@@ -33,12 +32,8 @@ def message_class(topic: RecordedTopic) -> type:
 class PlaybackPublisher:
     """Publishes the messages of one recorded topic.
 
-    Args:
-        message_bytes, per_s: size and rate of its messages, see `recorded_qos.profile`.
-
-    Raises:
-        BagError: invalid recorded QoS.
-        NodeError: its messages cannot be published here.
+    `message_bytes` and `per_s` are their size and rate, see `recorded_qos.profile`. Raises BagError for an
+    invalid recorded QoS, and NodeError if the messages cannot be published here.
     """
 
     def __init__(
@@ -49,9 +44,7 @@ class PlaybackPublisher:
         self.latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self.depth = profile.depth  # number of messages in its history
         self.name = name
-        self.publisher = node.create_publisher(
-            kind, name, profile, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False)
-        )
+        self.publisher = qos.create_publisher(node, kind, name, profile)
         self._reliable = profile.reliability == ReliabilityPolicy.RELIABLE
         self._unacknowledged = 0  # messages
         self._published: dict[tuple[int, int], None] = {}  # the last messages of a latched topic

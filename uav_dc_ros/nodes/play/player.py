@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import chain
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
@@ -42,7 +41,6 @@ RATE_FACTOR = 1.25  # per key; three times is about twice as fast
 class PlaybackOptions:
     """What to play, and how. Times are seconds of the bag."""
 
-    path: Path
     names: dict[str, str]  # full name of the topic to publish, by recorded topic
     start_s: float  # from the first message
     duration_s: float | None  # None: to the end
@@ -75,11 +73,10 @@ class Player:
             except NodeError as error:
                 display.note(f"topic {recorded} is not played: {error}")
         if not any(reader.topics[recorded].count for recorded in self.publishers):
-            raise BagError(f"bag {options.path} holds no message that can be played")
+            raise BagError(f"bag {reader.path} holds no message that can be played")
         self._start_ns = reader.first_ns + round(options.start_s * 1e9)
-        self._end_ns = None
-        if options.duration_s is not None:
-            self._end_ns = self._start_ns + round(options.duration_s * 1e9)
+        duration_s = options.duration_s
+        self._end_ns = None if duration_s is None else self._start_ns + round(duration_s * 1e9)
         self.clock = PlaybackClock(options.rate, paused=options.paused)
         self._keyboard = Keyboard(self.clock.delay)
         self._steps = 0  # requested single steps
@@ -95,10 +92,8 @@ class Player:
     def play(self) -> None:
         """Play to the end, or until the quit key.
 
-        Raises:
-            BagError: the bag is damaged.
-            NodeError: a topic has no subscriber within the timeout.
-            AnotherMissionError: a running mission publishes a played topic.
+        Raises BagError for a damaged bag, NodeError if a topic has no subscriber within the timeout, and
+        AnotherMissionError if a running mission publishes a played topic.
         """
         self.clock.jump(self._start_ns)
         with self._keyboard:
@@ -111,7 +106,7 @@ class Player:
                 if not self.options.loop:
                     break
                 if self.messages == before:
-                    raise BagError(f"bag {self.options.path} holds no message there; a loop would never end")
+                    raise BagError(f"bag {self.reader.path} holds no message there; a loop would never end")
             self.finish(FINISH_S if self._quit else math.inf)
 
     def finish(self, timeout_s: float = FINISH_S) -> None:
@@ -128,9 +123,8 @@ class Player:
         self.clock.jump(self._start_ns)
         for message in self._latched_before_start():
             self._publish(message)
-        with ReadAhead(
-            self.options.path, list(self.publishers), start_ns=self._start_ns, end_ns=self._end_ns
-        ) as messages:
+        path, topics = self.reader.path, list(self.publishers)
+        with ReadAhead(path, topics, start_ns=self._start_ns, end_ns=self._end_ns) as messages:
             self.clock.jump(self._start_ns)  # the first read took wall time
             before_ns = self._start_ns
             for message in messages:
@@ -162,12 +156,10 @@ class Player:
         latched = {name: each for name, each in self.publishers.items() if each.latched}
         if self.options.start_s == 0.0 or not latched:
             return ()
-        kept: dict[str, deque[tuple[int, BagMessage]]] = {
-            name: deque(maxlen=publisher.depth) for name, publisher in latched.items()
-        }
-        with ReadAhead(
-            self.options.path, list(latched), start_ns=self.reader.first_ns, end_ns=self._start_ns
-        ) as messages:
+        kept: dict[str, deque[tuple[int, BagMessage]]]
+        kept = {name: deque(maxlen=publisher.depth) for name, publisher in latched.items()}
+        path, first_ns = self.reader.path, self.reader.first_ns
+        with ReadAhead(path, list(latched), start_ns=first_ns, end_ns=self._start_ns) as messages:
             for i, message in enumerate(messages):
                 if not latched[message.topic].is_repeated(message):
                     kept[message.topic].append((i, message))

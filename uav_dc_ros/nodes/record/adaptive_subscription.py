@@ -4,11 +4,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rclpy.event_handler import QoSSubscriptionEventType, SubscriptionEventCallbacks
+from rclpy.event_handler import QoSSubscriptionEventType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.nodes.ros.rclpy_private import EventCount
 
 Callback = Callable[[bytes, Any], None]
@@ -59,16 +60,7 @@ class AdaptiveSubscription:
         self._create(self.callback)
 
     def _create(self, callback: Callback) -> None:
-        handler: Any = callback  # rclpy detects a second parameter, which its types lack
-        subscription = self._node.create_subscription(
-            self._class,
-            self.name,
-            handler,
-            self._profile,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            raw=True,
-        )
-        self._add(subscription)
+        self._add(qos.create_subscription(self._node, self._class, self.name, callback, self._profile))
 
     def _add(self, subscription: Any) -> None:
         event = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST

@@ -66,15 +66,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Record until Ctrl-C or SIGTERM; exits the process, or raises ParameterError."""
-    values = {
-        "bag": str(options.out),
-        "resume": options.resume,
-        "topics": options.topics,
-        "split_bytes": options.split_bytes,
-        "split_s": p.SPLIT_S.value(options.split_s),
-        "compression": options.compression,
-        "min_free_bytes": options.min_free_bytes,
-    }
+    names = ("resume", "topics", "split_bytes", "compression", "min_free_bytes")
+    values = {name: getattr(options, name) for name in names}
+    values |= {"bag": str(options.out), "split_s": p.SPLIT_S.value(options.split_s)}
     environment.prepare(local_only=False)  # publishers may be on any host
     remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
     node_main.main(lambda: BagRecorder(values), arguments=remapped)

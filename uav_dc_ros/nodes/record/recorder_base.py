@@ -69,14 +69,8 @@ class RecorderBase(MissionNode):
         self.selected = {self._full_name(name) for name in given["topics"]}
         about, folder = self.about(), Path(given["bag"])
         self._check_space(folder)
-        self.writer = BagWriter(
-            folder,
-            about,
-            resume=given["resume"] and folder.exists(),
-            compression=given["compression"],
-            split_bytes=given["split_bytes"],
-            split_s=given["split_s"],
-        )
+        options = {name: given[name] for name in ("compression", "split_bytes", "split_s")}
+        self.writer = BagWriter(folder, about, resume=given["resume"] and folder.exists(), **options)
         for kept in (self._announced, self._not_recorded, self._undrained):
             kept.clear()
         self._scanned = set()
@@ -179,14 +173,11 @@ class RecorderBase(MissionNode):
         ends = [end for end in self.get_publishers_info_by_topic(name) if end.topic_type == type]
         profiles = [end.qos_profile for end in ends] or ([] if topic is None else [qos.offered(topic)])
         depth = None if topic is None else topic.depth
+        offers = sorted({recorded_qos.offered(profile, depth) for profile in profiles}, key=str)
+        type_hash = min((str(end.topic_type_hash) for end in ends), default="")
         assert self.writer is not None, "subscriptions end with the bag"
-        self.writer.add_topic(
-            name,
-            type,
-            sorted({recorded_qos.offered(profile, depth) for profile in profiles}, key=str),
-            definition=message_types.definition(type),
-            type_hash=min((str(end.topic_type_hash) for end in ends), default=""),
-        )
+        definition = message_types.definition(type)
+        self.writer.add_topic(name, type, offers, definition=definition, type_hash=type_hash)
         self.writer.keep_latched(name, len(ends))
         self._announced.add(name)
 
@@ -238,13 +229,10 @@ class RecorderBase(MissionNode):
         ends = self.get_publishers_info_by_topic(name)
         if all(qos.full_name(end) == self.get_fully_qualified_name() for end in ends):
             return
-        type = types[0]
-        message_class = message_types.find(type)
-        if len(types) > 1:
-            self._exclude(name, f"it has several types: {', '.join(types)}")
-            return
-        if message_class is None:
-            self._exclude(name, f"type {type} is not installed here")
+        type, message_class = types[0], message_types.find(types[0])
+        if len(types) > 1 or message_class is None:
+            several = f"it has several types: {', '.join(types)}"
+            self._exclude(name, several if len(types) > 1 else f"type {type} is not installed here")
             return
         topic = AdaptiveSubscription(self, name, type, self._handler(name, None))
         topic.publishers = len(ends)

@@ -36,10 +36,8 @@ class DirectExecutor:
     Callbacks are plain functions. Event callbacks of publishers and subscriptions are not handled:
     `qos.incompatible` finds peers that do not match.
 
-    Args:
-        pause_s: pause after each turn that handled all messages, seconds. A node that need not respond at
-            once handles the messages of the pause in one turn, and leaves the cores to the other nodes.
-        context: ROS context; None: the default one.
+    It pauses for `pause_s` seconds after each turn that handled all messages. A node that need not respond at
+    once handles the messages of the pause in one turn, and leaves the cores to the other nodes.
     """
 
     def __init__(self, pause_s: float = 0.0, context: Context | None = None) -> None:

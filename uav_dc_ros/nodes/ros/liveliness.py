@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 from rclpy.duration import Duration
-from rclpy.event_handler import QoSSubscriptionEventType, SubscriptionEventCallbacks
+from rclpy.event_handler import QoSSubscriptionEventType
 from rclpy.node import Node
 
 from uav_dc_ros.nodes.ros import qos
@@ -57,14 +57,8 @@ class LivelinessMonitor:
         profile.liveliness_lease_duration = Duration(seconds=MISSED_S)
         self._node = node
         self._filter = LivelinessFilter()
-        self._subscription = node.create_subscription(
-            qos.MESSAGE_TYPES[topic.type],
-            topic.name,
-            _ignore,
-            profile,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            raw=True,
-        )
+        message_class = qos.MESSAGE_TYPES[topic.type]  # another subscription handles the messages
+        self._subscription = qos.create_subscription(node, message_class, topic.name, lambda _: None, profile)
         kind = QoSSubscriptionEventType.RCL_SUBSCRIPTION_LIVELINESS_CHANGED
         self._liveliness = EventCount(self._subscription, kind)
 
@@ -81,7 +75,3 @@ class LivelinessMonitor:
         """Stop monitoring."""
         self._liveliness.close()
         self._node.destroy_subscription(self._subscription)
-
-
-def _ignore(message: bytes) -> None:
-    """Another subscription handles the messages."""

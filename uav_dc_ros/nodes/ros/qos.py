@@ -1,4 +1,4 @@
-"""Quality of service: profiles from the topic table, and peers that do not match them."""
+"""Quality of service: profiles from the topic table, endpoints, and peers that do not match them."""
 
 import copy
 from collections.abc import Iterable, Iterator
@@ -10,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.duration import Duration, Infinite
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -50,12 +51,6 @@ OVERRIDES = QoSOverridingOptions(
 )
 
 
-def type_name(message: Any) -> str:
-    """The ROS name of a message class, such as `std_msgs/msg/String`."""
-    package, kind, *_ = message.__module__.split(".")
-    return f"{package}/{kind}/{message.__name__}"
-
-
 def offered(topic: Topic, message_bytes: int = 0) -> QoSProfile:
     """The QoS that a topic's publisher offers; the larger its messages, the fewer it keeps."""
     fitting = HISTORY_BYTES // message_bytes if message_bytes else topic.depth
@@ -76,6 +71,20 @@ def requested(topic: Topic, *, keep_all: bool) -> QoSProfile:
     if keep_all:
         profile.history = HistoryPolicy.KEEP_ALL
     return profile
+
+
+def create_publisher(node: Node, kind: Any, name: str, profile: QoSProfile, **options: Any) -> Publisher:
+    """Create a publisher without event callbacks: see `DirectExecutor`."""
+    events = PublisherEventCallbacks(use_default_callbacks=False)
+    return node.create_publisher(kind, name, profile, event_callbacks=events, **options)
+
+
+def create_subscription(
+    node: Node, kind: Any, name: str, callback: Any, profile: QoSProfile, *, raw: bool = True, **options: Any
+) -> Any:
+    """Create a subscription without event callbacks. A callback with a second parameter takes the info."""
+    events = SubscriptionEventCallbacks(use_default_callbacks=False)
+    return node.create_subscription(kind, name, callback, profile, event_callbacks=events, raw=raw, **options)
 
 
 @contextmanager
@@ -124,7 +133,9 @@ def _mismatch(
     name = full_name(peer)
     if UNKNOWN in name:
         return  # discovered a moment ago: its name follows
-    kind = type_name(endpoint.msg_type)
+    message_class: Any = endpoint.msg_type
+    package, namespace, *_ = message_class.__module__.split(".")
+    kind = f"{package}/{namespace}/{message_class.__name__}"  # such as std_msgs/msg/String
     if peer.topic_type != kind:
         yield endpoint.topic_name, name, f"its type is {peer.topic_type}; expected {kind}"
         return

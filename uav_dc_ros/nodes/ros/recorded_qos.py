@@ -56,10 +56,8 @@ def profile(topic: RecordedTopic, *, message_bytes: int, per_s: float) -> QoSPro
     more and no fewer, unless the rate needs more until they are acknowledged. Any other keeps enough for slow
     subscribers. The deadline and the lease are the strictest, the lifespan the longest of the publishers.
 
-    Args:
-        topic: as recorded; BagError: its QoS is not in rosbag2's format.
-        message_bytes: approximate size of its messages: the larger, the fewer are kept.
-        per_s: messages to be published in a second; infinite: as many as possible.
+    The larger its messages (about `message_bytes`), the fewer are kept. `per_s`: messages to be published in
+    a second; infinite: as many as possible. Raises BagError if its QoS is not in rosbag2's format.
     """
     try:
         offers = parse_qos(topic.offered_qos)

@@ -17,25 +17,15 @@ from uav_dc_ros.offboard.vehicle import Vehicle
 
 
 def make(
-    node: Node,
-    values: Mapping[str, Any],
-    scenario: Scenario,
-    datum: Geodetic | None,
-    grid_origin: str,
-    system: int | None = None,
-    restarted: bool = False,
+    node: Node,  # the bridge
+    values: Mapping[str, Any],  # of its parameters
+    scenario: Scenario,  # at its start the vehicle stands when its first position comes (ENU of the grid)
+    datum: Geodetic | None,  # replaces the start. Through MAVROS, the start gives the height all the same
+    grid_origin: str,  # of an earlier bridge in the same flight, which replaces both; empty: none
+    system: int | None,  # MAVLink system of the vehicle then, unless the parameter names one
+    restarted: bool,  # whether an earlier bridge was killed, which the ROS graph may still list
 ) -> Vehicle:
-    """The vehicle that a bridge's parameters name; not opened yet. Call `check` before.
-
-    Args:
-        node: the bridge.
-        values: its parameters.
-        scenario: its start is where the vehicle stands when its first position comes (ENU of the grid).
-        datum: of the grid; it replaces the start. Through MAVROS, the start gives the height all the same.
-        grid_origin: `grid_origin` of an earlier bridge in the same flight, which replaces both; empty: none.
-        system: MAVLink system of the vehicle then, unless the parameter names one.
-        restarted: whether an earlier bridge was killed, which the ROS graph may still list.
-    """
+    """The vehicle that a bridge's parameters name; not opened yet. Call `check` before."""
     start = Enu(*scenario.mission.start_m)._replace(up_m=0.0)
     grid: dict[str, Any] = {"start": start, "datum": datum, "grid_origin": grid_origin}
     if values["vehicle"] == "mavlink":
@@ -46,11 +36,9 @@ def make(
 
 
 def check(kind: str, connect: str, system: int, arm: bool) -> None:
-    """Check parameters against each other, and that the transport is available.
+    """Check parameters against each other (ParameterError), and that the transport is available.
 
-    Raises:
-        VehicleError: the transport is not available, or cannot arm; or the address is invalid.
-        ParameterError: an address or system is given where none belongs, or no address where one is needed.
+    Raises VehicleError if it is not, or cannot arm, or the address is invalid.
     """
     if kind != "mavlink" and connect:
         raise ParameterError(f"connect: {connect!r}; expected none with a vehicle on {kind}")

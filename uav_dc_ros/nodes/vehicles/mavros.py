@@ -16,20 +16,16 @@ from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import (  # type: ignore[import-untyped, unused-ignore]
-    BatteryState,
-    NavSatFix,
-    NavSatStatus,
-)
+from sensor_msgs.msg import BatteryState, NavSatFix, NavSatStatus  # type: ignore[import-untyped, unused-ignore]
 
 from uav_dc_ros.cdr import FRAME
 from uav_dc_ros.errors import MessageError
+from uav_dc_ros.nodes.ros import qos
 from uav_dc_ros.nodes.ros.convert import position_m, stamp_ns
-from uav_dc_ros.nodes.vehicles import mavros_commands
 from uav_dc_ros.nodes.vehicles.graph_checks import PeriodicCheck, other_publishers
+from uav_dc_ros.nodes.vehicles.mavros_commands import MavrosCommands, load_messages
 from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.offboard.mavros.telemetry import FIX, MESSAGES, POSE, STALE_S, TARGET, MavrosTelemetry
 from uav_dc_ros.offboard.setpoint_stream import SetpointStream
@@ -56,10 +52,8 @@ class Target(NamedTuple):
 class MavrosVehicle:
     """One vehicle behind MAVROS, see `Vehicle`; its methods are called by the node's executor.
 
-    Arguments: see `vehicles.make`. The names of the topics are relative, and can be remapped.
-
-    Raises:
-        VehicleError: the grid origin is invalid; or the mission arms, and mavros_msgs is not installed.
+    Arguments: see `vehicles.make`. The names of the topics are relative, and can be remapped. Raises
+    VehicleError for an invalid grid origin, or if the mission arms and mavros_msgs is not installed.
     """
 
     def __init__(
@@ -73,30 +67,23 @@ class MavrosVehicle:
         restarted: bool = False,
     ) -> None:
         self._node, self._restarted = node, restarted or bool(grid_origin)
-        self._package = mavros_commands.load_messages(needed_for="arming" if arms else "")
+        self._package = load_messages(needed_for="arming" if arms else "")
         self._telemetry = MavrosTelemetry(start, datum, grid_origin, has_msgs=self._package is not None)
         self._yaw_rad: float | None = None
         self._stream: SetpointStream[Target] = SetpointStream(self._publish, "mavros")
         self._publisher: Any = None
         self._subscriptions: dict[str, Any] = {}
-        self._commands: mavros_commands.MavrosCommands | None = None
+        self._commands: MavrosCommands | None = None
         self._closed = False
 
     def open(self) -> None:
         """Create the publisher, clients and subscriptions, and start the stream."""
         node, telemetry = self._node, self._telemetry
-        self._publisher = node.create_publisher(
-            PoseStamped,
-            SETPOINT,
-            STREAMED,
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
-        )
+        self._publisher = qos.create_publisher(node, PoseStamped, SETPOINT, STREAMED)
         topic = self._publisher.topic_name
         self._other_publishers = other_publishers(node, topic, restarted=self._restarted)
         self._graph_problem = PeriodicCheck(self._check_graph)
-        self._commands = mavros_commands.MavrosCommands(
-            node, self._package, telemetry.rejections, time.monotonic
-        )
+        self._commands = MavrosCommands(node, self._package, telemetry.rejections, time.monotonic)
         self._subscribe(PoseStamped, POSE, self._on_pose, NEWEST)
         self._subscribe(DiagnosticArray, DIAGNOSTICS, self._on_diagnostics)
         self._subscribe(BatteryState, BATTERY, self._on_battery)
@@ -151,19 +138,17 @@ class MavrosVehicle:
             self._commands.send_command(command, stack, position.up_m if position is not None else 0.0)
 
     def _subscribe(
-        self, kind: Any, topic: str, handler: Callable[[Any, float], None], qos: QoSProfile = SEVERAL
+        self, kind: Any, topic: str, handler: Callable[[Any, float], None], profile: QoSProfile = SEVERAL
     ) -> None:
         """Subscribe; the handler takes a message, and the steady time at which it arrived."""
 
         def callback(message: Any, info: Any) -> None:
-            handler(message, _arrival_s(info))
+            received_ns = info["received_timestamp"]  # it may have waited for a busy executor since
+            waited_s = (time.time_ns() - received_ns) * 1e-9 if received_ns else 0.0
+            handler(message, time.monotonic() - max(0.0, waited_s))
 
-        self._subscriptions[topic] = self._node.create_subscription(
-            kind,
-            topic,
-            callback,  # type: ignore[arg-type]
-            qos,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        self._subscriptions[topic] = qos.create_subscription(
+            self._node, kind, topic, callback, profile, raw=False
         )
 
     def _on_pose(self, message: PoseStamped, now_s: float) -> None:
@@ -173,8 +158,10 @@ class MavrosVehicle:
             self._telemetry.on_invalid_pose(str(error))
             return
         q = message.pose.orientation
+        yaw_rad = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))  # from the east
+        yaw_rad = yaw_rad if math.isfinite(yaw_rad) else 0.0  # of an invalid orientation
         stamp_s, tilt = stamp_ns(message.header.stamp) * 1e-9, tilt_rad(q.w, q.x, q.y, q.z)
-        self._telemetry.on_pose(local, _yaw_rad(message), stamp_s, now_s, tilt)
+        self._telemetry.on_pose(local, yaw_rad, stamp_s, now_s, tilt)
 
     def _on_diagnostics(self, message: DiagnosticArray, now_s: float) -> None:
         for status in message.status:
@@ -205,16 +192,3 @@ class MavrosVehicle:
         point.x, point.y, point.z = target.position
         orientation.z, orientation.w = math.sin(target.yaw_rad / 2), math.cos(target.yaw_rad / 2)
         self._publisher.publish(message)
-
-
-def _arrival_s(info: Any) -> float:
-    """When a message arrived at this machine, steady time: it may have waited for a busy executor."""
-    waited_s = (time.time_ns() - info["received_timestamp"]) * 1e-9 if info["received_timestamp"] else 0.0
-    return time.monotonic() - max(0.0, waited_s)
-
-
-def _yaw_rad(message: PoseStamped) -> float:
-    """Yaw of a pose, counter-clockwise from the east; 0 of an invalid orientation."""
-    q = message.pose.orientation
-    yaw_rad = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-    return yaw_rad if math.isfinite(yaw_rad) else 0.0

@@ -15,12 +15,7 @@ from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, TakeOff
 PACKAGE = "mavros_msgs"
 SET_MODE, ARM, TAKE_OFF = "mavros/set_mode", "mavros/cmd/arming", "mavros/cmd/takeoff"
 SET_INTERVAL = "mavros/set_message_interval"
-SERVICES = {
-    SET_MODE: "SetMode",
-    ARM: "CommandBool",
-    TAKE_OFF: "CommandTOL",
-    SET_INTERVAL: "MessageInterval",
-}
+SERVICES = {SET_MODE: "SetMode", ARM: "CommandBool", TAKE_OFF: "CommandTOL", SET_INTERVAL: "MessageInterval"}
 RATES_HZ = {POSE: (32, 30.0), EXTENDED_STATE: (245, 5.0), ESTIMATOR_STATUS: (230, 5.0)}  # MAVLink number, Hz
 RETRY_S = 3.0  # for messages that are missing
 
@@ -35,8 +30,7 @@ class MavrosMsgs(NamedTuple):
 def load_messages(*, needed_for: str = "") -> MavrosMsgs | None:
     """Import mavros_msgs; None if it is not installed, and `needed_for` nothing.
 
-    Raises:
-        VehicleError: it is needed, and not installed; or it is not that of MAVROS for ROS 2.
+    Raises VehicleError if it is needed and not installed, or not that of MAVROS for ROS 2.
     """
     try:
         package = MavrosMsgs(*(importlib.import_module(f"{PACKAGE}.{kind}") for kind in ("msg", "srv")))

@@ -40,11 +40,7 @@ QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=
 
 
 def load_messages() -> Any:
-    """The module of PX4's message classes.
-
-    Raises:
-        VehicleError: it is not installed, or too old.
-    """
+    """The module of PX4's message classes; raises VehicleError if it is not installed, or too old."""
     try:
         messages = importlib.import_module("px4_msgs.msg")
     except ImportError as error:
@@ -73,10 +69,8 @@ def versioned(name: str, kind: Any) -> str:
 class Px4Vehicle:
     """One vehicle on the topics `fmu/in/...` and `fmu/out/...` of a node's namespace, see `Vehicle`.
 
-    Arguments: see `vehicles.make`. The caller spins the node.
-
-    Raises:
-        VehicleError: px4_msgs is missing, or the grid origin is invalid.
+    Arguments: see `vehicles.make`. The caller spins the node. Raises VehicleError if px4_msgs is missing, or
+    the grid origin is invalid.
     """
 
     def __init__(
@@ -142,10 +136,9 @@ class Px4Vehicle:
         match command:
             case SetMode(Mode.RETURN):
                 self._publish_command(RETURN)
-            case SetMode(Mode.LAND):  # NaN: at the current position and heading
-                self._publish_command(
-                    LAND, **dict.fromkeys(("param4", "param5", "param6", "param7"), math.nan)
-                )
+            case SetMode(Mode.LAND):
+                here = dict.fromkeys(("param4", "param5", "param6", "param7"), math.nan)  # and heading
+                self._publish_command(LAND, **here)
             case SetMode(mode):
                 main, sub = flight_stacks.PX4.mode_parameters(mode)
                 self._publish_command(SET_MODE, param1=CUSTOM_MODE, param2=main, param3=sub)

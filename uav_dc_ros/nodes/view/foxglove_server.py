@@ -36,16 +36,9 @@ def _port_error(address: str, port: int, reason: str) -> ParameterError:
 class FoxgloveServer:
     """A running server with a channel for each topic.
 
-    It is read-only: clients cannot call services, set parameters or publish.
-
-    Args:
-        name: shown by clients.
-        port: TCP port; 0: any free one.
-        topics: rows of the topics, by full name.
-
-    Raises:
-        NodeError: foxglove-sdk is not installed.
-        ParameterError: the port is in use, or the address belongs to another machine.
+    It is read-only: clients cannot call services, set parameters or publish. They show its `name`; `topics`
+    are by full name; with port 0 it takes any free one. Raises NodeError if foxglove-sdk is not installed,
+    and ParameterError if the port is in use, or the address belongs to another machine.
     """
 
     def __init__(self, *, name: str, address: str, port: int, topics: Mapping[str, Topic]) -> None:

@@ -2,7 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -16,6 +16,7 @@ from uav_dc_ros.messages import Mission, Phase
 
 Rgba = tuple[float, float, float, float]
 Xyz = tuple[float, float, float]
+ORIGIN: Xyz = (0.0, 0.0, 0.0)
 
 # Sizes in cells of the grid.
 USER_CELLS = 0.16  # diameter of a user ...
@@ -69,16 +70,17 @@ class Scene:
     sum_rate_bps: float | None  # of the last step, bit/s
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Shape:
-    """The fields in use of a visualization_msgs/Marker, in frame `map`."""
+    """The fields in use of a visualization_msgs/Marker, in frame `map`, in the order of its definition."""
 
     ns: str
-    id: int = 0
-    type: int = Marker.CUBE
-    position_m: Xyz = (0.0, 0.0, 0.0)
-    scale_m: Xyz = (1.0, 1.0, 1.0)
-    colour: Rgba = TEXT_COLOUR
+    id: int
+    type: int
+    position_m: Xyz
+    scale_m: Xyz
+    colour: Rgba
+    _: KW_ONLY
     points_m: Array = field(default_factory=lambda: np.empty((0, 3)))
     text: str = ""
     shown: bool = True
@@ -92,11 +94,6 @@ def markers(scenario: Scenario, scene: Scene) -> bytes:
     for shape in shapes:
         _write(writer, shape, scene.time_ns)
     return writer.message()
-
-
-def user_states(served: Array, collected: Array) -> Array:
-    """The UserState of each user, `[U]`; `collected` takes precedence over `served`."""
-    return np.where(collected, UserState.COLLECTED, np.where(served, UserState.SERVED, UserState.WAITING))
 
 
 def status_text(scenario: Scenario, scene: Scene) -> str:
@@ -116,28 +113,14 @@ def status_text(scenario: Scenario, scene: Scene) -> str:
 
 def _ground(scenario: Scenario) -> Sequence[Shape]:
     """The start areas of the clusters, and the dock."""
-    cell_m = scenario.grid.cell_m
-    thin_m = THIN_CELLS * cell_m
+    thin_m, side_m = THIN_CELLS * scenario.grid.cell_m, DOCK_CELLS * scenario.grid.cell_m
     width_m = 2 * scenario.users.cluster_radius_m
+    area_m, dock_m = (width_m, width_m, thin_m), (*scenario.mission.dock_m, 0.0)
     clusters = [
-        Shape(
-            ns="clusters",
-            id=i,
-            type=Marker.CYLINDER,
-            position_m=(x_m, y_m, -2 * thin_m),
-            scale_m=(width_m, width_m, thin_m),
-            colour=CLUSTER_COLOUR,
-        )
+        Shape("clusters", i, Marker.CYLINDER, (x_m, y_m, -2 * thin_m), area_m, CLUSTER_COLOUR)
         for i, (x_m, y_m) in enumerate(scenario.users.cluster_centres_m)
     ]
-    side_m = DOCK_CELLS * cell_m
-    dock = Shape(
-        ns="dock",
-        position_m=(*scenario.mission.dock_m, 0.0),
-        scale_m=(side_m, side_m, thin_m),
-        colour=DOCK_COLOUR,
-    )
-    return [*clusters, dock]
+    return [*clusters, Shape("dock", 0, Marker.CUBE, dock_m, (side_m, side_m, thin_m), DOCK_COLOUR)]
 
 
 def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
@@ -145,67 +128,35 @@ def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
     users, cell_m = scenario.users, scenario.grid.cell_m
     crowded_m = USER_SPACING * users.cluster_radius_m / float(np.sqrt(users.users_per_cluster))
     width_m = min(USER_CELLS * cell_m, max(crowded_m, USER_CELLS_MIN * cell_m))
-    states = user_states(scene.served, scene.collected)
+    others = np.where(scene.served, UserState.SERVED, UserState.WAITING)
+    states = np.where(scene.collected, UserState.COLLECTED, others)  # [U]
     shapes = []
     for state, colour in USER_COLOURS.items():
         users_m = scene.users_m[states == state]
         size_m = width_m * (SERVED_SCALE if state is UserState.SERVED else 1.0)
-        shapes.append(
-            Shape(
-                ns="users",
-                id=state,
-                type=Marker.SPHERE_LIST,
-                scale_m=(size_m, size_m, size_m),
-                colour=colour,
-                points_m=np.column_stack([users_m, np.zeros(len(users_m))]),
-                shown=len(users_m) > 0,  # RViz warns about empty lists
-            )
-        )
+        sizes_m, points_m = (size_m, size_m, size_m), np.column_stack([users_m, np.zeros(len(users_m))])
+        shape = Shape("users", state, Marker.SPHERE_LIST, ORIGIN, sizes_m, colour, points_m=points_m)
+        shapes.append(replace(shape, shown=len(users_m) > 0))  # RViz warns about empty lists
     return shapes
 
 
 def _uav(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
     """The UAV, a line down to the ground, its service area, and the status text."""
     cell_m = scenario.grid.cell_m
+    thin_m, width_m = THIN_CELLS * cell_m, UAV_CELLS * cell_m
     known = scene.position_m is not None
-    x_m, y_m, z_m = at_m = scene.position_m or (0.0, 0.0, 0.0)
+    x_m, y_m, z_m = at_m = scene.position_m or ORIGIN
     reach_m = radio.ground_reach_m(scenario.mission.d_cons_m, z_m) if known else 0.0
-    text = status_text(scenario, scene)
+    area_m, below_m = (2 * reach_m, 2 * reach_m, thin_m), (x_m, y_m, -thin_m)
+    uav_m, line_m = (width_m, width_m, width_m / 2), (2 * thin_m, 0.0, 0.0)
+    down_m = np.array([at_m, (x_m, y_m, 0.0)])
+    text, text_m = status_text(scenario, scene), (0.0, 0.0, TEXT_CELLS * cell_m)
+    above_m, shown = (x_m, y_m, z_m + TEXT_ABOVE_CELLS * cell_m), known and bool(text)
     return [
-        Shape(
-            ns="footprint",
-            type=Marker.CYLINDER,
-            position_m=(x_m, y_m, -THIN_CELLS * cell_m),
-            scale_m=(2 * reach_m, 2 * reach_m, THIN_CELLS * cell_m),
-            colour=FOOTPRINT_COLOUR,
-            shown=reach_m > 0,
-        ),
-        Shape(
-            ns="uav",
-            type=Marker.SPHERE,
-            position_m=at_m,
-            scale_m=(UAV_CELLS * cell_m, UAV_CELLS * cell_m, UAV_CELLS * cell_m / 2),
-            colour=UAV_COLOUR,
-            shown=known,
-        ),
-        Shape(
-            ns="uav",
-            id=1,
-            type=Marker.LINE_LIST,
-            scale_m=(2 * THIN_CELLS * cell_m, 0.0, 0.0),
-            colour=UAV_COLOUR,
-            points_m=np.array([at_m, (x_m, y_m, 0.0)]),
-            shown=known,
-        ),
-        Shape(
-            ns="status",
-            type=Marker.TEXT_VIEW_FACING,
-            position_m=(x_m, y_m, z_m + TEXT_ABOVE_CELLS * cell_m),
-            scale_m=(0.0, 0.0, TEXT_CELLS * cell_m),
-            colour=TEXT_COLOUR,
-            text=text,
-            shown=known and bool(text),
-        ),
+        Shape("footprint", 0, Marker.CYLINDER, below_m, area_m, FOOTPRINT_COLOUR, shown=reach_m > 0),
+        Shape("uav", 0, Marker.SPHERE, at_m, uav_m, UAV_COLOUR, shown=known),
+        Shape("uav", 1, Marker.LINE_LIST, ORIGIN, line_m, UAV_COLOUR, points_m=down_m, shown=known),
+        Shape("status", 0, Marker.TEXT_VIEW_FACING, above_m, text_m, TEXT_COLOUR, text=text, shown=shown),
     ]
 
 
