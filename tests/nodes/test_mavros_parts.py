@@ -18,8 +18,8 @@ import pytest
 from rclpy.task import Future
 
 from uav_dc_ros.errors import VehicleError
-from uav_dc_ros.nodes.vehicles import mavros_commands
-from uav_dc_ros.nodes.vehicles.mavros_commands import RETRY_S, MavrosCommands
+from uav_dc_ros.nodes.vehicles import mavros
+from uav_dc_ros.nodes.vehicles.mavros import RETRY_S, MavrosCommands
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, tilt_rad
 from uav_dc_ros.offboard.mavros.diagnostics import OTHERS_S
@@ -320,9 +320,9 @@ class Service:
     Request = Message
 
 
-PACKAGE = mavros_commands.MavrosMsgs(
-    msg=SimpleNamespace(**dict.fromkeys(mavros_commands.MESSAGES.values(), Message)),
-    srv=SimpleNamespace(**dict.fromkeys(mavros_commands.SERVICES.values(), Service)),
+PACKAGE = mavros.MavrosMsgs(
+    msg=SimpleNamespace(**dict.fromkeys(mavros.MESSAGES.values(), Message)),
+    srv=SimpleNamespace(**dict.fromkeys(mavros.SERVICES.values(), Service)),
 )
 FLAGS = [
     *("attitude", "velocity_horiz", "velocity_vert", "pos_horiz_rel", "pos_horiz_abs", "pos_vert_abs"),
@@ -562,11 +562,11 @@ def test_without_mavros_msgs_nothing_is_asked_for_and_the_pilot_is_told_once() -
 
 def test_the_package_is_found_and_one_of_another_kind_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mavros_msgs", None)
-    assert mavros_commands.load_messages() is None
+    assert mavros.load_messages() is None
     with pytest.raises(
         VehicleError, match="arming through MAVROS needs the package mavros_msgs; expected it"
     ):
-        mavros_commands.load_messages(needed_for="arming")
+        mavros.load_messages(needed_for="arming")
     package, messages, services = ModuleType("mavros_msgs"), ModuleType("msg"), ModuleType("srv")
     names = ("State", "ExtendedState", "SysStatus", "EstimatorStatus", "StatusText", "HomePosition")
     for name in (*names, "PositionTarget"):
@@ -575,10 +575,10 @@ def test_the_package_is_found_and_one_of_another_kind_is_refused(monkeypatch: py
         setattr(services, name, Service)
     for name, module in (("", package), (".msg", messages), (".srv", services)):
         monkeypatch.setitem(sys.modules, f"mavros_msgs{name}", module)
-    assert mavros_commands.load_messages(needed_for="arming") == (messages, services)
+    assert mavros.load_messages(needed_for="arming") == (messages, services)
     del messages.SysStatus
     with pytest.raises(VehicleError, match=r"mavros_msgs has no SysStatus; expected"):
-        mavros_commands.load_messages()
+        mavros.load_messages()
 
 
 # The stream.

@@ -125,7 +125,7 @@ def test_of_two_missions_that_start_at_once_one_is_flown(ros: Ros, options: list
 HEEDLESS = """
 import sys
 from uav_dc_ros import bag
-from uav_dc_ros.nodes.play.subscriber_monitor import SubscriberMonitor
+from uav_dc_ros.nodes.play.playback_publisher import SubscriberMonitor
 SubscriberMonitor.mission = lambda *_: None
 sys.exit(bag.main())
 """

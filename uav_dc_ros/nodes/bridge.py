@@ -87,9 +87,8 @@ class AutopilotBridge(MissionNode):
         self._status: messages.Mission | None = None  # published last
         self._changes: list[str] = []  # since the last diagnostics
         self._n_changes = 0
-        self._plausibility = PlausibilityFilter(
-            self.settings.max_speed_mps, self.settings.max_position_jump_m
-        )
+        settings = self.settings
+        self._plausibility = PlausibilityFilter(settings.max_speed_mps, settings.max_position_jump_m)
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
         self._setpoint: Enu | None = None  # published last as `target`

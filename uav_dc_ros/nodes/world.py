@@ -70,10 +70,7 @@ class ExternalUsers:
         self._is_due = False
 
     def update(self, payload: messages.Mission) -> None:
-        """Follow the mission; a repeated `ready` requests the users again.
-
-        Raises MessageError for a mission in another world, or with other users.
-        """
+        """Follow the mission; raises MessageError for a mission in another world, or with other users."""
         payloads.check(payload, self._scenario)
         seed = self._seed + payload.mission
         if payload.seed != seed:
@@ -86,7 +83,7 @@ class ExternalUsers:
         last = (self._mission, self._users.step) if self._users else (-1, -1)
         is_new = payload.step > 0 and (payload.mission, payload.step) != last
         if payload.phase is Phase.READY or (payload.phase in REACHED and is_new):
-            self._is_due = True
+            self._is_due = True  # after a repeated `ready` again
 
     def users(self, stamp_ns: int, run: str = "") -> messages.Users | None:
         """The users to publish with the time of a pose, nanoseconds; None: none are due."""
@@ -319,11 +316,10 @@ class WorldNode(MissionNode):
     def _encode_users(self, step: int, users_m: Array) -> bytes:
         """The encoded `users` of a step at `users_m`, metres, `[U, 2]`."""
         time_ns = self.scenario.time_ns(self._mission, step)
-        return messages.encode(
-            payloads.users(
-                self.scenario, users_m, mission=self._mission, step=step, time_ns=time_ns, run=self.run
-            )
+        users = payloads.users(
+            self.scenario, users_m, mission=self._mission, step=step, time_ns=time_ns, run=self.run
         )
+        return messages.encode(users)
 
     def _status(self, reason: str = "") -> messages.Mission:
         assert self._phase is not None, "a mission has begun"

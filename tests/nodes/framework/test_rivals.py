@@ -7,7 +7,7 @@ import pytest
 
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
-from uav_dc_ros.nodes.play.subscriber_monitor import SubscriberMonitor
+from uav_dc_ros.nodes.play.playback_publisher import SubscriberMonitor
 from uav_dc_ros.topics import TOPICS
 
 OURS = {

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+import msgspec
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
@@ -24,7 +25,7 @@ from uav_dc_ros.nodes.framework import process_control
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.framework.parameters import COMMON, Parameter
-from uav_dc_ros.nodes.framework.process_control import SUPERVISED, Reporter
+from uav_dc_ros.nodes.framework.process_control import CONFIGURE, REASON_MAX, REPORTS, STATES, SUPERVISED
 from uav_dc_ros.nodes.ros import environment, fastdds, rclpy_private
 from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 
@@ -77,6 +78,49 @@ class StopMonitor:
                     self._wake()
                 if not received:
                     sources.remove(source)
+
+
+def make_transition(node: MissionNode, transition: str) -> bool:
+    """Make a transition of a node; returns whether it succeeded."""
+    if transition == CONFIGURE:
+        node.trigger_configure()
+    else:
+        node.trigger_activate()
+    return node.state == STATES[transition]
+
+
+class Reporter:
+    """The nodes' end: makes the commanded transitions, and reports.
+
+    A report is also a heartbeat: the executor's thread sends one every `PERIOD_S`. A callback that hangs
+    stops them.
+    """
+
+    def __init__(self, nodes: Sequence[MissionNode]) -> None:
+        self._nodes = {node.row.name: node for node in nodes}
+        self._refused: dict[str, str] = {}
+        self._pipe: int | None = int(os.environ[REPORTS]) if REPORTS in os.environ else None
+        if self._pipe is not None:
+            os.set_blocking(self._pipe, False)
+
+    def report(self) -> None:
+        """Report all nodes."""
+        if self._pipe is None:
+            return
+        states = ((name, node.state) for name, node in self._nodes.items())
+        reports = {name: process_control.NodeReport(state, self._refused.get(name)) for name, state in states}
+        # The pipe is full while run_all is suspended, and closed once it has ended: see StopMonitor.
+        with contextlib.suppress(OSError):
+            os.write(self._pipe, msgspec.json.encode(reports) + b"\n")
+
+    def execute(self, line: str) -> None:
+        """Make the transition that a line commands, and report."""
+        transition, name = line.split()
+        node = self._nodes[name]
+        self._refused.pop(name, None)
+        if not make_transition(node, transition):
+            self._refused[name] = str(node.failure or "it failed; see its log")[:REASON_MAX]
+        self.report()
 
 
 def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -167,8 +211,8 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> in
             node.prepare()
         nodes[0].create_timer(process_control.PERIOD_S, reporter.report, clock=nodes[0].steady)
         to_start = [node for node in nodes if node.values["autostart"]]
-        transitions = ((node, name) for name in process_control.STATES for node in to_start)
-        if all(process_control.make_transition(node, name) for node, name in transitions):
+        transitions = ((node, name) for name in STATES for node in to_start)
+        if all(make_transition(node, name) for node, name in transitions):
             gc.freeze()  # these objects stay: the collector need not scan them again
             if pause_s:
                 os.nice(BACKGROUND_NICENESS)

@@ -138,11 +138,8 @@ def _names(reader: BagReader, options: argparse.Namespace) -> dict[str, str]:
             raise ParameterError(f"{option} {topic}: no such topic in bag {reader.path}; it has {known}")
     excluded = {*(options.exclude or ()), *([CLOCK_TOPIC] if options.clock else ())}
     prefix = options.namespace.rstrip("/")
-    names = {
-        topic: remapped.get(topic, f"{prefix}{topic}")
-        for topic in (options.topics or sorted(reader.topics))
-        if topic not in excluded
-    }
+    played = [topic for topic in options.topics or sorted(reader.topics) if topic not in excluded]
+    names = {topic: remapped.get(topic, f"{prefix}{topic}") for topic in played}
     first_of: dict[str, str] = {}
     for topic, name in names.items():
         first = first_of.setdefault(name, topic)

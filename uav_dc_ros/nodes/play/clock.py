@@ -9,7 +9,7 @@ RATE_MIN, RATE_MAX = 1e-3, 1e6
 
 
 class PlaybackClock:
-    """Maps log times of a bag to the steady clock, from one reference point: no late message delays others."""
+    """Maps log times of a bag to the steady clock, from one reference: a late message delays no other."""
 
     def __init__(
         self, rate: float, *, paused: bool = False, now: Callable[[], float] = time.monotonic

@@ -19,8 +19,7 @@ from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN, PlaybackClock
 from uav_dc_ros.nodes.play.display import PlaybackDisplay
 from uav_dc_ros.nodes.play.keyboard import HELP, Keyboard
-from uav_dc_ros.nodes.play.playback_publisher import PlaybackPublisher
-from uav_dc_ros.nodes.play.subscriber_monitor import SubscriberMonitor
+from uav_dc_ros.nodes.play.playback_publisher import PlaybackPublisher, SubscriberMonitor
 from uav_dc_ros.nodes.ros import convert, qos
 from uav_dc_ros.topics import TOPICS
 

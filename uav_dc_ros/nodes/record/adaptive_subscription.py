@@ -109,10 +109,7 @@ class AdaptiveSubscription:
         return self._lost + sum(map(_count, self._losses.values()))
 
     def drain(self, until_ns: int, deadline_s: float) -> int:
-        """Handle messages that have arrived; returns the number of unhandled ones at the deadline.
-
-        `until_ns` is the latest publication time, `deadline_s` on the monotonic clock.
-        """
+        """Handle messages published by `until_ns`; the number that a (monotonic) deadline left unhandled."""
         unhandled = 0
         for subscription in self._losses:
             while (taken := _take(subscription)) is not None and taken[1]["source_timestamp"] <= until_ns:

@@ -55,13 +55,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--split-bytes", type=size, default=0, metavar="N", help=p.SPLIT_BYTES.description)
     add("--split-s", type=float, default=0.0, metavar="S", help=p.SPLIT_S.description)
     add("--compression", choices=COMPRESSIONS, default="zstd", help=p.COMPRESSION.description)
-    add(
-        "--min-free-bytes",
-        type=size,
-        default=p.MIN_FREE_BYTES.default,
-        metavar="N",
-        help=f"{p.MIN_FREE_BYTES.description} (default: {p.MIN_FREE_BYTES.default})",
-    )
+    free = p.MIN_FREE_BYTES
+    what = f"{free.description} (default: {free.default})"
+    add("--min-free-bytes", type=size, default=free.default, metavar="N", help=what)
 
 
 def run(options: argparse.Namespace) -> int:

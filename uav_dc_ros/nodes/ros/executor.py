@@ -113,10 +113,7 @@ class DirectExecutor:
         return [(kind, entity, handle) for node in self._nodes for entity in getattr(node, f"{kind}s")]
 
     def _wait(self, wait_set: Any, entities: list[_Entity], timeout_ns: int) -> bool:
-        """Wait for entities and handle those that are ready; False after the timeout.
-
-        True also after `wake`: then `spin` has to check its condition.
-        """
+        """Wait for entities, handle those that are ready; false after the timeout, but true after `wake`."""
         wait_set.clear_entities()
         at = [getattr(wait_set, f"add_{kind}")(entity.handle) for kind, entity, _ in entities]
         wait_set.add_guard_condition(self._guard.handle)

@@ -53,11 +53,9 @@ def _describe(type: str, texts: dict[str, str]) -> None:
     found = find(type)
     if found is None:
         raise LookupError(type)
-    names = found.get_fields_and_field_types()
-    texts[type] = "".join(
-        f"{_field_type(kind)} {name}\n" for name, kind in zip(names, found.SLOT_TYPES, strict=False)
-    )
-    for kind in found.SLOT_TYPES[: len(names)]:
+    fields = tuple(zip(found.get_fields_and_field_types(), found.SLOT_TYPES, strict=False))
+    texts[type] = "".join(f"{_field_type(kind)} {name}\n" for name, kind in fields)
+    for _, kind in fields:
         element = getattr(kind, "value_type", kind)
         if hasattr(element, "namespaced_name"):
             inner = "/".join(element.namespaced_name())

@@ -7,9 +7,7 @@ from rclpy.node import Node
 
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
-from uav_dc_ros.nodes.vehicles import mavros_commands
-from uav_dc_ros.nodes.vehicles.mavros import MavrosVehicle
-from uav_dc_ros.nodes.vehicles.px4 import Px4Vehicle, load_messages
+from uav_dc_ros.nodes.vehicles import mavros, px4
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle, load_codec
@@ -31,8 +29,8 @@ def make(
     if values["vehicle"] == "mavlink":
         return MavlinkVehicle(values["connect"], **grid, system=values["system"] or system)
     if values["vehicle"] == "mavros":
-        return MavrosVehicle(node, **grid, arms=values["arm"], restarted=restarted)
-    return Px4Vehicle(node, **grid, restarted=restarted)
+        return mavros.MavrosVehicle(node, **grid, arms=values["arm"], restarted=restarted)
+    return px4.Px4Vehicle(node, **grid, restarted=restarted)
 
 
 def check(kind: str, connect: str, system: int, arm: bool) -> None:
@@ -50,6 +48,6 @@ def check(kind: str, connect: str, system: int, arm: bool) -> None:
         Address.parse(connect)
         load_codec()
     elif kind == "px4":
-        load_messages()
+        px4.load_messages()
     elif arm:
-        mavros_commands.load_messages(needed_for="arming")
+        mavros.load_messages(needed_for="arming")

@@ -57,15 +57,13 @@ class FoxgloveServer:
         except RuntimeError as error:
             raise _port_error(address, port, str(error).removeprefix("FoxgloveError: ")) from None
         self._topics = topics
-        self._channels = {
-            full_name: foxglove.Channel(
-                full_name,
-                schema=foxglove.Schema(name=row.type, encoding=ENCODING, data=definition(row.type)),
-                message_encoding="cdr",
-                context=self._context,
+        self._channels: dict[str, foxglove.Channel] = {}
+        for full_name, row in topics.items():
+            schema = foxglove.Schema(name=row.type, encoding=ENCODING, data=definition(row.type))
+            channel = foxglove.Channel(
+                full_name, schema=schema, message_encoding="cdr", context=self._context
             )
-            for full_name, row in topics.items()
-        }
+            self._channels[full_name] = channel
         self._by_id = {channel.id(): channel for channel in self._channels.values()}
 
     @property
