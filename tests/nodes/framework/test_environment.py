@@ -200,3 +200,33 @@ def test_shared_memory_is_as_before_after_missions_and_kills(ros: Ros, missions:
     process = ros.start_command(*private, mount, "-", sys.executable, "-c", MISSIONS, missions, kills)
     status, output = finish(process, 60.0 + 60.0 * (missions + kills))
     assert (status, output.splitlines()[-1:]) == (0, ["equal"]), output
+
+
+def test_participants_are_created_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not for ever: a process that hangs meanwhile, or is killed, stops no other."""
+    name = f"\0uav_dc_ros/participant_of_{os.getpid()}"
+    monkeypatch.setattr(fastdds, "CREATION_LOCK", name)
+    code = f"""
+from uav_dc_ros.nodes.ros import fastdds
+fastdds.CREATION_LOCK = {name!r}
+with fastdds.one_participant_at_a_time():
+    print("created", flush=True)
+    input()
+"""
+    command = [sys.executable, "-c", code]
+    holder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == "created\n"
+    monkeypatch.setattr(fastdds, "CREATION_MAX_S", 0.3)
+    begun_s = time.monotonic()
+    with fastdds.one_participant_at_a_time():
+        assert time.monotonic() - begun_s >= 0.3
+    holder.kill()
+    holder.communicate()
+    monkeypatch.setattr(fastdds, "CREATION_MAX_S", 600.0)
+    with fastdds.one_participant_at_a_time():
+        pass
+    with fastdds.one_participant_at_a_time():
+        pass

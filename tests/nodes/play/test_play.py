@@ -208,12 +208,13 @@ def test_options_choose_what_is_played_and_how(ros: Ros, tmp_path: Path) -> None
         )
     ]
     assert times == sorted(times)
-    assert times[0][0] == START_NS + 10**9
+    # The clock waits for no subscriber: on a busy machine one is matched after the first ticks.
+    assert START_NS + 10**9 <= times[0][0] < START_NS + 1.5e9
     assert START_NS + 1.9e9 <= times[-1][0] <= START_NS + 1.95e9  # not ahead of the last message
-    running = [(at, sent) for at, sent in times if START_NS + 1.2e9 < at < START_NS + 1.8e9]
+    running = [(at, sent) for at, sent in times if START_NS + 1.5e9 < at < START_NS + 1.8e9]
     speed = (running[-1][0] - running[0][0]) / (running[-1][1] - running[0][1])
     assert speed == pytest.approx(0.5, rel=0.4)
-    assert 10 < len(running) < 0.6 / 0.5 * 50 * 1.3
+    assert 5 < len(running) < 0.3 / 0.5 * 50 * 1.3
 
 
 def test_a_split_bag_repeats_nothing(ros: Ros, tmp_path: Path) -> None:
