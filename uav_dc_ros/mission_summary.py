@@ -2,6 +2,7 @@
 
 import msgspec
 
+from uav_dc_ros.core.reward import RewardData
 from uav_dc_ros.messages import Phase
 
 
@@ -17,7 +18,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         data_bits: data collected from all users, bit.
         sum_rate_bps: sum of the served users' rates, mean over the steps, bit/s.
         distance_m: length of the path, metres.
-        reward: r^t at the end (eq. 7), as in `evaluate` and policy cards.
+        reward: of the mission (eq. 7), as in `evaluate` and policy cards: with the data `so_far`, r^t at the
+            end; with the data of the `step`, the mean of r^t over the steps with rates.
+        reward_data: data in r^t, `so_far` or `step`.
         reason: end of a real vehicle's mission, or cause of an abort, in words; else empty.
         bag: folder of the bag, or null.
     """
@@ -34,5 +37,6 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     sum_rate_bps: float
     distance_m: float
     reward: float
+    reward_data: RewardData
     reason: str
     bag: str | None

@@ -3,6 +3,7 @@
 import numpy as np
 
 from uav_dc_ros import messages
+from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Link
@@ -51,6 +52,16 @@ def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Arra
     """`data_bits` and `collected`, `[U]` each; raises MessageError as `check` does."""
     check(payload, scenario)
     return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
+
+
+def counted_data(payload: messages.Rates, scenario: Scenario) -> Array:
+    """R of each user in r^t (eq. 7), bit, `[U]`; raises MessageError as `check` does.
+
+    Not of step 0, which measures the channel and collects nothing.
+    """
+    data_bits, _ = collection(payload, scenario)
+    rate_bps = np.asarray(payload.rate_bps, dtype=np.float64)
+    return world.counted_data(scenario, np.asarray(payload.served), rate_bps, data_bits)
 
 
 def check(payload: messages.Payload, scenario: Scenario) -> None:

@@ -1,4 +1,4 @@
-"""The reward, its two shapes of R_plus, and the form that telescopes."""
+"""The reward, its data in two readings, its two shapes of R_plus, and the form that telescopes."""
 
 import numpy as np
 import pytest
@@ -21,6 +21,33 @@ def test_the_paper_s_reward_by_hand(array):
     # beta / (M K) sum(data) / scale + zeta R_plus = 2 * (0.5 + 1 + 0 + 0.5) / 4 + 3 * 0.25
     data_bits = array([[3e6, 6e6, 0.0, 3e6]])
     np.testing.assert_allclose(reward.total(data_bits, array([0.25]), 2.0, 3.0, 6e6), [1.75], rtol=1e-15)
+
+
+def test_the_data_that_counts(array):
+    """Of two users in two worlds, by name and world by world."""
+    delivered, collected = array([[1e6, 0.0], [2e6, 3e6]]), array([[4e6, 5e6], [2e6, 7e6]])
+    np.testing.assert_array_equal(reward.counted_data(delivered, collected, "step"), delivered)
+    np.testing.assert_array_equal(reward.counted_data(delivered, collected, "so_far"), collected)
+    counted = reward.counted_data(delivered, collected, array([True, False]))
+    np.testing.assert_array_equal(counted, [[1e6, 0.0], [2e6, 7e6]])
+    assert counted.dtype == collected.dtype
+
+
+def test_a_mission_s_reward_by_hand(array):
+    """Of three steps: r^t at the end, or its mean."""
+    totals = array([[3.0, 3.0], [1.0, 1.0], [5.0, 5.5]])
+    expected = {
+        "so_far": [[3.0, 3.0], [1.0, 1.0], [5.0, 5.5]],
+        "step": [[3.0, 3.0], [2.0, 2.0], [3.0, 9.5 / 3]],
+    }
+    for data, of_mission in expected.items():
+        found = array([0.0, 0.0])
+        for n, (total, now) in enumerate(zip(totals, of_mission, strict=True), 1):
+            found = reward.mission_reward(found, total, n, data)
+            np.testing.assert_allclose(found, now, rtol=1e-15)
+    mixed = reward.mission_reward(totals[0], totals[1], 2, array([True, False]))
+    np.testing.assert_array_equal(mixed, [2.0, 1.0])
+    assert reward.MISSION_REWARD.keys() == reward.DATA.keys() == expected.keys()
 
 
 def test_each_world_may_have_its_own_weights(array):
@@ -52,17 +79,21 @@ def test_each_world_may_have_its_own_shape_and_form(array):
         np.testing.assert_array_equal(earned, [2.0, -0.5, 3.0])
 
 
+@pytest.mark.parametrize("data", ["so_far", "step"])
 @pytest.mark.parametrize("r_plus", ["binary", "exponential"])
-def test_immediate_rewards_sum_to_the_episode_reward(three, changed, array, r_plus):
-    """Over a mission, at every step: the sum of r1 so far, r2, and r^t are one number."""
+def test_immediate_rewards_sum_to_the_episode_reward(three, changed, array, r_plus, data):
+    """Over a mission, at every step: the sum of r1 so far, r2, and r^t are one number.
+
+    With the data of the step every bit counts once in the sum of r2.
+    """
     scenarios = {
-        form: changed(three, reward={"form": form, "r_plus": r_plus, "beta": 2.0, "zeta": 1.5})
+        form: changed(three, reward={"form": form, "r_plus": r_plus, "beta": 2.0, "zeta": 1.5, "data": data})
         for form in ("immediate", "episode")
     }
     rng = np.random.default_rng(2)
     first = rng.random((4, three.n_users, 2))
     states = {form: world.initial(scenario, array(first)) for form, scenario in scenarios.items()}
-    so_far = np.zeros(4)
+    so_far, by_place, episode_return = np.zeros(4), np.zeros(4), np.zeros(4)
     has_fallen = False
     for _ in range(three.mission.max_steps):
         draws = rng.random(first.shape)
@@ -78,6 +109,12 @@ def test_immediate_rewards_sum_to_the_episode_reward(three, changed, array, r_pl
         has_fallen |= bool((rewards["immediate"] < 0.0).any())
         np.testing.assert_allclose(so_far, rewards["episode"], rtol=1e-12, atol=1e-12)
         np.testing.assert_array_equal(rewards["episode"], states["episode"].total_reward)
+        episode_return += rewards["episode"]
+        without_data = array(np.zeros((4, 1)))
+        by_place += np.asarray(world.total_reward(scenarios["episode"], states["episode"].cell, without_data))
         np.testing.assert_array_equal(states["immediate"].total_reward, states["episode"].total_reward)
-    assert so_far.max() > 0.5
+    if data == "step":
+        collected = np.asarray(states["episode"].data_bits).mean(axis=-1) / three.reward.data_scale_bits
+        np.testing.assert_allclose(episode_return, 2.0 * collected + by_place, rtol=1e-12)
+    assert (so_far if data == "so_far" else episode_return).max() > 0.5
     assert has_fallen, "a step away from the dock should have cost something"

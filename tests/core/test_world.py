@@ -61,7 +61,7 @@ def by_hand(scenario, draws, actions):
             strict=True,
         )
     ]
-    data, done, before = [0.0] * len(spot), [False] * len(spot), 0.0
+    data, done, before, totals = [0.0] * len(spot), [False] * len(spot), 0.0, []
     signs = [(-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (0, 0, 0)]
     for now, action in zip(draws[1:], actions, strict=True):
         target = [c + d for c, d in zip(cell, signs[action], strict=True)]
@@ -87,21 +87,29 @@ def by_hand(scenario, draws, actions):
         data = [b + r * 15.0 if on else b for b, r, on in zip(data, rate, served, strict=True)]
         done = [c or b >= s.mission.r_min_bits for c, b in zip(done, data, strict=True)]
         away = math.dist(cell[:2], (10, 10))
-        total = s.reward.beta * math.fsum(data) / len(
+        counted = (
+            data
+            if s.reward.data == "so_far"
+            else [r * 15.0 for r, on in zip(rate, served, strict=True) if on]
+        )
+        total = s.reward.beta * math.fsum(counted) / len(
             data
         ) / s.reward.data_scale_bits + s.reward.zeta * math.exp(-away)
-        yield cell, spot, rate, served, data, done, total, total - before
+        totals.append(total)
+        of_mission = total if s.reward.data == "so_far" else math.fsum(totals) / len(totals)
+        yield cell, spot, rate, served, data, done, total, total - before, of_mission
         before = total
 
 
-def test_step_is_the_composition_that_the_specification_describes(any_world, changed):
-    scenario = changed(any_world, reward={"form": "immediate", "beta": 2.0, "zeta": 3.0})
+@pytest.mark.parametrize("data", ["so_far", "step"])
+def test_step_is_the_composition_that_the_specification_describes(any_world, changed, data):
+    scenario = changed(any_world, reward={"form": "immediate", "beta": 2.0, "zeta": 3.0, "data": data})
     draws, actions = flight(scenario, (), seed=4)
     visited = 0
     for (state, outcome), hand in zip(
         fly(scenario, draws, [np.asarray(a) for a in actions]), by_hand(scenario, draws, actions), strict=True
     ):
-        cell, spot, rate, served, data, done, total, reward = hand
+        cell, spot, rate, served, data, done, total, reward, of_mission = hand
         np.testing.assert_array_equal(state.cell, cell)
         np.testing.assert_allclose(state.users_m, spot, rtol=1e-12, atol=1e-9)
         np.testing.assert_allclose(outcome.link.rate_bps, rate, rtol=1e-12)
@@ -112,6 +120,7 @@ def test_step_is_the_composition_that_the_specification_describes(any_world, cha
         np.testing.assert_allclose(state.data_bits, data, rtol=1e-12)
         np.testing.assert_array_equal(state.collected, done)
         np.testing.assert_allclose(state.total_reward, total, rtol=1e-12)
+        np.testing.assert_allclose(state.mission_reward, of_mission, rtol=1e-12)
         np.testing.assert_allclose(outcome.reward, reward, rtol=1e-9, atol=1e-12)
         visited += sum(served)
     assert visited > 10, "the flight should have met users, or this compares nothing"
@@ -276,6 +285,7 @@ def test_shapes_and_types(three, array, batch, dtype):
         "data_bits": ((users,), real),
         "collected": ((users,), truth),
         "total_reward": ((), real),
+        "mission_reward": ((), real),
     }
     of_outcome = {
         "reward": ((), real),
@@ -304,10 +314,13 @@ def test_shapes_and_types(three, array, batch, dtype):
 
 # Numbers that float32 holds exactly.
 REWARD_SETTINGS = [
-    {"beta": 1.0, "zeta": 4.0, "r_plus": "binary", "form": "immediate", "data_scale_bits": 6e6},
-    {"beta": 2.5, "zeta": 0.0, "r_plus": "exponential", "form": "episode", "data_scale_bits": 1e6},
-    {"beta": 0.0, "zeta": 0.5, "r_plus": "exponential", "form": "immediate", "data_scale_bits": 2e6},
-    {"beta": 0.5, "zeta": 2.0, "r_plus": "binary", "form": "episode", "data_scale_bits": 6e6},
+    {"data": data, "beta": beta, "zeta": zeta, "r_plus": r_plus, "form": form, "data_scale_bits": scale_bits}
+    for data, beta, zeta, r_plus, form, scale_bits in [
+        ("so_far", 1.0, 4.0, "binary", "immediate", 6e6),
+        ("step", 2.5, 0.0, "exponential", "episode", 1e6),
+        ("so_far", 0.0, 0.5, "exponential", "immediate", 2e6),
+        ("step", 0.5, 2.0, "binary", "episode", 6e6),
+    ]
 ]
 
 
@@ -323,6 +336,7 @@ def reward_settings(array, dtype, shape=(-1,)):
         data_scale_bits=column("data_scale_bits", dtype),
         r_plus=array(np.array([one["r_plus"] == "exponential" for one in REWARD_SETTINGS]).reshape(shape)),
         form=array(np.array([one["form"] == "episode" for one in REWARD_SETTINGS]).reshape(shape)),
+        data=array(np.array([one["data"] == "step" for one in REWARD_SETTINGS]).reshape(shape)),
     )
 
 
@@ -375,7 +389,7 @@ def test_a_mission_begins_at_its_start_with_nothing(three, array):
     state = world.initial(three, array(draws))
     start_m = three.grid.centre_m(state.cell, like=state.users_m)
     np.testing.assert_array_equal(start_m, [[0.0, 0.0, 200.0]] * 2)
-    for name in ("step", "data_bits", "collected", "total_reward"):
+    for name in ("step", "data_bits", "collected", "total_reward", "mission_reward"):
         assert not np.asarray(getattr(state, name)).any(), name
     away = np.asarray(state.users_m) - three.user_centres_m
     assert np.hypot(away[..., 0], away[..., 1]).max() <= three.users.cluster_radius_m * (1 + 1e-12)

@@ -26,7 +26,7 @@ def made(end="at_time_limit", **values):
         scenario,
         run(scenario, 1, algorithm="dqn", learning_rate=1e-2, epsilon=0.5, **LEARNING),
         run(scenario, 2**40, environment=4, batch_size=3, form="immediate", **LEARNING),
-        run(scenario, 3, aggregation="max", batch_size=16, epsilon=0.2, **LEARNING),
+        run(scenario, 3, aggregation="max", batch_size=16, epsilon=0.2, data="step", **LEARNING),
         **values,
     )
 
@@ -69,6 +69,33 @@ def test_what_goes_on_ends_as_what_was_never_interrupted(path, end, worlds_in):
             assert torch.equal(found[name], array), (stops, name)
         for name, curve in never.curves.items():
             np.testing.assert_array_equal(training.curves[name], curve)
+
+
+@pytest.mark.parametrize("worlds_in", ["numpy", "torch"])
+def test_a_checkpoint_of_version_0_1_0_goes_on(path, worlds_in):
+    """It has no reading of the data: it is that so far. Then r^t is the reward of a mission in its midst."""
+    population = made("on_arrival")
+    runs = tuple(
+        msgspec.structs.replace(one, reward=msgspec.structs.replace(one.reward, data="so_far"))
+        for one in population.runs
+    )
+    population = msgspec.structs.replace(population, runs=runs)
+    never = fly(Training(population, CPU, worlds_in), 5)
+    training = fly(Training(population, CPU, worlds_in), 2)
+    old = msgspec.to_builtins(population)
+    for reward in (old["scenario"]["reward"], *(one["reward"] for one in old["runs"])):
+        assert reward.pop("data") == "so_far"
+    checkpoint.save(path, training, {})
+    edit(path, {"population": old}, {"world.mission_reward": None})
+    again = Training(population, CPU, worlds_in)
+    checkpoint.restore(path, again)
+    fly(again, 3)
+    for name, curve in never.curves.items():
+        np.testing.assert_array_equal(again.curves[name], curve, err_msg=name)
+    # Of this version's other reading it is no checkpoint.
+    other = Training(made("on_arrival"), CPU, worlds_in)
+    with pytest.raises(TrainingError, match=r"runs\[2\]\.reward\.data = 'so_far'; expected 'step'"):
+        checkpoint.restore(path, other)
 
 
 def test_on_arrival_a_mission_goes_on_in_the_midst(path):

@@ -52,10 +52,12 @@ def by_hand(env, act, seed):
             return infos, rewards
 
 
-@pytest.mark.parametrize("end", ["at_time_limit", "on_arrival"])
-def test_seed_s_is_the_mission_of_the_environment_with_seed_s(tmp_path, end):
+@pytest.mark.parametrize(
+    ("end", "data"), [("at_time_limit", "so_far"), ("on_arrival", "so_far"), ("on_arrival", "step")]
+)
+def test_seed_s_is_the_mission_of_the_environment_with_seed_s(tmp_path, end, data):
     """To the last bit, however many missions fly side by side."""
-    scenario = changed("five_clusters", mission={"episode_end": end, "max_steps": 30})
+    scenario = changed("five_clusters", mission={"episode_end": end, "max_steps": 30}, reward={"data": data})
     made = policy.load(saved(tmp_path / "made", scenario))
     seeds = [3, 0, 11, 12, 13, 14, 15]
     missions = roll_out(scenario, greedy_act(made, scenario), seeds)
@@ -70,6 +72,9 @@ def test_seed_s_is_the_mission_of_the_environment_with_seed_s(tmp_path, end):
         assert missions.landed[i] == infos[-1]["landed"]
         assert missions.data_bits[i] == infos[-1]["data_bits"].sum()
         assert missions.episode_return[i] == pytest.approx(sum(rewards), rel=1e-12)
+        # The episode form pays r^t itself.
+        expected = rewards[-1] if data == "so_far" else np.mean(rewards)
+        assert missions.reward[i] == pytest.approx(expected, rel=1e-12)
         rates = [info["sum_rate_bps"] for info in infos[1:]]
         assert missions.sum_rate_bps[i] == pytest.approx(np.mean(rates), rel=1e-12)
 
@@ -117,6 +122,15 @@ def test_a_figure_is_over_the_missions_that_have_it():
     once = evaluate_act("plan", None, plan(1, 1, 2, 2, 6, 6, 6, 6), scenario, [7]).evaluation
     assert (once.data_bits.low, once.data_bits.high) == (None, None), "one mission has no interval"
     assert ("arrival step", "4.0", "-", "4.0", "4.0") in rows(once)
+
+
+@pytest.mark.parametrize(
+    ("data", "title"), [("so_far", "reward r^t at the end"), ("step", "reward r^t, mean over the steps")]
+)
+def test_the_table_names_the_reward(data, title):
+    evaluation = evaluate_act("hover", None, plan(*[6] * 8), tiny(reward={"data": data}), range(2)).evaluation
+    assert evaluation.reward_data == data
+    assert [row[0] for row in rows(evaluation) if row[0].startswith("reward")] == [title]
 
 
 def test_policies_are_compared_mission_by_mission():

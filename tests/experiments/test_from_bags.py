@@ -54,10 +54,11 @@ def in_environment(scenario, seeds, observation):
 
 @pytest.mark.parametrize("observation", ["position", "mission", "map"])
 @pytest.mark.parametrize("form", ["immediate", "episode"])
-def test_the_buffer_holds_what_the_environment_gives(tmp_path, observation, form):
+@pytest.mark.parametrize("data", ["step", "so_far"])
+def test_the_buffer_holds_what_the_environment_gives(tmp_path, observation, form, data):
     """Bit for bit, in every run, with the reward of the training, not that of the recorded scenario."""
     bags = [recorded(tmp_path / "a"), recorded(tmp_path / "b", seed=20, missions=2, namespace="/uav2")]
-    paid = {"form": form, "beta": 3.0, "zeta": 0.5, "r_plus": "binary"}
+    paid = {"form": form, "beta": 3.0, "zeta": 0.5, "r_plus": "binary", "data": data}
     runs = [run(TINY, seed, **paid) for seed in (0, 1)]
     training = Training(population(TINY, *runs, observation=observation), CPU)
     found = prefill_replay(training, bags)

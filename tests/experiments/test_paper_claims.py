@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 
-from tests.experiments.paper_sweeps import SHORT, realistic, sweep
+from tests.experiments.paper_sweeps import SHORT, of_the_data_of_the_step, realistic, sweep
 from uav_dc_ros.core.stats import Interval
 from uav_dc_ros.experiments.paper.claims import CLAIMS, check, finding
 from uav_dc_ros.experiments.paper.criteria import (
@@ -243,6 +243,20 @@ def test_the_reward_with_the_binary_r_plus_is_found_from_throughput_and_landing(
     rise = 0.2 + 0.8 * (1 - np.exp(-(results.episode[-8:] - results.episode[0]) / 40)).mean()
     expected = (2 * 3e-6 * 3e5 + 0.5) / 3 * here * rise
     np.testing.assert_allclose(Evidence(results).of("common_share", setting), expected, rtol=1e-5)
+
+
+def test_as_a_mean_over_the_steps_it_counts_those_over_the_dock():
+    results = of_the_data_of_the_step(
+        sweep(lambda s: {"throughput_bps": 3e5, "landing_rate": 0.5, "arrival_step": 40.0})
+    )
+    found = Evidence(results)
+    setting = Setting(beta=2, zeta=1)
+    throughput, landed, arrival = (
+        found.of(name, setting) for name in ("throughput_bps", "landing_rate", "arrival_step")
+    )
+    data_per_bps = results.metadata.worlds["five_clusters"].data_per_bps
+    expected = (2 * data_per_bps * throughput + (60 - arrival + landed) / 60) / 3
+    np.testing.assert_allclose(found.of("common_share", setting), expected, rtol=1e-6)
 
 
 def test_the_rules_of_a_direction():

@@ -6,8 +6,9 @@ from dataclasses import fields
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
-from tests.experiments.paper_sweeps import realistic
+from tests.experiments.paper_sweeps import of_the_data_of_the_step, realistic
 from uav_dc_ros import scenarios
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
@@ -48,6 +49,21 @@ def test_every_figure_is_drawn(results, tracks, figure, tmp_path):
     colours = np.rint(255 * image[..., :3]).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     assert len(np.unique(colours)) > 50, "not a blank page"
     assert list(tmp_path.iterdir()) == [path], "no partial file is left"
+
+
+@pytest.mark.parametrize("figure", ["reward5clusters", "reward5clusters3", "lr", "exp"])
+def test_the_axis_names_the_reward(results, figure, tmp_path, monkeypatch):
+    titles = []
+    monkeypatch.setattr(Axes, "set_ylabel", lambda _, text, **how: titles.append(text))
+    monkeypatch.setattr(Axes, "text", lambda _, x, y, text, **how: titles.append(text))
+    for made, words in (
+        (results, "$r^t$ at the end"),
+        (of_the_data_of_the_step(results), "$r^t$, mean over"),
+    ):
+        titles.clear()
+        draw(figure, made, [], tmp_path / "figure.png")
+        assert any(text.startswith("reward") for text in titles)
+        assert all(words in text for text in titles if text.startswith("reward"))
 
 
 def test_the_full_sweep_is_drawn(tmp_path):

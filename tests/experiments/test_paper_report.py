@@ -6,7 +6,7 @@ import re
 import msgspec
 import pytest
 
-from tests.experiments.paper_sweeps import realistic, sweep
+from tests.experiments.paper_sweeps import of_the_data_of_the_step, realistic, sweep
 from uav_dc_ros.experiments.paper.claims import CLAIMS, check
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.report import CLAIMS_FILE, VERDICTS_FILE, claims_md, write
@@ -28,6 +28,24 @@ def test_it_says_where_it_comes_from(text):
         "fcb46aa8fbbf",
     ):
         assert fact in text
+
+
+@pytest.mark.parametrize("data", ["so_far", "step"])
+def test_it_names_the_reward_that_it_compares(data):
+    results = realistic(SMOKE)
+    results = of_the_data_of_the_step(results) if data == "step" else results
+    text = claims_md(results, check(results), [])
+    words, reading = {
+        "so_far": ("r^t at the end", "`three_clusters` data so far, `five_clusters` data so far"),
+        "step": (
+            "r^t, mean over the steps",
+            "`three_clusters` data of the step, `five_clusters` data of the step",
+        ),
+    }[data]
+    assert f"- data in r^t (eq. 7): {reading}\n" in text
+    titles = re.findall(r"^\*\*Reward .*\*\*$|(?<=\| )[^|]*\breward\b[^|]*(?= \|.*\n\|---)", text, re.M)
+    assert len(titles) > 10
+    assert all(words in title for title in titles), titles
 
 
 def test_every_claim_has_its_row_and_its_section(text):

@@ -137,6 +137,25 @@ def test_runs_come_by_environment_and_repeat():
     assert len(results.of(Setting(batch_size=9))) == 0
 
 
+def test_results_of_version_0_1_0_are_of_the_data_so_far(results):
+    facts = msgspec.to_builtins(results.metadata.worlds["five_clusters"])
+    assert facts.pop("reward_data") == "so_far"
+    assert msgspec.convert(facts, ScenarioFacts) == results.metadata.worlds["five_clusters"]
+
+
+@pytest.mark.parametrize("name", ["three_clusters", "five_clusters"])
+def test_the_throughput_gives_the_data_term_of_the_mean_over_the_steps(name):
+    """Where a mission is over the dock from its arrival on, and not before."""
+    scenario = changed(name, reward={"beta": 3.0, "zeta": 2.0, "r_plus": "binary", "data": "step"})
+    facts, n_steps = ScenarioFacts.of(scenario), scenario.mission.max_steps
+    assert facts.reward_data == "step"
+    for planner in ("tour", "random"):
+        missions = roll_out(scenario, PLANNERS[planner](scenario), range(5))
+        docked = np.where(missions.landed, n_steps + 1 - missions.arrival_step, 0) / n_steps
+        expected = 3 * facts.data_per_bps * missions.sum_rate_bps + 2 * docked
+        np.testing.assert_allclose(missions.reward, expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["three_clusters", "five_clusters"])
 def test_the_throughput_gives_the_data_term(name):
     """Of flown missions: r^t with the binary R_plus is beta c throughput + zeta landed."""

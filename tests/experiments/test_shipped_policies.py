@@ -50,6 +50,15 @@ def test_the_command_on_the_card_says_how_it_was_made(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_a_policy_of_version_0_1_0_learnt_from_the_data_so_far(name):
+    """Its config has no reading of the data."""
+    made = policy.load(name)
+    assert "data" not in made.config.scenario["reward"]
+    assert made.scenario.reward.data == "so_far"
+    assert "form, data so far" in card(name)
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_it_learnt_in_the_scenario_as_it_is_now_but_for_the_reward(name):
     learnt, now = policy.load(name).scenario, scenarios.load(policy.load(name).scenario.name)
     for section in ("grid", "users", "mission", "radio"):

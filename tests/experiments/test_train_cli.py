@@ -104,6 +104,7 @@ def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
     arguments = ["--scenario", field, "--algo", "dueling_dqn", "--out", out, "--observation", "map"]
     arguments += ["--episodes", 6, "--runs", 2, "--seed", 5, "--checkpoint-every", 3, "--hidden", 12, 10]
     arguments += ["--batch-size", 16, "--gamma", 0.8, "--beta", 3, "--reward-form", "immediate"]
+    arguments += ["--reward-data", "step", "--data-scale-bits", 4e5]
     arguments += ["--tensorboard", tmp_path / "scalars"]
     status, printed, progress = command(*arguments)
     assert status == 0, progress
@@ -122,10 +123,12 @@ def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
     assert (made.config.hyperparameters.gamma, made.config.hyperparameters.batch_size) == (0.8, 16)
     assert made.config.seed in (5, 6)
     assert (made.scenario.reward.beta, made.scenario.reward.form) == (3.0, "immediate")
+    assert (made.scenario.reward.data, made.scenario.reward.data_scale_bits) == ("step", 4e5)
     card = (out / policy.CARD).read_text()
     assert f"python -m uav_dc_ros.train --scenario {field} --algo dueling_dqn --out {out}" in card
     # The card judges by the scenario as it is in the file.
-    assert "as it is shipped: beta 1, zeta 1, exponential R_plus, episode form" in card
+    assert "as it is shipped: beta 1, zeta 1, exponential R_plus, episode form, data so far" in card
+    assert "learnt from: beta 3, zeta 1, exponential R_plus, immediate form, data of the step" in card
     for row in rows(evaluate(made, tiny())):
         assert f"| {' | '.join(row)} |" in card
 
@@ -146,6 +149,8 @@ def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
         (["--seed", "-1"], "--seed is -1; expected int >= 0"),
         (["--runs", "0"], "'0'; expected a whole number of at least 1"),
         (["--beta", "-1"], "reward.beta = -1.0; expected float >= 0"),
+        (["--data-scale-bits", "0"], "reward.data_scale_bits = 0.0; expected float > 0"),
+        (["--reward-data", "mean"], "'mean'"),
         (["--device", "abacus"], "--device is 'abacus'"),
         (["--learning-rate", "inf"], "--learning-rate is inf; expected float <= 1"),
         (

@@ -44,7 +44,7 @@ def mixed(scenario, **values):
     return (
         run(scenario, 5, algorithm="dqn", gamma=0.5, r_plus="binary", learning_rate=1e-2, **values),
         run(scenario, 6, aggregation="max", batch_size=16, form="immediate", beta=4.0, zeta=0.5, **values),
-        run(scenario, 7, environment=3, epsilon=0.3, data_scale_bits=1e6, **values),
+        run(scenario, 7, environment=3, epsilon=0.3, data_scale_bits=1e6, data="step", **values),
         run(scenario, 7, gamma=0.99, batch_size=2, form="immediate", r_plus="binary", zeta=3.0, **values),
     )
 
@@ -252,7 +252,7 @@ def flown_by_hand(scenario, one, actions):
     env, limit = DataCollectionEnv(values), scenario.mission.max_steps
     transitions, episodes, missions = [], [], []
     before, _ = env.reset(seed=one.environment)
-    paid, rates, arrival, step = 0.0, [], None, 0
+    paid, rates, totals, arrival, step = 0.0, [], [], None, 0
     for t, action in enumerate(actions, start=1):
         after, reward, terminated, truncated, info = env.step(np.int64(action))
         transitions.append(np.concatenate([before, after, [action, reward, terminated]]))
@@ -262,13 +262,17 @@ def flown_by_hand(scenario, one, actions):
         rates.append(float(info["sum_rate_bps"]))
         away = math.dist(info["cell"][:2], scenario.dock_cell)
         arrival = None if away else arrival or step
+        r_plus = float(not away) if one.reward.r_plus == "binary" else math.exp(-away)
+        counted = info["data_bits"]
+        if one.reward.data == "step":
+            counted = info["rate_bps"] * info["served"] * scenario.mission.step_s
+        data = float(counted.mean()) / one.reward.data_scale_bits
+        totals.append(one.reward.beta * data + one.reward.zeta * r_plus)
         if terminated or truncated:
-            r_plus = float(not away) if one.reward.r_plus == "binary" else math.exp(-away)
-            data = float(info["data_bits"].mean()) / one.reward.data_scale_bits
             landed = bool(info["landed"])
             missions.append(
                 {
-                    "reward": one.reward.beta * data + one.reward.zeta * r_plus,
+                    "reward": np.mean(totals) if one.reward.data == "step" else totals[-1],
                     "episode_return": paid,
                     "throughput_bps": np.mean(rates),
                     "users_collected": info["collected"].sum(),
@@ -277,7 +281,7 @@ def flown_by_hand(scenario, one, actions):
                 }
             )
             before, _ = env.reset(seed=one.environment)
-            paid, rates, arrival, step = 0.0, [], None, 0
+            paid, rates, totals, arrival, step = 0.0, [], [], None, 0
         if t % limit == 0:
             episodes.append(missions)
             missions = []
@@ -294,6 +298,8 @@ def test_transitions_and_statistics_are_those_of_the_environment_for_the_same_ac
         {"form": "episode", "beta": 1.0, "zeta": 0.5, "r_plus": "binary"},
         {"form": "immediate", "r_plus": "binary"},
         {"form": "episode", "r_plus": "exponential", "data_scale_bits": 1e6},
+        {"form": "immediate", "r_plus": "exponential", "data": "step"},
+        {"form": "episode", "r_plus": "binary", "data_scale_bits": 4e5, "data": "step"},
     ]
     runs = [
         run(scenario, i, environment=20 + i, epsilon=0.3, episodes=8, **own) for i, own in enumerate(paid)

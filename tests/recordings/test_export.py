@@ -62,18 +62,20 @@ def rows_of(path):
         ]
 
 
-@pytest.mark.parametrize("format", ["parquet", "csv"])
-def test_tables_hold_the_values_of_the_environment(bag, tmp_path, capsys, format):
-    status, out = export(capsys, bag, "--out", tmp_path / "tables", "--format", format)
+@pytest.mark.parametrize(("format", "data"), [("parquet", "so_far"), ("csv", "so_far"), ("parquet", "step")])
+def test_tables_hold_the_values_of_the_environment(bag, tmp_path, capsys, format, data):
+    options = ("--out", tmp_path / "tables", "--format", format, "--reward-data", data)
+    status, out = export(capsys, bag, *options)
     assert status == 0
     n_users = TINY.n_users
     assert f"3 missions: 27 rows of steps, {27 * n_users} rows of users, 3 rows of missions" in out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tables"], "nothing else is left"
     steps, users, missions = (rows_of(tmp_path / "tables" / f"{name}.{format}") for name in TABLES)
-    env = DataCollectionEnv(TINY)
+    env = DataCollectionEnv(tiny(reward={"data": data}))
     for mission in range(MISSIONS):
         _, info = env.reset(seed=SEED + mission)
         total = paid = 0.0
+        totals = []
         for step in range(STEPS + 1):
             row = steps[mission * (STEPS + 1) + step]
             mine = users[(mission * (STEPS + 1) + step) * n_users :][:n_users]
@@ -97,11 +99,14 @@ def test_tables_hold_the_values_of_the_environment(bag, tmp_path, capsys, format
             if not last:
                 _, paid, _, _, info = env.step(act(mission, step))
                 total = paid  # the form is the episode's
+                totals.append(total)
         summary = missions[mission]
         assert summary["outcome"] == ("landed" if info["landed"] else "timeout") == row["phase"]
         assert (summary["seed"], summary["steps_flown"], summary["policy"]) == (SEED + mission, STEPS, "own")
         assert summary["users_collected"] == info["collected"].sum()
         assert summary["total_reward"] == total
+        assert summary["reward"] == (total if data == "so_far" else pytest.approx(np.mean(totals), rel=1e-12))
+        assert summary["reward_data"] == data
         rates = [one["sum_rate_bps"] for one in steps if one["mission"] == mission and one["step"]]
         assert summary["mean_sum_rate_bps"] == pytest.approx(np.mean(rates), rel=1e-12)
 
@@ -138,6 +143,13 @@ def test_what_is_missing_is_empty(bag, tmp_path, capsys):
     assert {row["sinr"] for row in mine} == {None}
     assert None not in {row["x_m"] for row in mine}
     assert [row["outcome"] for row in missions][1] == "unfinished"
+    # The mission's reward is of the steps that have one: not 3, for want of rates, nor 8, for want of a cell.
+    assert (missions[1]["total_reward"], missions[1]["reward"]) == (None, at[1, 7]["total_reward"])
+    assert export(capsys, holes, "--out", tmp_path / "step", "--reward-data", "step")[0] == 0
+    steps, missions = (rows_of(tmp_path / "step" / f"{name}.parquet") for name in ("steps", "missions"))
+    known = [row["total_reward"] for row in steps if row["mission"] == 1 and row["step"] not in (0, 3, 8)]
+    assert len(known) == 6
+    assert missions[1]["reward"] == pytest.approx(np.mean(known), rel=1e-12)
 
 
 def test_transitions_are_those_of_the_environment(bag, tmp_path, capsys):
@@ -149,16 +161,22 @@ def test_other_observations_and_the_immediate_reward(bag, tmp_path, capsys, obse
     check_transitions(capsys, bag, tmp_path / "t.npz", observation, "immediate")
 
 
-def check_transitions(capsys, bag, out, observation, form):
+@pytest.mark.parametrize("form", ["immediate", "episode"])
+def test_transitions_of_the_data_of_the_step(bag, tmp_path, capsys, form):
+    check_transitions(capsys, bag, tmp_path / "t.npz", "mission", form, "step")
+
+
+def check_transitions(capsys, bag, out, observation, form, data="so_far"):
     status, printed = export(
-        capsys, bag, "--transitions", "--out", out, "--observation", observation, "--reward-form", form
+        *(capsys, bag, "--transitions", "--out", out),
+        *("--observation", observation, "--reward-form", form, "--reward-data", data),
     )
     assert status == 0
     assert (
         f"24 transitions of {len(DataCollectionEnv(TINY, observation).reset(seed=0)[0])} numbers" in printed
     )
     made = np.load(out)
-    env = DataCollectionEnv(tiny(reward={"form": form}), observation)
+    env = DataCollectionEnv(tiny(reward={"form": form, "data": data}), observation)
     i = 0
     for mission in range(MISSIONS):
         seen, _ = env.reset(seed=SEED + mission)
@@ -175,6 +193,7 @@ def check_transitions(capsys, bag, out, observation, form):
     metadata = json.loads(str(made["metadata"]))
     assert metadata["scenario_fingerprint"] == TINY.fingerprint
     assert (metadata["observation"], metadata["reward"]["form"]) == (observation, form)
+    assert metadata["reward"]["data"] == data
     assert sorted(path.name for path in out.parent.iterdir()) == ["t.npz"], "nothing else is left"
 
 

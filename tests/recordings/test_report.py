@@ -14,7 +14,9 @@ from tests.nodes.conftest import SMALL
 from tests.recordings import report_bags
 from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag, files, scenarios
+from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core import world
+from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.nodes.view import markers
 from uav_dc_ros.recordings.pages import page as pages
 
@@ -47,14 +49,17 @@ def whats(data):
     return [(fault["source"], fault["what"]) for fault in data["data"]["health"]["faults"]]
 
 
-def test_the_page_of_missions_equals_the_summary_of_run_all(module_ros):
-    ros = module_ros
-    (ros.folder / "small.toml").write_text(SMALL)
-    saved(ros.folder / "untrained", scenarios.load(ros.folder / "small.toml"), name="untrained")
+@pytest.mark.parametrize("reading", ["so_far", "step"])
+def test_the_page_of_missions_equals_the_summary_of_run_all(ros, reading):
+    """And both the environment, by each reading of the reward. A file without one is of the data so far."""
+    scenario_file = ros.folder / "small.toml"
+    scenario_file.write_text(SMALL if reading == "so_far" else f'{SMALL}data = "{reading}"\n')
+    scenario = scenarios.load(scenario_file)
+    policy = policies.load(saved(ros.folder / "untrained", scenario, name="untrained"))
     # Two seconds: long enough for every node to publish its diagnostics.
     flown = ("--scenario", "small.toml", "--policy", "untrained", "--pace", 300, "--missions", 2)
-    status, output = ros.run_all(*flown, "--bag", "flown", "--summary", "summary.json")
-    assert status == 0, output
+    status, printed = ros.run_all(*flown, "--bag", "flown", "--summary", "summary.json")
+    assert status == 0, printed
     status, output = ros.run("uav_dc_ros.bag", "report", "flown")
     assert status == 0, output
     assert re.fullmatch(r"flown\.html: 2 missions, \d\.\d\d MB\n", output)
@@ -68,8 +73,23 @@ def test_the_page_of_missions_equals_the_summary_of_run_all(module_ros):
         for key in ("data_bits", "sum_rate_bps", "distance_m", "reward"):
             assert summary[key] == pytest.approx(wanted[key], rel=1e-12), key
     assert data["data"]["policy"] == "untrained"
-    for key in ("mission-0", "mission-1"):
-        assert [step["step"] for step in data[key]["steps"]] == list(range(31))
+    env = DataCollectionEnv(scenario)
+    for seed, summary in enumerate(summaries):
+        steps = data[f"mission-{seed}"]["steps"]
+        assert [step["step"] for step in steps] == list(range(31))
+        observation, _ = env.reset(seed=seed)
+        totals = []
+        for _ in steps[1:]:
+            observation, total, *_ = env.step(policy.act(observation))  # the form is the episode's
+            totals.append(total)
+        assert [step["reward"][2] for step in steps[1:]] == totals
+        expected = totals[-1] if reading == "so_far" else np.mean(totals)
+        assert summary["reward"] == pytest.approx(expected, rel=1e-12)
+        assert summary["reward_data"] == reading
+    status, verified = ros.run("uav_dc_ros.bag", "verify", "flown")
+    assert status == 0, verified
+    words = {"so_far": "r^t at the end", "step": "r^t, mean over the steps"}[reading]
+    assert f"\nreward: {words}\n" in printed
 
     health = data["data"]["health"]
     latencies = {topic["name"]: topic for topic in health["topics"]}
@@ -88,8 +108,9 @@ def test_the_page_of_missions_equals_the_summary_of_run_all(module_ros):
     assert not re.search(r"""(src|href)\s*=|url\(|https?:|//\w+\.\w+/|@import""", text), "a network address"
 
 
-def test_users_and_rewards_are_those_of_the_core(made):
-    scenario = tiny(mission={"r_min_bits": 4e6, "d_cons_m": 150.0})
+@pytest.mark.parametrize("reading", ["so_far", "step"])
+def test_users_and_rewards_are_those_of_the_core(made, reading):
+    scenario = tiny(mission={"r_min_bits": 4e6, "d_cons_m": 150.0}, reward={"data": reading})
     data = made(scenario, seeds=(5,))
     course, table = data["mission-0"]["steps"], data["mission-0"]["table"]
     flown = list(report_bags.states(scenario, 5))
@@ -103,7 +124,11 @@ def test_users_and_rewards_are_those_of_the_core(made):
         assert [int(letter) for letter in step["state"]] == wanted.tolist()
         by_data, by_place, total = step["reward"]
         assert total == pytest.approx(by_data + by_place, rel=1e-12)
-        assert total == pytest.approx(float(world.total_reward(scenario, state.cell, state.data_bits)))
+        counted = np.zeros(scenario.n_users)  # nothing is collected before the first move
+        if state.step:
+            counted = world.counted_data(scenario, link.served, link.rate_bps, state.data_bits)
+            assert total == float(state.total_reward)
+        assert total == pytest.approx(float(world.total_reward(scenario, state.cell, counted)))
     assert {letter for step in course for letter in step["state"]} == set("012"), "every state was seen"
     assert [at if at is not None else -1 for at in table["collected_at"]] == collected_at.tolist()
     served = np.asarray([link.served for _, link, _ in flown[1:]])
@@ -141,6 +166,23 @@ def test_faults_are_reported_and_a_good_bag_has_none(made):
     (node,) = data["data"]["health"]["nodes"]
     assert (node["warnings"], node["restarts"], node["reports"]) == (2, "2", 3)
     assert data["data"]["missions"][0]["outcome"] == "unfinished"
+
+
+@pytest.mark.parametrize("reading", ["so_far", "step"])
+def test_without_rates_the_data_so_far_is_the_last_known_and_that_of_the_step_unknown(made, reading):
+    scenario = tiny(reward={"data": reading})
+    data = made(scenario, leave_out=(("rates", 3),))
+    totals = [float(state.total_reward) for state, _, _ in report_bags.states(scenario, 0)]
+    found = [step["reward"][2] for step in data["mission-0"]["steps"]]
+    assert found[4:] == totals[4:]
+    summary = data["data"]["missions"][0]
+    assert summary["reward_data"] == reading
+    if reading == "so_far":
+        assert found[3] is not None
+        assert summary["reward"] == totals[-1]
+    else:
+        assert found[3] is None
+        assert summary["reward"] == pytest.approx(np.mean(totals[1:3] + totals[4:]), rel=1e-12)
 
 
 def test_latencies_are_those_of_the_recording(made):
@@ -256,6 +298,22 @@ def test_missions_of_a_bag_side_by_side(tmp_path):
     assert [group["label"] for group in groups] == ["mission 0", "mission 3", "mission 8"]
     assert [group["seeds"] for group in groups] == ["0", "3", "8"]
     assert groups[0]["metrics"]["reward"]["low"] is None, "of one mission there is no interval"
+
+
+def test_other_readings_of_the_reward_are_reported(tmp_path):
+    bags = [
+        report_bags.write(tmp_path / reading, tiny(reward={"data": reading}), seeds=(1, 2))
+        for reading in ("step", "so_far")
+    ]
+    out = tmp_path / "page.html"
+    for compared, words in (
+        (bags, "r^t, mean over the steps or r^t at the end"),
+        (bags[1:], "r^t at the end"),
+    ):
+        out.unlink(missing_ok=True)
+        assert report(compared[0], "--compare", *compared[1:], "--out", out) == 0
+        data = report_bags.unpacked(out)["data"]
+        assert (data["reward_words"], data["rewards_differ"]) == (words, len(compared) > 1)
 
 
 def test_other_worlds_are_reported_and_not_paired(tmp_path):

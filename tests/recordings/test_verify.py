@@ -1,5 +1,6 @@
 """`bag verify`: a clean flight verifies to the last bit, and whatever is changed in it is found."""
 
+import json
 import os
 import re
 import shutil
@@ -371,6 +372,15 @@ def without_step(recorded, scenario, number):
 
 def more_data(payload):
     return msgspec.structs.replace(payload, data_bits=[one + 1.0 for one in payload.data_bits])
+
+
+def test_a_bag_of_version_0_1_0_verifies(tmp_path, capsys):
+    """Its scenario has no reading of the data in the reward, and the same fingerprint."""
+    old = msgspec.to_builtins(TINY)
+    assert old["reward"].pop("data") == "so_far"
+    values = {"scenario_values": json.dumps(old)}
+    status, out = verify(capsys, write(tmp_path / "bag", flight(TINY), about(TINY, **values)))
+    assert (status, out.count("9 of 9 steps recomputed, equal to the last bit")) == (0, 2), out
 
 
 def test_a_recording_that_begins_late_two_flights_and_an_abort(tmp_path, capsys):

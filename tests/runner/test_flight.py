@@ -140,6 +140,7 @@ def test_the_summaries_are_the_environment_s_numbers(flown: Flown, simulated: li
             "sum_rate_bps": pytest.approx(np.mean([info["sum_rate_bps"] for info in steps[1:]])),
             "distance_m": pytest.approx(np.abs(metres).sum()),
             "reward": pytest.approx(last["reward"]),  # the episode form pays r^t itself
+            "reward_data": "so_far",
             "reason": "",
             "steps_not_reached": 0,
             "bag": str(flown.bag),

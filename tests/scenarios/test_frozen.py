@@ -24,6 +24,7 @@ OTHER = {
     "interference": "none",
     "r_plus": "binary",
     "form": "immediate",
+    "data": "step",
 }
 
 

@@ -102,7 +102,7 @@ def keys_of(name, table):
 def test_every_number_has_its_unit_in_the_key(name):
     """Keys without a unit are counts, ratios, names and powers of ten by their meaning."""
     bare = {"n_x", "n_y", "n_z", "users_per_cluster", "max_steps", "path_loss_exponent", "beta", "zeta"}
-    words = {"episode_end", "interference", "r_plus", "form"}
+    words = {"episode_end", "interference", "r_plus", "form", "data"}
     for table in ("grid", "users", "mission", "radio", "reward"):
         for key in keys_of(name, table):
             value = getattr(getattr(scenarios.load(name), table), key)

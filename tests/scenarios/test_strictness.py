@@ -163,6 +163,7 @@ def test_a_byte_order_mark_is_no_part_of_the_scenario(tmp_path):
             "radio.interference = 'al'; expected one of all, associated, none",
         ),
         ("form", 'form = "episodic"', "reward.form = 'episodic'; expected one of immediate, episode"),
+        ("data", 'data = "mean"', "reward.data = 'mean'; expected one of step, so_far"),
         ("r_plus", 'r_plus = "exp"', "reward.r_plus = 'exp'; expected one of binary, exponential"),
         (
             "episode_end",
@@ -267,7 +268,14 @@ def test_an_unknown_table(refused):
     assert refused(f"{TEXT}\n[missions]\n") == "unknown key missions = {}; did you mean 'mission'?"
 
 
-@pytest.mark.parametrize("path", LEAVES, ids=".".join)
+def test_a_scenario_without_the_data_of_the_reward_counts_the_data_so_far():
+    """As those of version 0.1.0 do; it is written in any case."""
+    scenario = parse(with_line("data", ""), "old.toml")
+    assert scenario == scenarios.load("three_clusters")
+    assert msgspec.to_builtins(scenario)["reward"]["data"] == "so_far"
+
+
+@pytest.mark.parametrize("path", [path for path in LEAVES if path != ("reward", "data")], ids=".".join)
 def test_a_missing_key(path):
     values = copy.deepcopy(VALUES)
     table = values if len(path) == 1 else values[path[0]]

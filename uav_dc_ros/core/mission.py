@@ -8,14 +8,19 @@ def served(distance_m: Array, collected: Array, d_cons_m: float) -> Array:
     return (distance_m <= d_cons_m) & ~collected
 
 
+def delivered(served: Array, rate_bps: Array, step_s: float) -> Array:
+    """Data that each user delivers in a step (eq. 4, the rate constant over a step), bit, `[..., U]`."""
+    return rate_bps * step_s * served
+
+
 def collect(
     data_bits: Array, collected: Array, served: Array, rate_bps: Array, step_s: float, r_min_bits: float
 ) -> tuple[Array, Array]:
-    """`data_bits` and `collected` after a step (eq. 4, the rate constant over a step), all `[..., U]`.
+    """`data_bits` and `collected` after a step, all `[..., U]`; see `delivered`.
 
     `served` is P of this step. A user counts as collected from `r_min_bits` to the end of the mission.
     """
-    data_bits = data_bits + rate_bps * step_s * served
+    data_bits = data_bits + delivered(served, rate_bps, step_s)
     return data_bits, collected | (data_bits >= r_min_bits)
 
 

@@ -23,7 +23,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Grid
 from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.radio import Interference
-from uav_dc_ros.core.reward import RewardForm, RPlus
+from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.errors import ScenarioError
 
 EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
@@ -92,6 +92,9 @@ class RewardSettings(_Table, frozen=True):
     r_plus: RPlus  # trajectory reward, see `reward.r_plus`
     form: RewardForm  # reward of a step, see `reward.step_reward`
     data_scale_bits: Positive  # data of a user that counts as 1 in the reward, bit
+    # Data R in r^t (eq. 7), see `reward.counted_data`. Scenarios of version 0.1.0, also those in policies,
+    # checkpoints and bags, lack the key: their data is the data so far.
+    data: RewardData = "so_far"
 
 
 class Scenario(_Table, frozen=True, dict=True):

@@ -35,6 +35,7 @@ class State:
     data_bits: Array  # data collected from each user, bit, `[..., U]`
     collected: Array  # bool `[..., U]`
     total_reward: Array  # r^t (eq. 7), `[...]`
+    mission_reward: Array  # reward of the mission so far, see `reward.mission_reward`, `[...]`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +67,7 @@ def initial(scenario: Scenario, draws: Array) -> State:
         data_bits=zeros,
         collected=zeros > 0.0,
         total_reward=zero,
+        mission_reward=zero,
     )
 
 
@@ -86,12 +88,22 @@ def collect(scenario: Scenario, link: Link, data_bits: Array, collected: Array) 
     return mission.collect(data_bits, collected, link.served, link.rate_bps, step_s, r_min_bits)
 
 
-def total_reward(scenario: Scenario, cell: Array, data_bits: Array, rewards: Rewards | None = None) -> Array:
-    """r^t (eq. 7), `[...]`, of a UAV in `cell` `[..., 3]` that holds `data_bits` `[..., U]`."""
+def counted_data(
+    scenario: Scenario, served: Array, rate_bps: Array, data_bits: Array, rewards: Rewards | None = None
+) -> Array:
+    """R of each user in r^t (eq. 7), bit, of a step that ends with `data_bits`, all `[..., U]`."""
+    delivered_bits = mission.delivered(served, rate_bps, scenario.mission.step_s)
+    return reward.counted_data(delivered_bits, data_bits, (rewards or scenario.reward).data)
+
+
+def total_reward(
+    scenario: Scenario, cell: Array, counted_bits: Array, rewards: Rewards | None = None
+) -> Array:
+    """r^t (eq. 7), `[...]`, of a UAV in `cell` `[..., 3]`; `counted_bits` is R of each user, `[..., U]`."""
     values = rewards or scenario.reward
-    distance = mission.dock_distance_cells(cell, scenario.dock_cell, like=data_bits)
+    distance = mission.dock_distance_cells(cell, scenario.dock_cell, like=counted_bits)
     return reward.total(
-        data_bits, reward.r_plus(distance, values.r_plus), values.beta, values.zeta, values.data_scale_bits
+        counted_bits, reward.r_plus(distance, values.r_plus), values.beta, values.zeta, values.data_scale_bits
     )
 
 
@@ -129,8 +141,11 @@ def step(
     uav_m = scenario.grid.centre_m(cell, like=users_m)
     link = measure(scenario, uav_m, users_m, state.collected)
     data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
-    total = total_reward(scenario, cell, data_bits, rewards)
+    values = rewards or scenario.reward
+    counted_bits = counted_data(scenario, link.served, link.rate_bps, data_bits, rewards)
+    total = total_reward(scenario, cell, counted_bits, rewards)
     n_steps = state.step + 1
+    n_rewards = array_namespace(total).astype(n_steps, total.dtype)
     terminated, truncated, landed = end_of_mission(scenario, n_steps, cell)
     after = State(
         step=n_steps,
@@ -139,9 +154,10 @@ def step(
         data_bits=data_bits,
         collected=collected,
         total_reward=total,
+        mission_reward=reward.mission_reward(state.mission_reward, total, n_rewards, values.data),
     )
     outcome = Outcome(
-        reward=reward.step_reward(total, state.total_reward, (rewards or scenario.reward).form),
+        reward=reward.step_reward(total, state.total_reward, values.form),
         terminated=terminated,
         truncated=truncated,
         landed=landed,

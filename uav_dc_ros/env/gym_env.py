@@ -34,8 +34,9 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         vector to each cluster and to the dock. The exact layout is in `core.observations`.
 
     Reward:
-        From r^t = beta * (data collected so far, mean over users, scaled) + zeta * R_plus (eq. 7):
-        either its change in this step (`reward.form = "immediate"`) or r^t itself (`"episode"`).
+        From r^t = beta * (data, mean over users, scaled) + zeta * R_plus (eq. 7), with the data delivered in
+        this step (`reward.data = "step"`) or collected so far (`"so_far"`): either its change in this step
+        (`reward.form = "immediate"`) or r^t itself (`"episode"`).
 
     Start:
         The UAV in the scenario's start cell; users uniform in their clusters' discs. In each step the

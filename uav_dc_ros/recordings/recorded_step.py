@@ -11,6 +11,7 @@ import numpy as np
 
 from uav_dc_ros import messages, payloads
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.reward import RewardData, mission_reward
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import FaultKind, Mission, Phase, Rates
 from uav_dc_ros.phases import BEFORE_START
@@ -140,6 +141,8 @@ class MissionTotals:
     collected: int | None = None  # users collected at the last rates
     users: int | None = None  # all users
     data_bits: float | None = None  # from all users at the last rates
+    reward: float | None = None  # of the mission, see `core.reward.mission_reward`
+    n_rewards: int = 0  # steps with a known r^t: the end is the last of them, and the mean is over them
     seed: int | None = None
     scenario: str | None = None
     fingerprint: str | None = None
@@ -148,6 +151,11 @@ class MissionTotals:
     def is_over(self) -> bool:
         """Whether the bag holds the end of the mission."""
         return self.outcome != UNFINISHED
+
+    def add_reward(self, total: float, data: RewardData) -> None:
+        """Add the r^t of the next step that has one."""
+        self.n_rewards += 1
+        self.reward = mission_reward(self.reward or 0.0, total, self.n_rewards, data)
 
     def add(self, step: int, status: Mission | None, rates: Rates | None) -> None:
         """Add the next step."""

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from uav_dc_ros import payloads
 from uav_dc_ros.core import observations, world
 from uav_dc_ros.core import reward as core_reward
 from uav_dc_ros.core.arrays import Array
@@ -78,8 +79,9 @@ class RecordedTransitions:
             return None
         observation = observations.encode(self._observation, self._scenario, **observed)
         cell, total = observed["cell"], 0.0
-        if step.step:  # a mission starts from r = 0, whatever R_plus its start cell has
-            total = float(world.total_reward(self._scenario, cell, observed["data_bits"]))
+        if step.step and step.rates:  # a mission starts from r = 0, whatever R_plus its start cell has
+            counted_bits = payloads.counted_data(step.rates, self._scenario)
+            total = float(world.total_reward(self._scenario, cell, counted_bits))
         return _State((step.flight, step.mission, step.step), cell, observation, total)
 
     def _action(self, cell: Array, after: Array, move: Action | None) -> Action | None:

@@ -9,7 +9,7 @@ from rich.progress import TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uav_dc_ros.cli import LiveDisplay
-from uav_dc_ros.core import world
+from uav_dc_ros.core import reward, world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission
 from uav_dc_ros.mission_summary import Summary
@@ -99,6 +99,7 @@ class MissionConsole(LiveDisplay):
                 f"{mission.reward:.3f}",
             )
         self.console.print(table)
+        self.console.print(f"reward: {reward.MISSION_REWARD[self.scenario.reward.data]}")
         if summaries and summaries[0].bag is not None:
             bag = Path(summaries[0].bag)
             if bag.is_relative_to(self._working_directory):

@@ -40,10 +40,6 @@ class MonitoredMission(MissionTotals):
 
     def summary(self, scenario: Scenario, policy: str, bag: str | None) -> Summary:
         """The result of a mission that is over."""
-        reward = 0.0
-        if self.rates is not None and self.steps:
-            data_bits, _ = payloads.collection(self.rates, scenario)
-            reward = float(world.total_reward(scenario, np.asarray(self.cell), data_bits))
         return Summary(
             scenario=scenario.name,
             policy=policy,
@@ -56,7 +52,8 @@ class MonitoredMission(MissionTotals):
             data_bits=self.data_bits or 0.0,
             sum_rate_bps=self.sum_of_sum_rates_bps / max(self.steps - self.unmeasured_steps, 1),
             distance_m=self.distance_m,
-            reward=reward,
+            reward=self.reward or 0.0,
+            reward_data=scenario.reward.data,
             reason=self.reason,
             bag=bag,
         )
@@ -203,6 +200,10 @@ class MissionMonitor(MissionNode):
         self.mission, self._position_m = now, position_m
         now.cell, now.rates = status.cell, rates
         now.add(status.step, status, rates)
+        if status.step:
+            counted_bits = payloads.counted_data(rates, self.scenario)
+            total = world.total_reward(self.scenario, np.asarray(status.cell), counted_bits)
+            now.add_reward(float(total), self.scenario.reward.data)
         self._on_step(now)
         if now.is_over:
             self._report_end(now)

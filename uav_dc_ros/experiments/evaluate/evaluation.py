@@ -11,6 +11,7 @@ import numpy as np
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.reward import MISSION_REWARD, RewardData
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.stats import interval
 from uav_dc_ros.core.world import Act, observe
@@ -54,7 +55,10 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     arrival_step: Figure  # step after which the UAV stayed over the dock; missions that landed only
     sum_rate_bps: Figure  # mean over the steps of a mission, bit/s
     data_bits: Figure  # data collected in a mission, bit
-    reward: Figure  # r^t at the end of a mission (eq. 7), with the weights of this scenario
+    reward_data: RewardData  # data in r^t (eq. 7) in this scenario
+    # Of a mission, with the weights of this scenario: r^t at its end with the data `so_far`, the mean of r^t
+    # over its steps with the data of the `step`
+    reward: Figure
     episode_return: Figure  # undiscounted sum of the agent's rewards
 
 
@@ -114,6 +118,7 @@ def evaluate_act(
         version=__version__,
         seeds=(seeds[0], len(seeds)),
         users_total=scenario.n_users,
+        reward_data=scenario.reward.data,
         **{figure: _figure(of_missions) for figure, of_missions in values.items()},
     )
     return EvaluatedMissions(evaluation=evaluation, values=values)
@@ -148,7 +153,7 @@ _SHOWN = {
     "arrival_step": ("arrival step", 1.0, 1),
     "sum_rate_bps": ("sum-rate, Mbit/s", 1e6, 3),
     "data_bits": ("data, Mbit", 1e6, 1),
-    "reward": ("reward r^t at the end", 1.0, 3),
+    "reward": ("reward", 1.0, 3),  # with the words of `MISSION_REWARD` behind it
     "episode_return": ("return", 1.0, 3),
 }
 TITLES = {name: title for name, (title, _, _) in _SHOWN.items()}
@@ -160,6 +165,8 @@ def rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
     table: list[tuple[str, ...]] = []
     for name, title in TITLES.items():
         figure: Figure = getattr(evaluation, name)
+        if name == "reward":
+            title = f"{title} {MISSION_REWARD[evaluation.reward_data]}"
         # Extremes of landings, which are 0 or 1, carry no information.
         extremes = ("", "") if name == "landing_rate" else (_text(name, figure.min), _text(name, figure.max))
         table.append((title, *mean_and_interval(name, figure), *extremes))

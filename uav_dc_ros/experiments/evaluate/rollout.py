@@ -29,7 +29,7 @@ class Missions:
     arrival_step: Array  # step after which the UAV stayed over the dock; NaN when it did not land
     sum_rate_bps: Array  # of the served users, mean over the steps
     data_bits: Array  # collected from all users
-    reward: Array  # r^t at the end (eq. 7)
+    reward: Array  # of the mission, see `core.reward.mission_reward`
     episode_return: Array  # undiscounted sum of the agent's rewards
 
 
@@ -99,7 +99,7 @@ def roll_out(
         arrival_step=np.where(landed, arrival, np.nan),
         sum_rate_bps=rate_sum / final.step,
         data_bits=np.sum(final.data_bits, axis=-1),
-        reward=final.total_reward,
+        reward=final.mission_reward,
         episode_return=episode_return,
     )
 

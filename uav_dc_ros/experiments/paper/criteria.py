@@ -19,8 +19,9 @@ MARGIN = 0.05
 # Fixed before any result of the sweep was seen.
 RULES = f"""\
 - **Performance** of a run is its mean over the last {FINAL:.0%} of its training episodes, exploration
-  included, as in the paper's curves. *Reward* is r^t (eq. 7) at the end of a mission. Its scale grows with
-  beta + zeta, so what compares or averages over ratios divides it by beta + zeta: the *reward share*.
+  included, as in the paper's curves. *Reward* is that of a mission: r^t (eq. 7) at its end with the data so
+  far, the mean of r^t over its steps with the data of the step. Its scale grows with beta + zeta, so what
+  compares or averages over ratios divides it by beta + zeta: the *reward share*.
 - **Convergence** is the episode from which on the reward's moving average over {SMOOTHING} points stays above
   start + {SETTLED:.0%} of (final - start), where start is the first point and final the performance. A run
   that does not rise, or does not stay there, gets the number of all episodes.

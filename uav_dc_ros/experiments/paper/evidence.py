@@ -27,7 +27,8 @@ class Evidence:
         middle                                reward after 40% to 60% of the episodes
         fluctuation                           of the reward from point to point, second half of the episodes
         reward_share, greedy_reward_share     reward / (beta + zeta)
-        common_share                          reward_share with the binary R_plus for all
+        common_share                          reward_share with the binary R_plus for all; as a mean over the
+                                              steps it leaves out steps over the dock before the arrival
     """
 
     def __init__(self, results: Results) -> None:
@@ -89,10 +90,12 @@ class Evidence:
         if measure.endswith("reward_share"):
             return self._of_runs(measure.removesuffix("_share")) / (beta + zeta)
         if measure == "common_share":
-            worlds = self.results.metadata.worlds
-            data_per_bps = np.array([worlds[run.setting.scenario].data_per_bps for run in planned])
-            data = self._of_runs("throughput_bps") * data_per_bps
-            return (beta * data + zeta * self._of_runs("landing_rate")) / (beta + zeta)
+            worlds = [self.results.metadata.worlds[run.setting.scenario] for run in planned]
+            data = self._of_runs("throughput_bps") * np.array([one.data_per_bps for one in worlds])
+            landed, max_steps = self._of_runs("landing_rate"), np.array([one.max_steps for one in worlds])
+            docked = (max_steps - self._of_runs("arrival_step") + landed) / max_steps  # share of the steps
+            r_plus = np.where([one.reward_data == "step" for one in worlds], docked, landed)
+            return (beta * data + zeta * r_plus) / (beta + zeta)
         raise TrainingError(f"no measure {measure!r}")
 
 

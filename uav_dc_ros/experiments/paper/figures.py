@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from uav_dc_ros import files
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.reward import MISSION_REWARD
 from uav_dc_ros.core.stats import interval
 from uav_dc_ros.env.render import FAINT, INK, PAPER, PATH_COLOURS, picture
 from uav_dc_ros.env.trajectory import Trajectory
@@ -27,10 +28,10 @@ from uav_dc_ros.experiments.paper.setting import Scale, Setting, domain, name
 _DPI, _PICTURE_DPI = 150, 100
 # Sizes in inches: of a panel, and of its margins.
 _WIDE, _HIGH, _LEFT, _RIGHT, _BELOW, _ABOVE = 5.3, 3.3, 0.75, 0.25, 0.6, 0.8
-# Metric: title of the axis, divisor.
+# Metric: title of the axis, divisor. The words of `MISSION_REWARD` replace r^t.
 _AXES = {
-    "reward": ("reward $r^t$ at the end of a mission", 1.0),
-    "reward_share": (r"reward $r^t\,/\,(\beta + \zeta)$", 1.0),
+    "reward": ("reward r^t of a mission", 1.0),
+    "reward_share": (r"reward r^t $/\,(\beta + \zeta)$", 1.0),
     "throughput_bps": ("throughput, Mbit/s", 1e6),
     "arrival_step": ("arrival step ($T_{cons}$ if not landed)", 1.0),
 }
@@ -108,10 +109,17 @@ def _panels(plan: FigurePlan, results: Results) -> Figure:
     return figure
 
 
+def _axis(metric: str, panel: Panel, evidence: Evidence) -> tuple[str, float]:
+    """Title and divisor of a metric's axis."""
+    title, unit = _AXES[metric]
+    data = evidence.results.metadata.worlds[panel.setting.scenario].reward_data
+    return title.replace("r^t", MISSION_REWARD[data].replace("r^t", "$r^t$")), unit
+
+
 def _curves(axes: Axes, panel: Panel, evidence: Evidence) -> None:
     """Mean over environments of smoothed curves, with its interval as a band."""
     episode = evidence.results.episode
-    title, unit = _AXES[panel.metric]
+    title, unit = _axis(panel.metric, panel, evidence)
     lines = panel.lines(evidence.scale)
     for line, look in zip(lines, _looks(lines, panel.vary), strict=True):
         mean, low, high = _bands(smooth(evidence.curves(panel.metric, line)) / unit)
@@ -124,7 +132,7 @@ def _curves(axes: Axes, panel: Panel, evidence: Evidence) -> None:
 def _ratios(axes: Axes, panel: Panel, evidence: Evidence) -> None:
     """Performance over the ratios, mean over environments with its interval as a bar."""
     metric = "reward_share" if panel.metric == "reward" else panel.metric
-    title, unit = _AXES[metric]
+    title, unit = _axis(metric, panel, evidence)
     ratios, lines = evidence.scale.ratios, panel.lines(evidence.scale)
     for i, (line, look) in enumerate(zip(lines, _looks(lines, panel.vary), strict=True)):
         mean, low, high = _bands(evidence.of(metric, line, "ratio") / unit)
@@ -138,7 +146,7 @@ def _ratios(axes: Axes, panel: Panel, evidence: Evidence) -> None:
 
 def _grid(axes: Axes, panel: Panel, evidence: Evidence) -> None:
     """Performance over gamma and epsilon, as a map; the paper's choice has a frame."""
-    title, unit = _AXES[panel.metric]
+    title, unit = _axis(panel.metric, panel, evidence)
     gammas, epsilons = (domain(axis, evidence.scale) for axis in panel.vary)
     measured = evidence.of(panel.metric, panel.setting, *panel.vary) / unit
     image = axes.imshow(measured.mean(axis=0), cmap=PATH_COLOURS, aspect="auto", origin="lower")

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from uav_dc_ros import files
+from uav_dc_ros.core.reward import DATA, MISSION_REWARD
 from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.experiments.paper.claims import Finding, check
@@ -25,13 +26,13 @@ _VERDICTS: dict[Verdict, str] = {
     "undecided": "are undecided",
     "not tested": "were not tested",
 }
-# Measure: title, divisor, decimals.
+# Measure: title, divisor, decimals. The words of `MISSION_REWARD` replace r^t.
 _UNITS = {
-    "reward": ("reward", 1.0, 3),
-    "reward_share": ("reward share", 1.0, 3),
-    "common_share": ("reward share with the binary R_plus for all", 1.0, 3),
-    "greedy_reward": ("reward of greedy missions", 1.0, 3),
-    "greedy_reward_share": ("reward share of greedy missions", 1.0, 3),
+    "reward": ("reward r^t", 1.0, 3),
+    "reward_share": ("reward share, r^t", 1.0, 3),
+    "common_share": ("reward share with the binary R_plus for all, r^t", 1.0, 3),
+    "greedy_reward": ("reward of greedy missions, r^t", 1.0, 3),
+    "greedy_reward_share": ("reward share of greedy missions, r^t", 1.0, 3),
     "throughput_bps": ("throughput, Mbit/s", 1e6, 4),
     "greedy_throughput_bps": ("throughput of greedy missions, Mbit/s", 1e6, 4),
     "users_collected": ("users collected", 1.0, 1),
@@ -41,7 +42,7 @@ _UNITS = {
     "arrival_step": ("arrival step, T_cons when not landed", 1.0, 1),
     "greedy_arrival_step": ("arrival step of greedy missions, T_cons when not landed", 1.0, 1),
     "convergence": ("convergence, episodes; all of them where it never converged", 1.0, 0),
-    "fluctuation": ("fluctuation of the reward", 1.0, 4),
+    "fluctuation": ("fluctuation of the reward r^t", 1.0, 4),
 }
 
 
@@ -93,6 +94,7 @@ def _provenance(results: Results) -> str:
     metadata, scale = results.metadata, results.metadata.scale
     minutes = f"{metadata.wall_time_s / 60:.1f} minutes" if metadata.wall_time_s else "interrupted, not timed"
     worlds = ", ".join(f"`{name}` {world.fingerprint}" for name, world in metadata.worlds.items())
+    data = ", ".join(f"`{name}` {DATA[world.reward_data]}" for name, world in metadata.worlds.items())
     environments = ", ".join(map(str, scale.environments))
     seeds = sorted({run.seed for run in results.planned})
     return f"""```
@@ -103,6 +105,7 @@ def _provenance(results: Results) -> str:
 - {len(results.planned)} runs of {scale.episodes} episodes; environments {environments}, in each
   {scale.repeats} run(s) of a setting; seeds {", ".join(map(str, seeds))}
 - worlds and their fingerprints: {worlds}
+- data in r^t (eq. 7): {data}
 - data: `runs.parquet`, `curves.parquet` (means over {scale.episodes_per_point} episodes);
   verdicts also in `{VERDICTS_FILE}`"""
 
@@ -152,15 +155,21 @@ def _criteria(criteria: Sequence[Criterion], verdict_title: str) -> str:
 def tables_md(evidence: Evidence, table: Table) -> list[str]:
     """A table in Markdown; with `columns`, one for each measure. Settings without runs are left out."""
     if table.columns is None:
-        header = [_UNITS[measure][0] for measure in table.measures]
+        header = [_title(measure, evidence, table) for measure in table.measures]
         return [_markdown(["", *header], _rows(evidence, table, table.measures))]
     header = [name(value) for value in domain(table.columns, evidence.scale)]
     sections = []
     for measure in table.measures:
-        title = _UNITS[measure][0]
+        title = _title(measure, evidence, table)
         text = _markdown(["", *header], _rows(evidence, table, [measure], table.columns))
         sections.append(f"**{title[0].upper()}{title[1:]}**\n\n{text}")
     return sections
+
+
+def _title(measure: str, evidence: Evidence, table: Table) -> str:
+    """A measure in words."""
+    data = evidence.results.metadata.worlds[table.setting.scenario].reward_data
+    return _UNITS[measure][0].replace("r^t", MISSION_REWARD[data])
 
 
 def _rows(evidence: Evidence, table: Table, measures: Sequence[str], *axes: str) -> list[list[str]]:

@@ -16,6 +16,7 @@ from pyarrow import parquet
 
 from uav_dc_ros import __version__, files
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.reward import RewardData
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper.setting import PlannedRun, Scale, Setting
@@ -58,10 +59,11 @@ class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     fingerprint: str  # hash of the scenario's values
     n_users: int
     max_steps: int
-    # The data term of r^t for a throughput of 1 bit/s over the whole mission, with beta = 1: seconds of a
-    # mission / (users x data_scale_bits). A mission flies all its steps, so the throughput determines the
-    # data term.
+    # The data term of a mission's reward for a throughput of 1 bit/s and beta = 1: seconds whose data counts
+    # in r^t (of the mission, of a step) / (users x data_scale_bits). A mission flies all its steps, so the
+    # throughput determines the data term.
     data_per_bps: float
+    reward_data: RewardData = "so_far"  # data in r^t; results of version 0.1.0 lack it
 
     @classmethod
     def of(cls, scenario: Scenario) -> "ScenarioFacts":
@@ -72,11 +74,14 @@ class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
                 f"{scenario.name}: mission.episode_end = {mission.episode_end!r}; expected 'at_time_limit', "
                 "or missions of different lengths would be compared"
             )
+        reward_data = scenario.reward.data
+        counted_s = (1 if reward_data == "step" else mission.max_steps) * mission.step_s
         return cls(
             fingerprint=scenario.fingerprint,
             n_users=n_users,
             max_steps=mission.max_steps,
-            data_per_bps=mission.max_steps * mission.step_s / (n_users * scenario.reward.data_scale_bits),
+            data_per_bps=counted_s / (n_users * scenario.reward.data_scale_bits),
+            reward_data=reward_data,
         )
 
 

@@ -10,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 
 from uav_dc_ros import files
 from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments.train.population import Population
 from uav_dc_ros.experiments.train.training import Training
 
 _FORMAT = 1
@@ -46,7 +47,8 @@ def restore(path: Path, training: Training) -> dict[str, Any]:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a dict
         if values["format"] != _FORMAT:
             raise TrainingError(f"{path}: format is {values['format']}; expected {_FORMAT}")
-        saved = dict(_flat(values["population"]))
+        # Converted, it has the defaults of keys that it was saved without.
+        saved = dict(_flat(msgspec.to_builtins(msgspec.convert(values["population"], Population))))
         expected = dict(_flat(msgspec.to_builtins(training.population)))
         for key in expected | saved:
             refuse_other(path, key, saved.get(key, "absent"), expected.get(key, "absent"))

@@ -16,7 +16,7 @@ from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import network, policy
 from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Algorithm, Hyperparameters, PolicyConfig
 from uav_dc_ros.core.observations import Observation
-from uav_dc_ros.core.reward import RewardForm, RPlus
+from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act, save_mission_picture
@@ -42,7 +42,14 @@ _LEARNING_OPTIONS = {
     "buffer_size": "transitions that the replay buffer holds",
 }
 # Options that replace a value of the scenario's reward, and its key.
-_REWARD_OPTIONS = {"beta": "beta", "zeta": "zeta", "r_plus": "r_plus", "reward_form": "form"}
+_REWARD_OPTIONS = {
+    "beta": "beta",
+    "zeta": "zeta",
+    "r_plus": "r_plus",
+    "reward_form": "form",
+    "reward_data": "data",
+    "data_scale_bits": "data_scale_bits",
+}
 
 
 class _Progress(msgspec.Struct):
@@ -97,6 +104,10 @@ def options_parser() -> cli.Parser:
     reward.add_argument("--zeta", metavar="X", type=float, help="weight of R_plus", **instead)
     reward.add_argument("--r-plus", choices=get_args(RPlus), help="shape of R_plus", **instead)
     reward.add_argument("--reward-form", choices=get_args(RewardForm), help="reward of a step", **instead)
+    data = "data in r^t (eq. 7): of the step, or so far"
+    reward.add_argument("--reward-data", choices=get_args(RewardData), help=data, **instead)
+    scale = "data of a user that counts as 1 in r^t, bit"
+    reward.add_argument("--data-scale-bits", metavar="X", type=float, help=scale, **instead)
     return parser
 
 

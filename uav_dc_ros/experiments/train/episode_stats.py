@@ -11,7 +11,7 @@ from uav_dc_ros.core.world import Outcome, State
 
 # Means over the missions that ended in an episode, exploration included; NaN where none ended.
 CURVES = (
-    "reward",  # r^t at the end of a mission (eq. 7)
+    "reward",  # of a mission, see `core.reward.mission_reward`
     "episode_return",  # undiscounted
     "throughput_bps",  # sum-rate of the served users, mean over the steps, bit/s
     "users_collected",
@@ -49,7 +49,7 @@ class EpisodeStats:
         """Adds the missions in `ended`, bool `[N]`, to the episode."""
         xp, dtype = self._xp, self._zero.dtype
         values = [
-            state.total_reward,
+            state.mission_reward,
             self._return,
             self._rate_bps / xp.astype(state.step, dtype),
             xp.astype(xp.sum(state.collected, axis=-1), dtype),

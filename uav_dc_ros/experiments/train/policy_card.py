@@ -2,6 +2,7 @@
 
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
+from uav_dc_ros.core import reward
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate.evaluation import COLUMNS, TEST_SEEDS, evaluate, rows
 from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay
@@ -88,4 +89,5 @@ The best policy until episode {config.episode}, from the run with seed {config.s
 
 def _reward(scenario: Scenario) -> str:
     values = scenario.reward
-    return f"beta {values.beta:g}, zeta {values.zeta:g}, {values.r_plus} R_plus, {values.form} form"
+    weights = f"beta {values.beta:g}, zeta {values.zeta:g}"
+    return f"{weights}, {values.r_plus} R_plus, {values.form} form, {reward.DATA[values.data]}"

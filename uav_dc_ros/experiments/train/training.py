@@ -175,7 +175,10 @@ class Training:
 
         self.learner.restore(part("learner"))
         self._buffer.restore(part("buffer"))
-        self._worlds.state = world.State(**in_worlds("world"))
+        state = in_worlds("world")
+        # Checkpoints of version 0.1.0 lack it. Their data is that so far.
+        state.setdefault("mission_reward", state["total_reward"])
+        self._worlds.state = world.State(**state)
         self._stats.restore(in_worlds("books"))
         self.n_flown = values["n_flown"]
         self._curves[: self.n_flown] = arrays["curves"].numpy()
@@ -194,4 +197,5 @@ def rewards(runs: Sequence[Run], array: Callable[[np.ndarray], Array]) -> Reward
         **weights,
         r_plus=array(np.array([term.r_plus == "exponential" for term in terms])),
         form=array(np.array([term.form == "episode" for term in terms])),
+        data=array(np.array([term.data == "step" for term in terms])),
     )

@@ -18,7 +18,7 @@ from uav_dc_ros import __version__, files
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.observations import Observation
-from uav_dc_ros.core.reward import RewardForm
+from uav_dc_ros.core.reward import DATA, MISSION_REWARD, RewardData, RewardForm
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.recordings import step_reader
@@ -28,6 +28,7 @@ from uav_dc_ros.recordings.step_reader import EXTERNAL, Steps
 from uav_dc_ros.recordings.transitions import RecordedTransitions, Transition
 
 ALL = tuple(table_columns(EXTERNAL))
+_REWARDS = "; ".join(f"{data}: {words}" for data, words in MISSION_REWARD.items())
 EPILOG = f"""\
 Tables go into a new folder, one file each, one observation a row:
   steps     a row per step: pose, cell, phase, action, sum-rate, data, rewards
@@ -36,7 +37,9 @@ Tables go into a new folder, one file each, one observation a row:
   phases    real vehicles only: a row per phase report, with reason and time
 For a real vehicle, steps also hold the reason of the phase and the duration of the move that led there;
 missions hold the vehicle, the reason of the end, and the number of flown steps that did not reach their cell.
-Units are in the names of columns. Rewards are computed from recorded cells and data.
+Units are in the names of columns. Rewards are computed from recorded cells, rates and data. The reward of a
+mission depends on the data in r^t (reward_data): {_REWARDS}. Steps without a known r^t are
+left out.
 
 Transitions go into a new .npz file for numpy.load: observation, next_observation (float32 [T, D]),
 action (int64 [T]), reward (float64 [T]), terminated, truncated (bool [T]); flight, mission, step (int64 [T]),
@@ -58,6 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--transitions", action="store_true", help="write transitions (s, a, r, s', terminated), no tables")
     add("--observation", choices=get_args(Observation), help="of transitions (default: mission)")
     add("--reward-form", choices=get_args(RewardForm), help="reward form instead of the scenario's")
+    add("--reward-data", choices=get_args(RewardData), help="data in r^t instead of the scenario's")
     add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the mission, for a bag with several")
 
@@ -82,9 +86,9 @@ def run(options: argparse.Namespace) -> int:
     with BagReader(options.bag) as reader:
         namespace = step_reader.namespace(reader, options.namespace)
         scenario = step_reader.scenario(reader, namespace, options.scenario)
-        if options.reward_form:
-            reward = msgspec.structs.replace(scenario.reward, form=options.reward_form)
-            scenario = msgspec.structs.replace(scenario, reward=reward)
+        given = {"form": options.reward_form, "data": options.reward_data}
+        own = {key: value for key, value in given.items() if value is not None}
+        scenario = msgspec.structs.replace(scenario, reward=msgspec.structs.replace(scenario.reward, **own))
         recorded = Steps(reader, namespace, scenario.step_ns)
         if options.transitions:
             _write_transitions(options, recorded, scenario)
@@ -178,8 +182,11 @@ def _write_transitions(options: argparse.Namespace, recorded: Steps, scenario: S
         arrays: dict[str, Any] = {name: np.memmap(scratch / name, kind, "r") for name, kind in kinds.items()}
         with (scratch / "result").open("wb") as result:
             np.savez_compressed(result, **arrays, metadata=np.asarray(json.dumps(metadata)))
-    size, form = observations.size(observation, scenario), scenario.reward.form
-    print(f"{options.out}: {n} transitions of {size} numbers ({observation!r}), reward form {form!r}")
+    size, reward = observations.size(observation, scenario), scenario.reward
+    print(
+        f"{options.out}: {n} transitions of {size} numbers ({observation!r}), reward form {reward.form!r}, "
+        f"{DATA[reward.data]}"
+    )
     if transitions.deduced:
         print(
             f"  {transitions.deduced} actions are deduced from the cells: no move was recorded, or not flown"

@@ -40,7 +40,7 @@ TABLES: dict[str, Columns] = {
         "phase": "text", "remaining_steps": "int", "action": "text",
         "sum_rate_bps": "float", "users_served": "int", "users_collected": "int",
         "data_bits": "float",  # of all users
-        "total_reward": "float", "reward": "float",  # r^t (eq. 7), and the reward of the step
+        "total_reward": "float", "reward": "float",  # r^t (eq. 7), and the agent's reward for the step
     },
     "users": {
         **_SOURCE,
@@ -55,7 +55,9 @@ TABLES: dict[str, Columns] = {
         "steps_flown": "int", "steps_recorded": "int", "first_received_ns": "int", "last_received_ns": "int",
         "users_total": "int", "users_collected": "int", "data_bits": "float",
         "mean_sum_rate_bps": "float",  # over the flown steps that have one
-        "total_reward": "float",
+        "total_reward": "float",  # r^t at the last step
+        "reward": "float",  # of the mission, over the steps with a known r^t: `core.reward.mission_reward`
+        "reward_data": "text",  # data in r^t: step, so_far
     },
 }
 # Further columns of flights with a real vehicle.
@@ -141,7 +143,9 @@ class MissionRows:
             if step.rates is None or step.status is None:
                 return None, None
             cell = np.asarray(step.status.cell)
-            total = float(world.total_reward(self._scenario, cell, np.asarray(step.rates.data_bits)))
+            counted_bits = payloads.counted_data(step.rates, self._scenario)
+            total = float(world.total_reward(self._scenario, cell, counted_bits))
+            self._totals.add_reward(total, self._scenario.reward.data)
         self._total = step.step, total
         if before is None or before[0] != step.step - 1:
             return total, None
@@ -182,6 +186,8 @@ class MissionRows:
             "data_bits": totals.data_bits,
             "mean_sum_rate_bps": float(np.mean(self._sum_rates)) if self._sum_rates else None,
             "total_reward": self._total and self._total[1],
+            "reward": totals.reward,
+            "reward_data": self._scenario.reward.data,
             "vehicle": self._vehicle,
             "reason": totals.reason if known else None,
             "steps_not_reached": totals.steps_not_reached if known else None,

@@ -1,10 +1,10 @@
 // Missions or policies side by side.
 
 // Key, words, unit, digits; with a null for digits: three significant ones, and an SI prefix.
-const METRICS = [
+const METRICS = (rewardWords) => [
   ["landed", "landed", "%", 0], ["users_collected", "users collected", "", 1], ["data_bits", "data", "bit", null],
   ["sum_rate_bps", "mean sum-rate", "bit/s", null], ["distance_m", "distance flown", "m", null], ["steps", "steps", "", 1],
-  ["reward", "reward", "", 3],
+  ["reward", `reward ${rewardWords}`, "", 3],
 ];
 // Okabe and Ito's colours without yellow, which is invisible on paper. Dashes distinguish groups without colour.
 const SHADES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c7853", "#7f7f9f"];
@@ -12,6 +12,7 @@ const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "5
 
 open(async (page, data) => {
   const { groups, world } = data;
+  const metrics = METRICS(data.reward_words);
   const one = groups.every((group) => group.missions === 1);
   const policies = [...new Set(groups.map((group) => group.policy))];
   page.querySelector("header").prepend(make("div", {}, page.querySelector("h1"),
@@ -48,7 +49,7 @@ open(async (page, data) => {
     one ? { name: "seed", text: (row) => row.seeds || NONE, value: (row) => Number(row.seeds) }
       : { name: "missions", text: (row) => cell(String(row.missions), make("div", { class: "range" }, row.seeds && `seed ${row.seeds}`)), value: (row) => row.missions },
   ];
-  const figures = METRICS.map(([metric, words, unit, digits]) => ({
+  const figures = metrics.map(([metric, words, unit, digits]) => ({
     name: words, text: (row) => range(row.metrics[metric], unit, digits), value: (row) => row.metrics[metric].mean,
   }));
   const paired = groups.filter((group) => group.paired);
@@ -60,7 +61,7 @@ open(async (page, data) => {
         paired.length ? card(`Difference to ${groups[0].label}, seed by seed`, table([
           { name: "bag", text: (row) => name(groups.indexOf(row)), value: (row) => row.label },
           { name: "seeds in common", text: (row) => String(row.paired.seeds), value: (row) => row.paired.seeds },
-          ...METRICS.map(([metric, words, unit, digits]) => ({
+          ...metrics.map(([metric, words, unit, digits]) => ({
             name: words, text: (row) => range(row.paired.differences[metric], unit, digits, "+"), value: (row) => row.paired.differences[metric].mean,
           })),
         ], paired, { label: "Paired differences", caption: "Equal seeds give equal users at equal positions. An interval without zero is a significant difference." })) : null)),
@@ -72,7 +73,7 @@ open(async (page, data) => {
         make("div", { class: "stack" },
           card("Users collected", make("div", { class: "chart", id: "n_collected" })),
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum_rate_bps" })),
-          card("Reward so far, r of eq. 7", make("div", { class: "chart", id: "reward" }))))),
+          card("Reward r^t of each step (eq. 7)", make("div", { class: "chart", id: "reward" }))))),
     make("footer", {}, `After its end a mission keeps its values, at rate 0. ${one ? "" : "Bands are 95% bootstrap intervals of the mean. "}At most 20 paths of a bag are drawn. World ${world.name} ${world.fingerprint} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`));
 
   function drawScene() {

@@ -15,6 +15,7 @@ from uav_dc_ros import __version__
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import stats
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.reward import MISSION_REWARD
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.messages import Phase
@@ -135,6 +136,9 @@ def page(
         "steps": axis.tolist(),
         "worlds_differ": len({group.scenario.fingerprint for group in groups}) > 1,
         "rewards_differ": len({repr(group.scenario.reward) for group in groups}) > 1,
+        "reward_words": " or ".join(
+            dict.fromkeys(MISSION_REWARD[one.scenario.reward.data] for one in groups)
+        ),
         "groups": [group.data(first, axis) for group in groups],
     }
     made = Page("compare", title)

@@ -40,8 +40,8 @@ open(async (page, data) => {
         make("div", { class: "stack" },
           card("Users collected", make("div", { class: "chart", id: "collected" })),
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum-rate" })),
-          card("Reward so far, r of eq. 7", make("div", { class: "chart", id: "reward" }),
-            make("ul", { class: "legend" }, key("ink", "total"), key("accent", `data: β = ${world.beta} × mean data / ${si(world.data_scale_bits, "bit")}`),
+          card("Reward r^t of each step (eq. 7)", make("div", { class: "chart", id: "reward" }),
+            make("ul", { class: "legend" }, key("ink", "total"), key("accent", `data: β = ${world.beta} × mean ${world.data_words} / ${si(world.data_scale_bits, "bit")}`),
               key("warm", `trajectory: ζ = ${world.zeta} × R₊ (${world.r_plus})`))))),
       make("div", { class: "card transport" }, play, make("div", { class: "slide" }, make("label", { for: "step" }, "Step"), slider), position)),
     make("section", { "aria-labelledby": "users-title" },
@@ -246,7 +246,7 @@ open(async (page, data) => {
       ["distance flown", ...si(one.distance_m, "m").split(" ")],
       ["steps", `${one.steps}`, `of ${world.max_steps}`],
       ...(one.steps_not_reached ? [["steps not reached", `${one.steps_not_reached}`, `of ${one.steps}`, "bad"]] : []),
-      ["reward", fixed(one.reward, 3)],
+      [`reward ${world.reward_words}`, fixed(one.reward, 3)],
     ]));
     at("why").hidden = !one.reason || landed;
     at("why").textContent = one.reason ? `${one.outcome}: ${one.reason}` : "";
@@ -306,7 +306,7 @@ open(async (page, data) => {
         { name: "data", text: (row) => si(row.data_bits, "bit"), value: by("data_bits") },
         { name: "mean sum-rate", text: (row) => si(row.sum_rate_bps, "bit/s"), value: by("sum_rate_bps") },
         { name: "distance", text: (row) => si(row.distance_m, "m"), value: by("distance_m") },
-        { name: "reward", text: (row) => fixed(row.reward, 3), value: by("reward") },
+        { name: `reward ${world.reward_words}`, text: (row) => fixed(row.reward, 3), value: by("reward") },
       ], data.missions, { label: "Missions" })));
   }
 

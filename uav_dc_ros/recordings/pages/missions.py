@@ -40,6 +40,7 @@ class MissionData:
         self.faults: Counter[str] = Counter()  # missing or contradictory messages, by text
         self.last_ns = 0  # log time of the latest message
         self._data_bits: Array = np.zeros(n_users)
+        self._counted_bits: Array = np.zeros(n_users)  # R in r^t (eq. 7); NaN where unknown
         self._collected: Array = np.zeros(n_users, dtype=bool)
         self._distance_m = 0.0  # length of the path flown
         self._shown = spread(n_users, USERS_MAX)
@@ -74,6 +75,10 @@ class MissionData:
         self.totals.add(step.step, status, rates)
         if rates is not None:
             self._add_rates(step.step, rates)
+        elif self.scenario.reward.data == "step":
+            self._counted_bits = np.full_like(self._counted_bits, math.nan)
+        if step.step and not math.isnan(total := self._rewards()[2]):
+            self.totals.add_reward(total, self.scenario.reward.data)
         self._keep(step, self._move(step.position_m, status if step.is_measured else None), users, rates)
 
     @property
@@ -97,14 +102,15 @@ class MissionData:
             "data_bits": float(self._data_bits.sum()),
             "sum_rate_bps": total / max(n, 1),
             "distance_m": self._distance_m,
-            "reward": self._rewards()[2] if totals.steps else 0.0,
+            "reward": (math.nan if totals.steps else 0.0) if totals.reward is None else totals.reward,
+            "reward_data": self.scenario.reward.data,
         }
 
     def _rewards(self) -> tuple[float, float, float]:
-        """The data and trajectory terms of r^t (eq. 7), and r^t; NaN without a cell."""
+        """The data and trajectory terms of r^t (eq. 7), and r^t; NaN where unknown."""
         if self._cell is None:
             return math.nan, math.nan, math.nan
-        weights, data_bits = self.scenario.reward, self._data_bits
+        weights, data_bits = self.scenario.reward, self._counted_bits
         distance = mission.dock_distance_cells(self._cell, self.scenario.dock_cell, like=data_bits)
         trajectory = weights.zeta * reward.r_plus(distance, weights.r_plus)
         data = reward.total(data_bits, np.zeros(()), weights.beta, weights.zeta, weights.data_scale_bits)
@@ -154,6 +160,7 @@ class MissionData:
         self._data_bits, self._collected = data_bits, collected
         if step == 0:
             return  # nothing is collected before the first move
+        self._counted_bits = payloads.counted_data(rates, self.scenario)
         self._sum_rates_bps[0] += rates.sum_rate_bps
         self._sum_rates_bps[1] += 1
         served = np.asarray(rates.served, dtype=bool)

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from uav_dc_ros.core import radio
+from uav_dc_ros.core import radio, reward
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 
@@ -57,6 +57,8 @@ def world_data(scenario: Scenario) -> dict[str, Any]:
         **msgspec.to_builtins(grid),
         **msgspec.to_builtins(mission),
         **msgspec.to_builtins(scenario.reward),
+        "data_words": reward.DATA[scenario.reward.data],
+        "reward_words": reward.MISSION_REWARD[scenario.reward.data],
         "name": scenario.name,
         "fingerprint": scenario.fingerprint,
         "users": scenario.n_users,
