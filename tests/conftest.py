@@ -47,13 +47,16 @@ LONGEST_FIRST = ("test_house_rules.py", "nodes", "runner", "experiments", "offbo
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest first; the tests of a file stay together."""
+    """Put the longest first; the tests of a file stay together. Give long tests time."""
 
     def rank(item: pytest.Item) -> int:
         place = item.path.relative_to(ROOT / "tests").parts[0]
         return LONGEST_FIRST.index(place) if place in LONGEST_FIRST else len(LONGEST_FIRST)
 
     items.sort(key=rank)
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(pytest.mark.timeout(3600))
 
 
 class Ros:
