@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.fake_autopilot.streaming import off_beat_ms
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
-from uav_dc_ros.offboard.realtime import use_realtime_priority
+from uav_dc_ros.offboard.setpoint_stream import use_realtime_priority
 
 AIM_MS = 10.0
 

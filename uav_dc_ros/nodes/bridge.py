@@ -28,7 +28,7 @@ from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.plausibility import PlausibilityFilter
 from uav_dc_ros.offboard.mission.progress import Checkpoint
-from uav_dc_ros.offboard.realtime import use_realtime_priority
+from uav_dc_ros.offboard.setpoint_stream import use_realtime_priority
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry, Vehicle
 from uav_dc_ros.topics import TOPICS
 

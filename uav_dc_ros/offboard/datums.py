@@ -37,11 +37,7 @@ class SavedDatum(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def folder() -> Path:
-    """Folder of the saved datums.
-
-    Raises:
-        ParameterError: the user has no home folder, and the environment names no other.
-    """
+    """Folder of the saved datums; raises ParameterError if there is no home folder, nor another named."""
     path = os.environ.get("STATE_DIRECTORY", "").split(":")[0] or os.environ.get("XDG_STATE_HOME", "")
     if not Path(path).is_absolute():
         try:
@@ -54,11 +50,7 @@ def folder() -> Path:
 
 
 def last(scenario: Scenario) -> SavedDatum | None:
-    """Datum of the last flight in a scenario's world; None: there was no flight.
-
-    Raises:
-        ParameterError: its file cannot be read.
-    """
+    """Datum of the last flight in a scenario's world; None: no flight. ParameterError: it cannot be read."""
     path = folder() / f"{scenario.fingerprint}.json"
     try:
         saved = msgspec.json.decode(path.read_bytes(), type=SavedDatum)
@@ -73,11 +65,7 @@ def last(scenario: Scenario) -> SavedDatum | None:
 
 
 def save(scenario: Scenario, datum: Geodetic, vehicle: str) -> None:
-    """Save the datum of the flight that begins.
-
-    Raises:
-        UavDcError: the file cannot be written.
-    """
+    """Save the datum of the flight that begins; raises UavDcError if the file cannot be written."""
     time = datetime.now(UTC).isoformat(timespec="seconds")
     saved = SavedDatum(scenario=scenario.name, datum=str(datum), vehicle=vehicle, time=time)
     path = folder() / f"{scenario.fingerprint}.json"
@@ -91,13 +79,8 @@ def save(scenario: Scenario, datum: Geodetic, vehicle: str) -> None:
 def parse(text: str, scenario: Scenario, vehicle: str, *, arm: bool = False) -> Geodetic | None:
     """Datum given by an option or parameter; None: the position of the vehicle on the ground gives it.
 
-    Args:
-        text: `here`, `last` or LAT,LON,ALT; empty: as `here`, but not with `arm`.
-        vehicle: transport to the autopilot.
-
-    Raises:
-        ParameterError: there is no last flight, or none that fits; `arm` without a datum.
-        VehicleError: the text is not a datum.
+    The text is `here`, `last` or LAT,LON,ALT; empty is as `here`, but not with `arm`. Raises ParameterError
+    if no last flight fits `vehicle`, the transport, or `arm` has no datum; VehicleError if the text is none.
     """
     if arm and not text:
         raise ParameterError(f"arm: without a datum; expected one with it: {_offer(scenario)}")
@@ -122,8 +105,7 @@ def parse(text: str, scenario: Scenario, vehicle: str, *, arm: bool = False) -> 
 def describe(datum: Geodetic, source: str, scenario: Scenario) -> tuple[str, bool]:
     """Position of the grid, its source and its distance from the last flight's; and whether it has moved.
 
-    Args:
-        source: text of the option, see `parse`; empty: an earlier start of the bridge in this flight.
+    `source` is the text of the option, see `parse`; empty: an earlier start of the bridge in this flight.
     """
     sources = {
         HERE: "from the vehicle's position",

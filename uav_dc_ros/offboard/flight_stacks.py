@@ -61,9 +61,7 @@ class FlightStack:
     def estimate_ok(self, flags: int, health: int, armed: bool) -> bool:
         """Whether the autopilot trusts its position enough to fly by it, or, disarmed, to arm.
 
-        Args:
-            flags: of `estimate_message`.
-            health: `onboard_control_sensors_health` of SYS_STATUS.
+        Flags: of `estimate_message`. Health: `onboard_control_sensors_health` of SYS_STATUS.
         """
         if flags & CONST_POS_MODE:
             return False

@@ -4,12 +4,12 @@ The origin of the grid's ENU frame is its *datum*: the grid's corner on the grou
 The origin of the autopilot's local NED frame is mostly the place where it was switched on.
 """
 
-import importlib
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.offboard.extras import load
 
 MAX_ALTITUDE_M = 10_000.0
 EQUATOR_M, SQUARED_ECCENTRICITY = 6_378_137.0, 6.694379990141e-3  # of WGS84
@@ -24,11 +24,7 @@ class Enu(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse `EAST,NORTH,UP`, metres.
-
-        Raises:
-            VehicleError: the text is not three finite numbers.
-        """
+        """Parse `EAST,NORTH,UP`, metres; raises VehicleError if the text is not three finite numbers."""
         try:
             position = cls(*map(float, text.split(",")))
         except (TypeError, ValueError):
@@ -74,10 +70,7 @@ def to_enu(position: Ned) -> Enu:
 
 
 def tilt_rad(w: float, x: float, y: float, z: float) -> float | None:
-    """Angle between body z axis and vertical, 0 to pi, of an attitude quaternion (ENU or NED).
-
-    None: the quaternion is not a unit quaternion.
-    """
+    """Angle between body z axis and vertical, 0 to pi, of a quaternion (ENU or NED); None: not a unit one."""
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.9 < length < 1.1:
         return None
@@ -93,11 +86,7 @@ class Geodetic(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse `LATITUDE,LONGITUDE,ALTITUDE`, degrees and metres.
-
-        Raises:
-            VehicleError: the text has another form, or a value is out of range.
-        """
+        """Parse `LATITUDE,LONGITUDE,ALTITUDE`, degrees and metres; raises VehicleError if it is not that."""
         try:
             point = cls(*map(float, text.split(",")))
         except (TypeError, ValueError):
@@ -116,11 +105,11 @@ class Geodetic(NamedTuple):
 
     def enu_from(self, datum: Self) -> Enu:
         """Position of this point in the ENU frame of a datum, exact on WGS84."""
-        return Enu(*map(float, _pymap3d().geodetic2enu(*self, *datum)))
+        return Enu(*map(float, load("pymap3d", "a datum needs pymap3d").geodetic2enu(*self, *datum)))
 
     def at(self, offset: Enu) -> Self:
         """Point at an offset in this point's ENU frame."""
-        return type(self)(*map(float, _pymap3d().enu2geodetic(*offset, *self)))
+        return type(self)(*map(float, load("pymap3d", "a datum needs pymap3d").enu2geodetic(*offset, *self)))
 
 
 NO_SCALE = Enu(1.0, 1.0, 1.0)
@@ -131,14 +120,10 @@ class LocalFrame:
     """Transform between the grid's ENU frame and an autopilot's local NED frame, metres.
 
     The axes are taken as parallel: within two kilometres the error is less than 0.3 m.
-
-    Attributes:
-        origin: origin of the autopilot's frame, in the grid's ENU frame.
-        scale: the autopilot's metres in one metre, east, north and up; see `sphere_scale`.
     """
 
-    origin: Enu
-    scale: Enu = NO_SCALE
+    origin: Enu  # origin of the autopilot's frame, in the grid's ENU frame
+    scale: Enu = NO_SCALE  # the autopilot's metres in one metre, see `sphere_scale`
 
     def to_autopilot(self, position: Enu) -> Ned:
         """Position in the autopilot's local NED frame."""
@@ -159,12 +144,3 @@ def sphere_scale(origin: Geodetic, radius_m: float) -> Enu:
     across_m = EQUATOR_M / math.sqrt(denominator) + origin.altitude_m
     along_m = EQUATOR_M * (1 - SQUARED_ECCENTRICITY) / denominator**1.5 + origin.altitude_m
     return Enu(radius_m / across_m, radius_m / along_m, 1.0)
-
-
-def _pymap3d() -> Any:
-    try:
-        return importlib.import_module("pymap3d")
-    except ImportError:
-        raise VehicleError(
-            "a datum needs pymap3d; expected it installed: pip install 'uav_dc_ros[mavlink]'"
-        ) from None

@@ -27,14 +27,10 @@ PX4: Names = (
 
 
 class ParameterReader:
-    """Reads parameters by name, each with `MAX_REQUESTS` requests at most.
-
-    Attributes:
-        values: received values.
-    """
+    """Reads parameters by name, each with `MAX_REQUESTS` requests at most."""
 
     def __init__(self) -> None:
-        self.values: dict[str, float] = {}
+        self.values: dict[str, float] = {}  # received
         self._requests: dict[str, tuple[int, float]] = {}  # number of requests, time of the last one
 
     def receive(self, name: str, value: float) -> None:

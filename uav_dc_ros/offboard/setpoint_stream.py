@@ -1,16 +1,16 @@
-"""Send times of heartbeats and setpoints, the same for every transport, and a thread that streams setpoints.
+"""Send times of heartbeats and setpoints, the same for every transport; streaming with real-time priority.
 
 A simulated vehicle's time may run faster than the steady clock, and its failsafes count vehicle time:
 heartbeats and setpoints follow the faster of the two.
 """
 
 import math
+import os
+import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
-
-from uav_dc_ros.offboard.realtime import use_realtime_priority
 
 STREAM_S = 0.05  # steady clock
 STREAM_VEHICLE_S = 0.2  # vehicle time; PX4 requires more than 2 Hz of it
@@ -24,6 +24,21 @@ Target = TypeVar("Target")
 def next_due_s(due_s: float, period_s: float, now_s: float) -> float:
     """Next send time of a periodic message; missed periods are skipped."""
     return due_s + period_s if now_s < due_s + period_s else now_s + period_s
+
+
+def use_realtime_priority() -> bool:
+    """Set the calling thread to SCHED_RR at the lowest real-time priority; whether the system permits it.
+
+    On a busy computer an ordinary thread runs tens of milliseconds late. The permission is CAP_SYS_NICE or
+    RLIMIT_RTPRIO of 1 or more (systemd: `LimitRTPRIO=1`). Child threads and processes have normal priority.
+    """
+    if sys.platform != "linux":
+        return False
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except OSError:
+        return False
+    return True
 
 
 class Heartbeat:
@@ -48,12 +63,7 @@ class Heartbeat:
 
 
 class SetpointStream(Generic[Target]):
-    """Thread that calls `send` with the target every `STREAM_S`, and at once when the target changes.
-
-    Args:
-        send: sends one setpoint; called in the thread.
-        name: of the thread.
-    """
+    """Thread that calls `send` with the target every `STREAM_S`, and at once when the target changes."""
 
     def __init__(self, send: Callable[[Target], None], name: str) -> None:
         self._send = send
@@ -71,8 +81,7 @@ class SetpointStream(Generic[Target]):
     def set_setpoint(self, target: Target | None) -> None:
         """Send this target from now on, or none, for at most `STREAM_TIMEOUT_S`.
 
-        Raises:
-            Exception: the last error of `send`, so that the caller does not rely on a stream that has ended.
+        Raises the last error of `send`, so that the caller does not rely on a stream that has ended.
         """
         with self._changed:
             if self._failure is not None:
@@ -102,9 +111,7 @@ class SetpointStream(Generic[Target]):
         while True:
             with self._changed:
                 self._changed.wait_for(
-                    lambda sent=sent: (  # type: ignore[misc]
-                        self._ended or self._urgent or self._target != sent
-                    ),
+                    lambda sent=sent: self._ended or self._urgent or self._target != sent,  # type: ignore[misc]
                     timeout=max(0.0, due_s - time.monotonic()),
                 )
                 if self._ended:

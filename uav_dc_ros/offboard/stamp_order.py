@@ -15,18 +15,16 @@ class StampOrder:
 
     def refusal(self, stamp_s: float, now_s: float) -> str | None:
         """Why a message that arrived at a steady time is to be ignored; None: it is accepted."""
-        why = None
         if self._stamp_s:
             passed_s, advance_s = now_s - self._accepted_s, stamp_s - self._stamp_s
             if not advance_s:
                 return "repeated"
             if passed_s <= RESYNC_S:
                 if not stamp_s:
-                    why = "zeroed"
-                elif advance_s < 0:
-                    why = "late"
-                elif advance_s > LEAP_S + FASTEST * passed_s:
-                    why = "impossible"
-        if why is None:
-            self._stamp_s, self._accepted_s = stamp_s, now_s
-        return why
+                    return "zeroed"
+                if advance_s < 0:
+                    return "late"
+                if advance_s > LEAP_S + FASTEST * passed_s:
+                    return "impossible"
+        self._stamp_s, self._accepted_s = stamp_s, now_s
+        return None

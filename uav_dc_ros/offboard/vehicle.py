@@ -118,11 +118,7 @@ class Vehicle(Protocol):
         """Start to receive."""
 
     def telemetry(self) -> Telemetry:
-        """Current state of the vehicle; times as of `time.monotonic`.
-
-        Raises:
-            VehicleError: this machine cannot reach the vehicle at all.
-        """
+        """Current state, times as of `time.monotonic`; raises VehicleError if no connection is possible."""
 
     def set_setpoint(self, setpoint: Enu | None) -> None:
         """Stream a setpoint, in the grid's ENU frame, or none. To be called at 2 Hz or more."""

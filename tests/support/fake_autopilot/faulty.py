@@ -20,7 +20,7 @@ from tests.support.fake_autopilot.flight import ROOT, SCENARIO, Flight, fake
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.offboard.realtime import use_realtime_priority
+from uav_dc_ros.offboard.setpoint_stream import use_realtime_priority
 
 SPEED = 100.0
 AT_ONCE = 4

@@ -21,8 +21,7 @@ from pymavlink import mavutil
 from tests.support.fake_autopilot.flight import ROOT, Fake, fake
 from uav_dc_ros.offboard.mavlink.session import POSITION_ONLY
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
-from uav_dc_ros.offboard.realtime import use_realtime_priority
-from uav_dc_ros.offboard.setpoint_stream import STREAM_S
+from uav_dc_ros.offboard.setpoint_stream import STREAM_S, use_realtime_priority
 
 BURN = "while True: pass"
 LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_dueling')"

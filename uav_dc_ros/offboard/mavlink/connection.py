@@ -5,12 +5,12 @@ block while they reconnect, and print to standard output.)
 """
 
 import contextlib
-import importlib
 import socket
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.offboard.extras import load
 
 EXPECTED = "tcp:HOST:PORT, udpin:HOST:PORT (listens), udpout:HOST:PORT (sends first) or serial:DEVICE:BAUD"
 CONNECT_S = 2.0
@@ -31,10 +31,9 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read an address such as `tcp:127.0.0.1:5760`; `udp` means `udpin`, as with other MAVLink tools.
+        """Read an address such as `tcp:127.0.0.1:5760`; raises VehicleError if the text is none.
 
-        Raises:
-            VehicleError: the text is no address.
+        `udp` means `udpin`, as with other MAVLink tools.
         """
         kind, _, rest = text.partition(":")
         host, _, number = rest.rpartition(":")
@@ -53,12 +52,7 @@ class Address:
         return f"{self.kind}:{self.host}:{self.number}"
 
     def open(self) -> "Connection":
-        """Open a connection.
-
-        Raises:
-            ConnectionLost: it cannot be opened now.
-            VehicleError: this machine cannot open it at all.
-        """
+        """Open a connection; raises ConnectionLost if that fails now, VehicleError if it always will."""
         try:
             if self.kind == "tcp":
                 return _Tcp(self)
@@ -71,17 +65,8 @@ class Address:
 
 
 def load_serial(address: Address) -> Any:
-    """The module of pyserial.
-
-    Raises:
-        VehicleError: it is not installed.
-    """
-    try:
-        return importlib.import_module("serial")
-    except ImportError:
-        raise VehicleError(
-            f"{address} needs pyserial; expected it installed: pip install 'uav_dc_ros[mavlink]'"
-        ) from None
+    """The module of pyserial; raises VehicleError if it is not installed."""
+    return load("serial", f"{address} needs pyserial")
 
 
 class Connection:
@@ -148,10 +133,8 @@ class _Tcp(Connection):
 
 class _Serial(Connection):
     def __init__(self, address: Address) -> None:
-        port = load_serial(address).Serial
-        super().__init__(
-            address, port(address.host, address.number, timeout=0, write_timeout=0, exclusive=True)
-        )
+        serial, (device, baud) = load_serial(address), (address.host, address.number)
+        super().__init__(address, serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True))
 
     def _receive(self) -> bytes:
         return bytes(self._file.read(READ_BYTES))
@@ -163,9 +146,8 @@ class _Serial(Connection):
 
 class _Udp(Connection):
     def __init__(self, address: Address) -> None:
-        family, kind, protocol, _, where = socket.getaddrinfo(
-            address.host, address.number, type=socket.SOCK_DGRAM
-        )[0]
+        found = socket.getaddrinfo(address.host, address.number, type=socket.SOCK_DGRAM)
+        family, kind, protocol, _, where = found[0]
         super().__init__(address, socket.socket(family, kind, protocol))
         self._file.setblocking(False)
         self._peer: Any = where if address.kind == "udpout" else None

@@ -67,15 +67,11 @@ class Sequence:
 
 
 class VehicleClock:
-    """The vehicle's time, from `time_boot_ms` of its messages.
-
-    Attributes:
-        vehicle_s: seconds; monotonic, also across restarts of the vehicle.
-        restarts: number of restarts.
-    """
+    """The vehicle's time, from `time_boot_ms` of its messages."""
 
     def __init__(self) -> None:
-        self.vehicle_s, self.restarts = 0.0, 0
+        self.vehicle_s = 0.0  # seconds; monotonic, also across restarts of the vehicle
+        self.restarts = 0  # number of them
         self._boot_s: float | None = None  # newest time of all messages,
         self._received_s = 0.0  # and when it was received, steady clock
         self._newest_ms: dict[str, int] = {}  # newest time by message name

@@ -37,14 +37,11 @@ NAMES = {SET_MODE: "the change of mode", ARM: "arming", TAKE_OFF: "taking off"} 
 
 
 class Session:
-    """One vehicle, on links that come and go. `write` sends bytes, and returns whether there is a peer.
-
-    Attributes:
-        next_setpoint_s: when the next setpoint is due, steady clock.
-    """
+    """One vehicle, on links that come and go. `write` sends bytes, and returns whether there is a peer."""
 
     def __init__(self, codec: Any, telemetry: MavlinkTelemetry, write: Callable[[bytes], bool]) -> None:
-        self.telemetry, self.next_setpoint_s = telemetry, -math.inf
+        self.telemetry = telemetry
+        self.next_setpoint_s = -math.inf  # steady clock: when the next setpoint is due
         self._codec, self._write_bytes = codec, write
         self._mav = codec.MAVLink(None, SYSTEM, COMPONENT)
         self._mav.robust_parsing = True  # skips bytes that are no message

@@ -10,8 +10,7 @@ from uav_dc_ros.offboard import limits
 from uav_dc_ros.offboard.flight_stacks import BATTERY, LANDING, ON_GROUND, FlightStack
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, sphere_scale
 from uav_dc_ros.offboard.mavlink.message_order import Discard, Sequence, VehicleClock
-from uav_dc_ros.offboard.mavlink.other_controllers import OtherControllers
-from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM, Systems
+from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM, OtherControllers, Systems
 from uav_dc_ros.offboard.rejections import Rejections
 from uav_dc_ros.offboard.vehicle import Limits, Mode, Telemetry
 
@@ -57,24 +56,18 @@ IS_POSSIBLE: dict[str, Callable[[Any], bool]] = {
 
 
 class MavlinkTelemetry:
-    """State of one vehicle. Arguments: see `MavlinkVehicle`.
-
-    Attributes:
-        datum, frame: of the grid, and of the vehicle's local position in it; None until known.
-        position: of the vehicle, in the grid's ENU frame.
-        received_s: when a message of each name was received last, steady clock, seconds.
-    """
+    """State of one vehicle. Arguments: see `MavlinkVehicle`."""
 
     def __init__(
         self, datum: Geodetic | None, start: Enu, system: int | None = None, again: bool = False
     ) -> None:
-        self.datum, self.start = datum, start
+        self.datum, self.start = datum, start  # of the grid, None: not known yet; see `MavlinkVehicle`
         self.systems, self.other_controllers = Systems(system, again), OtherControllers(SYSTEM, COMPONENT)
         self.rejections = Rejections()
         self.discarded: Counter[str] = Counter()
         self._sequence, self._clock = Sequence(), VehicleClock()
-        self.frame: LocalFrame | None = None
-        self.received_s: dict[str, float] = {}
+        self.frame: LocalFrame | None = None  # of the vehicle's local position; None: not known yet
+        self.received_s: dict[str, float] = {}  # by message name, steady clock: when the last one came
         self._custom_mode, self._armed = 0, False
         self._left_s: dict[tuple[int, bool], float] = {}  # when the vehicle last left a state
         self._returned_s: float | None = None  # last heartbeat, if it reports a state left a moment ago
@@ -86,7 +79,7 @@ class MavlinkTelemetry:
         """Drop what a vehicle reported before it was started anew."""
         self.received_s = {name: at_s for name, at_s in self.received_s.items() if name == "HEARTBEAT"}
         self._messages = {name: last for name, last in self._messages.items() if name == "SYS_STATUS"}
-        self.position: Enu | None = None
+        self.position: Enu | None = None  # in the grid's ENU frame
         self._position_s: float | None = None
         self._ned: Ned | None = None
         self._origin: Geodetic | None = None
@@ -300,11 +293,7 @@ class MavlinkTelemetry:
 
 def _geodetic(message: Any) -> Geodetic:
     """The position of a message that has degrees times 1e7, and millimetres."""
-    return Geodetic(
-        latitude_deg=message.latitude / 1e7,
-        longitude_deg=message.longitude / 1e7,
-        altitude_m=message.altitude / 1e3,
-    )
+    return Geodetic(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
 
 
 def _target(message: Any) -> Ned | None:

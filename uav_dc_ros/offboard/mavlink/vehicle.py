@@ -5,7 +5,6 @@ Python's global lock delays it: the rest of the process should have that priorit
 """
 
 import contextlib
-import importlib
 import math
 import os
 import select
@@ -14,11 +13,12 @@ import time
 from typing import Any, Self
 
 from uav_dc_ros.errors import VehicleError
+from uav_dc_ros.offboard.extras import load
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavlink.connection import Address, Connection, ConnectionLost, load_serial
 from uav_dc_ros.offboard.mavlink.session import Session
 from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
-from uav_dc_ros.offboard.realtime import use_realtime_priority
+from uav_dc_ros.offboard.setpoint_stream import use_realtime_priority
 from uav_dc_ros.offboard.vehicle import Command, Telemetry
 
 RECONNECT_S = 0.5
@@ -28,41 +28,24 @@ ORIGIN = Enu(0.0, 0.0, 0.0)
 
 
 def load_codec() -> Any:
-    """pymavlink's messages of ArduPilot's dialect, which includes the common ones.
-
-    Raises:
-        VehicleError: pymavlink is not installed.
-    """
-    try:
-        return importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
-    except ImportError:
-        raise VehicleError(
-            "a vehicle on MAVLink needs pymavlink; expected it installed: pip install 'uav_dc_ros[mavlink]'"
-        ) from None
+    """pymavlink's messages of ArduPilot's dialect, which includes the common ones; raises VehicleError."""
+    return load("pymavlink.dialects.v20.ardupilotmega", "a vehicle on MAVLink needs pymavlink")
 
 
 class MavlinkVehicle:
     """One vehicle on one link, see `Vehicle`; usable as a context manager.
 
-    Args:
-        address: such as `tcp:127.0.0.1:5760`.
-        datum: of the grid. None: the vehicle stands at `start` when its first position comes.
-        start: in the grid's ENU frame, see `datum`.
-        grid_origin: `grid_origin` of an earlier process in the same flight; replaces `datum`.
-        system: MAVLink system of the vehicle; None: the only autopilot on the link.
-
-    Raises:
-        VehicleError: the address is invalid, or a package is missing.
+    Raises VehicleError if the address is invalid, or a package is missing.
     """
 
     def __init__(
         self,
-        address: str,
+        address: str,  # such as `tcp:127.0.0.1:5760`
         *,
-        datum: Geodetic | None = None,
-        start: Enu = ORIGIN,
-        grid_origin: str = "",
-        system: int | None = None,
+        datum: Geodetic | None = None,  # None: the vehicle stands at `start` when its first position comes
+        start: Enu = ORIGIN,  # in the grid's ENU frame
+        grid_origin: str = "",  # of an earlier process in the same flight; replaces `datum`
+        system: int | None = None,  # MAVLink system of the vehicle; None: the only autopilot on the link
     ) -> None:
         if grid_origin:
             datum = Geodetic.parse(grid_origin)
@@ -108,11 +91,7 @@ class MavlinkVehicle:
         os.close(self._wake_out)
 
     def telemetry(self) -> Telemetry:
-        """The vehicle's state now, times as of `time.monotonic`.
-
-        Raises:
-            VehicleError: this machine cannot open the connection at all.
-        """
+        """The vehicle's state now, see `Vehicle`."""
         if self._failure is not None:
             raise self._failure
         with self._lock:

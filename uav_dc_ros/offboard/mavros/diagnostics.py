@@ -27,24 +27,17 @@ MIN_HEARTBEATS = 3  # before the vehicle counts as the only one
 
 
 class Diagnostics:
-    """State of the first MAVROS that reports heartbeats. Times are of the steady clock, seconds.
-
-    Attributes:
-        flight_stack: of the vehicle.
-        mode_name: the autopilot's name of its mode.
-        armed: as far as MAV_STATE shows: PX4 is Active when armed, ArduPilot when flying. A failsafe state
-            leaves it unchanged; None: not known.
-        heartbeat_s: when a heartbeat was reported last.
-        enabled, health: sensor bits of SYS_STATUS; None before one came.
-    """
+    """State of the first MAVROS that reports heartbeats. Times are of the steady clock, seconds."""
 
     def __init__(self) -> None:
         self.flight_stack: FlightStack | None = None
-        self.mode_name = ""
+        self.mode_name = ""  # the autopilot's name of its mode
+        # As far as MAV_STATE shows: PX4 is Active when armed, ArduPilot when flying. A failsafe state leaves
+        # it unchanged; None: not known.
         self.armed: bool | None = None
-        self.heartbeat_s: float | None = None
-        self.enabled: int | None = None
-        self.health: int | None = None
+        self.heartbeat_s: float | None = None  # when a heartbeat was reported last
+        self.enabled: int | None = None  # bits of enabled sensors in SYS_STATUS; None before one came
+        self.health: int | None = None  # of healthy ones
         self._source: tuple[str, str] | None = None  # node and link of the MAVROS in use
         self._sources: dict[tuple[str, str], float] = {}  # all that report heartbeats, and when they did
         self._count, self._in_a_row = 0, 0

@@ -86,27 +86,18 @@ class VehicleTime:
 
 
 class MavrosTelemetry:
-    """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`.
-
-    Attributes:
-        has_msgs: whether mavros_msgs is installed.
-        origin: of MAVROS's local frame (its EKF's origin), in the grid's frame; None: not known yet.
-        yaw_rad: of the vehicle, counter-clockwise from the east.
-        received_s: when a message came last, by topic.
-        corner: of the grid on the Earth, its altitude only known from a datum; None: not known yet.
-
-    Raises:
-        VehicleError: the grid origin is invalid.
-    """
+    """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`."""
 
     def __init__(
         self, start: Enu, datum: Geodetic | None = None, grid_origin: str = "", has_msgs: bool = False
     ) -> None:
-        self.start, self.datum, self.has_msgs = start, datum, has_msgs
+        self.start, self.datum, self.has_msgs = start, datum, has_msgs  # mavros_msgs is installed
+        # Of MAVROS's local frame (its EKF's origin), in the grid's frame; None: not known yet.
         self.origin = Enu.parse(grid_origin) if grid_origin else None
         self.diagnostics, self.rejections = Diagnostics(), Rejections()
-        self.yaw_rad = 0.0
-        self.received_s: dict[str, float] = {}
+        self.yaw_rad = 0.0  # counter-clockwise from the east
+        self.received_s: dict[str, float] = {}  # when a message came last, by topic
+        # Of the grid on the Earth, its altitude only known from a datum; None: not known yet.
         self.corner = datum
         self.discarded: Counter[str] = Counter()
         self._messages: dict[str, Any] = {}  # of mavros_msgs: the last one by topic
@@ -309,9 +300,7 @@ class MavrosTelemetry:
         if has_fix and math.isfinite(latitude_deg + longitude_deg):
             self.received_s[FIX] = now_s
             altitude_m = self.datum.altitude_m if self.datum is not None else 0.0
-            self._fix = Geodetic(
-                latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=altitude_m
-            )
+            self._fix = Geodetic(latitude_deg, longitude_deg, altitude_m)
 
     def on_battery(self, location: str, charge: float, volts: float) -> None:
         """Process a BatteryState: charge, 0 to 1, and voltage; any other value is not known."""

@@ -16,18 +16,11 @@ FAILS_S = 5.0  # minimum duration of the autopilot's report: a single message ma
 
 
 class BatteryMonitor:
-    """Monitors one battery.
-
-    Args:
-        min_charge: 0 to 1; 0: nothing is checked.
-        at_rest_v: see below, from the checkpoint.
-
-    Attributes:
-        at_rest_v: smoothed voltage on the ground with motors off; None: not measured.
-    """
+    """Monitors one battery."""
 
     def __init__(self, min_charge: float, at_rest_v: float | None = None) -> None:
-        self.min_charge, self.at_rest_v = min_charge, at_rest_v
+        self.min_charge = min_charge  # 0 to 1; 0: nothing is checked
+        self.at_rest_v = at_rest_v  # smoothed voltage on the ground with motors off; None: not measured
         self._smooth_v: float | None = None
         self._updated_s = 0.0  # vehicle time
         self._fails_since_s: float | None = None  # vehicle time

@@ -17,8 +17,7 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.frames import Enu
-from uav_dc_ros.offboard.mission.crash_detector import CrashDetector
-from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
+from uav_dc_ros.offboard.mission.fault_detector import CrashDetector, FaultDetector, SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, Landing
 from uav_dc_ros.offboard.mission.preflight import Preflight, other_controller
@@ -32,23 +31,11 @@ POLICY_LOST = "policy lost"
 
 
 class MissionController:
-    """Controls one mission of one vehicle.
+    """Controls one mission of one vehicle; a `checkpoint` is that of a mission that is resumed."""
 
-    Args:
-        on_change: called after each change of phase, step, reason or checkpoint.
-        checkpoint: of a mission that is resumed.
-        fence: for setpoints and positions; None: the one around the scenario.
-
-    Attributes:
-        phase, reason: current phase, and why.
-        progress: steps flown, current cell and goal.
-        detector: faults, battery and discarded values of the telemetry.
-        setpoint: to be streamed, in the grid's ENU frame, inside the fence; None: none.
-        policy_lost: set by the caller while the policy is not alive: the vehicle stops.
-        is_strict: whether an impossible transition raises PhaseError (in tests) or ends the mission.
-    """
-
-    is_strict: ClassVar[bool] = False
+    is_strict: ClassVar[bool] = (
+        False  # an impossible transition raises PhaseError (in tests), or else ends it
+    )
 
     def __init__(
         self,
@@ -56,15 +43,15 @@ class MissionController:
         settings: SafetySettings,
         on_change: Callable[[], None] = lambda: None,
         checkpoint: Checkpoint | None = None,
-        fence: Geofence | None = None,
+        fence: Geofence | None = None,  # None: the one around the scenario
     ) -> None:
         self.scenario, self.settings = scenario, settings
-        self.fence = fence or Geofence.around(scenario)
+        self.fence = fence or Geofence.around(scenario)  # for setpoints and positions
         self.phase, self.reason = Phase.IDLE, "not started"
         self.progress = MissionProgress(scenario, checkpoint)
-        self.setpoint: Enu | None = None
-        self.policy_lost = False
-        self._on_change = on_change
+        self.setpoint: Enu | None = None  # to be streamed, in the grid's ENU frame, inside the fence
+        self.policy_lost = False  # set by the caller while the policy is not alive: the vehicle stops
+        self._on_change = on_change  # called after each change of phase, step, reason or checkpoint
         self._telemetry = Telemetry()
         self._now = self._entered = Instant(0.0, 0.0)  # last tick; start of the phase
         self._entered_step = self.step

@@ -1,5 +1,6 @@
-"""Safety settings, and faults of link, position estimate, position, clock and battery."""
+"""Safety settings; faults of link, position estimate, position, clock and battery; crashes."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -55,32 +56,19 @@ class Fault:
 
 
 class FaultDetector:
-    """Detects faults in the telemetry of one vehicle.
-
-    Args:
-        at_rest_v: of the battery, from the checkpoint.
-        home: from the checkpoint.
-
-    Attributes:
-        battery: monitor of its battery.
-        home: position of the vehicle when it was armed; None: not known.
-    """
+    """Detects faults in the telemetry of one vehicle; `at_rest_v` and `home` are those of the checkpoint."""
 
     def __init__(
         self, settings: SafetySettings, at_rest_v: float | None = None, home: Enu | None = None
     ) -> None:
         self.settings = settings
         self.battery = BatteryMonitor(settings.min_battery, at_rest_v)
-        self.home = home
+        self.home = home  # position of the vehicle when it was armed; None: not known
         self._filter = PlausibilityFilter(settings.max_speed_mps, settings.max_position_jump_m)
+        self.discarded = self._filter.discarded  # number of discarded values by reason
         self._heartbeat_s: float | None = None
         self._link_since_s = 0.0  # steady clock: start of the current sequence of heartbeats without a gap
         self._clock: tuple[float, float] | None = None  # vehicle time, and steady time of its last advance
-
-    @property
-    def discarded(self) -> dict[str, int]:
-        """Number of discarded values by reason."""
-        return self._filter.discarded
 
     def update(self, now_s: float, telemetry: Telemetry) -> Telemetry:
         """Take in the telemetry of a tick; returns it without impossible values, and with a home position."""
@@ -137,4 +125,43 @@ class FaultDetector:
             return Fault(FaultKind.POSITION, jump or f"no position for {max_age_s:g} s")
         if self.clock_stopped(now_s):
             return Fault(FaultKind.CLOCK, f"the vehicle's time has not advanced for {CLOCK_S:g} s")
+        return None
+
+
+class CrashDetector:
+    """Detects crashes in one phase after the other, by tilt, loss of altitude and ground contact."""
+
+    def __init__(self, settings: SafetySettings) -> None:
+        self._settings = settings
+        self._since_s: dict[str, float] = {}  # vehicle time, by symptom
+        self.begin(flies=False)
+
+    def begin(self, flies: bool) -> None:
+        """Start another phase; `flies`: the vehicle is in the air in all of it."""
+        self.flies = flies  # the vehicle was in the air since the phase began, or its phase implies it
+        self._min_setpoint_m, self._max_position_m = math.inf, -math.inf
+        self._since_s.clear()
+
+    def update(self, telemetry: Telemetry, setpoint: Enu | None) -> str | None:
+        """The symptom that has lasted for `crash_timeout_s`; None: there is none, or it is not reported."""
+        settings, position = self._settings, telemetry.position
+        self.flies |= telemetry.on_ground is False
+        symptoms: dict[str, str] = {}
+        if telemetry.tilt_rad is not None:
+            tilt_deg, limit_deg = math.degrees(telemetry.tilt_rad), settings.max_tilt_deg
+            if tilt_deg > limit_deg:
+                symptoms["tilt"] = f"tilted by {tilt_deg:.0f} degrees; expected at most {limit_deg:g}"
+        if self.flies and telemetry.on_ground:
+            symptoms["ground"] = "on the ground while it should fly"
+        if self.flies and position is not None and setpoint is not None:
+            self._min_setpoint_m = min(self._min_setpoint_m, setpoint.up_m)
+            self._max_position_m = max(self._max_position_m, position.up_m)
+            up_m, limit_m = position.up_m, settings.max_sink_m
+            sink_m = min(self._min_setpoint_m, self._max_position_m) - up_m
+            if sink_m > limit_m:
+                symptoms["sink"] = f"at {up_m:.0f} m, {sink_m:.0f} m too low; expected at most {limit_m:g} m"
+        self._since_s = {name: self._since_s.get(name, telemetry.vehicle_s) for name in symptoms}
+        for name, text in symptoms.items():
+            if telemetry.vehicle_s - self._since_s[name] > settings.crash_timeout_s:
+                return text
         return None

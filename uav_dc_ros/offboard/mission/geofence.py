@@ -43,9 +43,7 @@ class Geofence:
 def limit_conflict(scenario: Scenario, settings: SafetySettings, limits: Limits, home: Enu) -> str | None:
     """The limit that excludes a cell, with `tolerance_m` around its centre; None: there is none.
 
-    Args:
-        scenario: its start and dock are cells.
-        home: reference of the limits, in the grid's ENU frame, metres.
+    Start and dock are cells. The limits are relative to `home`, in the grid's ENU frame.
     """
     grid, margin_m = scenario.grid, settings.tolerance_m
     corners = [(x * grid.cell_m, y * grid.cell_m) for x in (0, grid.n_x - 1) for y in (0, grid.n_y - 1)]

@@ -41,18 +41,7 @@ def finish(
 
 
 class Landing:
-    """One landing.
-
-    Args:
-        mode: mode to request.
-        outcome: final phase of the mission after the landing.
-        reason: of the landing.
-        blind_since_s: start of the position fault that caused the landing, steady clock.
-
-    Attributes:
-        confirmed: whether the vehicle was in a landing mode; any later change of the mode is a pilot's.
-        requests: number of requests sent.
-    """
+    """One landing."""
 
     def __init__(
         self,
@@ -64,9 +53,11 @@ class Landing:
         blind_since_s: float | None = None,
     ) -> None:
         self._progress, self._detector, self._settings = progress, detector, detector.settings
-        self.mode, self.outcome, self.reason = mode, outcome, reason
-        self.confirmed, self.requests = False, 0
-        self._blind_since_s = blind_since_s
+        self.mode, self.reason = mode, reason  # mode to request, reason of the landing
+        self.outcome = outcome  # final phase of the mission
+        self.confirmed = False  # the vehicle was in a landing mode; any later change of the mode is a pilot's
+        self.requests = 0  # number of requests sent
+        self._blind_since_s = blind_since_s  # steady clock: start of the position fault that is the reason
         self._replaces_return = False  # land is requested because the return makes no progress
         self._last_mode: Mode | None = None
         self._link_lost_since_s: float | None = None  # steady clock
@@ -91,12 +82,9 @@ class Landing:
     def update(
         self, now_s: float, telemetry: Telemetry, setpoint: Enu | None, waited_s: float | None
     ) -> Decision:
-        """Decide in one tick.
+        """Decide in one tick; the current setpoint is streamed until the landing is confirmed.
 
-        Args:
-            now_s: steady clock.
-            setpoint: current setpoint, which is streamed until the landing is confirmed.
-            waited_s: time since return was requested last, see `CommandRetry`; None: it was not.
+        `waited_s` is the time since return was requested last, see `CommandRetry`; None: it was not.
         """
         settings = self._settings
         if self._detector.link_lost(now_s, telemetry):

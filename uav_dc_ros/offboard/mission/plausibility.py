@@ -1,6 +1,7 @@
 """Removes impossible values from telemetry, and counts them."""
 
 import math
+from collections import Counter
 
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.vehicle import Telemetry
@@ -9,22 +10,13 @@ SLACK_S = 1.0  # between arrival times that are taken in different threads, stea
 
 
 class PlausibilityFilter:
-    """Filters the telemetry of one vehicle.
-
-    Args:
-        max_speed_mps, max_jump_m: a position that is farther from the last accepted one is a jump.
-
-    Attributes:
-        discarded: number of discarded values by reason.
-        jump: why the newest position was discarded; None: it was accepted.
-        accepted_s: vehicle time of the last accepted position.
-    """
+    """Filters the telemetry of one vehicle; a position beyond both limits together has jumped."""
 
     def __init__(self, max_speed_mps: float, max_jump_m: float) -> None:
         self._max_speed_mps, self._max_jump_m = max_speed_mps, max_jump_m
-        self.discarded: dict[str, int] = {}
-        self.jump: str | None = None
-        self.accepted_s = 0.0
+        self.discarded: Counter[str] = Counter()  # number of values by reason
+        self.jump: str | None = None  # why the newest position was discarded; None: it was accepted
+        self.accepted_s = 0.0  # vehicle time of the last accepted position
         self._accepted: tuple[Enu, float] | None = None  # position, and its arrival
         self._newest_s = -math.inf  # steady clock: arrival of the newest position, accepted or not
         self._vehicle_s = 0.0
@@ -37,7 +29,7 @@ class PlausibilityFilter:
         """
         last = self._last
         if last is not None and (telemetry.heartbeat_s or 0.0) < (last.heartbeat_s or 0.0) - SLACK_S:
-            self._discard("out of order")
+            self.discarded["out of order"] += 1
             return last
         if math.isfinite(telemetry.vehicle_s):
             self._vehicle_s = max(self._vehicle_s, telemetry.vehicle_s)
@@ -58,7 +50,7 @@ class PlausibilityFilter:
         if position_s == self._newest_s:
             return
         if position_s < self._newest_s or position_s > now_s + SLACK_S:
-            self._discard("out of order")
+            self.discarded["out of order"] += 1
             return
         self._newest_s, self.jump = position_s, None
         if not position.is_finite:
@@ -70,7 +62,4 @@ class PlausibilityFilter:
         if self.jump is None:
             self._accepted, self.accepted_s = (position, position_s), self._vehicle_s
         else:
-            self._discard("impossible position")
-
-    def _discard(self, reason: str) -> None:
-        self.discarded[reason] = self.discarded.get(reason, 0) + 1
+            self.discarded["impossible position"] += 1

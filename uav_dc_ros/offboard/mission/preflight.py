@@ -12,21 +12,18 @@ NO_POSITION_S = 5.0  # a vehicle in the air whose grid position is unknown for l
 
 
 class Preflight:
-    """Decides for a vehicle that does not fly the mission yet.
-
-    Attributes:
-        allowed_mode: with `SafetySettings.arm`, the one mode besides the commanded one that is no takeover:
-            that of the moment when the commanded mode was requested, or the commanded mode itself once the
-            vehicle was in it. None: every mode is allowed.
-        pilot_has_control: whether a pilot has armed or disarmed the vehicle; the bridge does not arm it then.
-    """
+    """Decides for a vehicle that does not fly the mission yet."""
 
     def __init__(
         self, progress: MissionProgress, settings: SafetySettings, fence: Geofence, detector: FaultDetector
     ) -> None:
         self.progress, self.settings, self.fence, self.detector = progress, settings, fence, detector
         self.checkpoint = progress.checkpoint
+        # With `SafetySettings.arm`, the one mode besides the commanded one that is no takeover: that of the
+        # moment when the commanded mode was requested, or the commanded mode itself once the vehicle was in
+        # it. None: every mode is allowed.
         self.allowed_mode = self.checkpoint.allowed_mode
+        # A pilot has armed or disarmed the vehicle; the bridge does not arm it then.
         self.pilot_has_control = self.checkpoint.pilot_has_control
         self._was_armed = False
         self._no_position_since_s: float | None = None  # steady clock, of a vehicle in the air
@@ -106,10 +103,8 @@ class Preflight:
         mode = before.landing_mode or self.settings.failsafe_action
         if telemetry.mode in LANDING_MODES:
             mode = telemetry.mode
-        requested = before.landing_requested and before.landing_mode is telemetry.mode
-        return Decision(
-            Phase.LANDING, reason, landing_mode=mode, outcome=outcome, landing_requested=requested
-        )
+        sent = before.landing_requested and before.landing_mode is telemetry.mode
+        return Decision(Phase.LANDING, reason, landing_mode=mode, outcome=outcome, landing_requested=sent)
 
     def _after_restart(self, telemetry: Telemetry, breach: str | None) -> Decision | None:
         """Why a mission that was in the air ends, or continues its landing; None: it is resumed."""

@@ -37,22 +37,14 @@ class Checkpoint(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MissionProgress:
-    """Steps and cells of one mission.
-
-    Attributes:
-        checkpoint: state in which the bridge started.
-        step: steps flown.
-        steps_not_reached: number of steps that ended away from their cell's centre.
-        cell: cell that the vehicle reached last.
-        goal: cell that it flies to, or is in.
-    """
+    """Steps and cells of one mission."""
 
     def __init__(self, scenario: Scenario, checkpoint: Checkpoint | None = None) -> None:
         self.scenario = scenario
-        self.checkpoint = checkpoint or Checkpoint(step=0, cell=scenario.start_cell)
-        self.step, self.cell = self.checkpoint.step, self.checkpoint.cell
-        self.goal = self.checkpoint.goal or self.checkpoint.cell
-        self.steps_not_reached = self.checkpoint.steps_not_reached
+        self.checkpoint = checkpoint or Checkpoint(step=0, cell=scenario.start_cell)  # at the bridge's start
+        self.step, self.cell = self.checkpoint.step, self.checkpoint.cell  # steps flown, cell reached last
+        self.goal = self.checkpoint.goal or self.checkpoint.cell  # cell that the vehicle flies to, or is in
+        self.steps_not_reached = self.checkpoint.steps_not_reached  # that ended away from their goal's centre
 
     @property
     def target(self) -> Enu:

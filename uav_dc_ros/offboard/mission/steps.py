@@ -16,15 +16,11 @@ TARGET_M = 1.0  # permitted difference of the autopilot's target and the setpoin
 
 
 class StepControl:
-    """Decides whether the start or the goal of a step is reached, and detects faults on the way.
-
-    Attributes:
-        resumes_move: whether the vehicle has to complete the move that an earlier bridge began.
-    """
+    """Decides whether the start or the goal of a step is reached, and detects faults on the way."""
 
     def __init__(self, progress: MissionProgress, settings: SafetySettings) -> None:
         self._progress, self._settings = progress, settings
-        self.resumes_move = progress.checkpoint.goal is not None
+        self.resumes_move = progress.checkpoint.goal is not None  # the move that an earlier bridge began
         self._setpoint: Enu | None = None
         self._sent_s = 0.0  # steady clock: first time of the current setpoint
         self._timer = ProgressTimer(NEARER_M)

@@ -19,17 +19,12 @@ class Instant(NamedTuple):
 
 
 class FaultTimer:
-    """Duration of the current fault.
-
-    Attributes:
-        fault: current fault; None: none.
-        since: its start.
-    """
+    """Duration of the current fault."""
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
         self.fault: Fault | None = None
-        self.since = Instant(0.0, 0.0)
+        self.since = Instant(0.0, 0.0)  # start of the fault
 
     def update(self, now: Instant, fault: Fault | None) -> Literal["changed", "cleared", "expired"] | None:
         """Note the present fault; returns the change. `expired`: the timeout has passed on either clock.
@@ -50,17 +45,12 @@ class FaultTimer:
 
 
 class PolicyTimeout:
-    """Timeout of a policy that publishes no moves, or is lost.
-
-    Attributes:
-        limit_s: vehicle time; a minimum of steady time applies, too.
-        lost_since: loss of the policy; None: it is alive.
-    """
+    """Timeout of a policy that publishes no moves, or is lost."""
 
     def __init__(self, settings: SafetySettings, step_s: float) -> None:
-        self.limit_s = settings.policy_timeout_steps * step_s
-        self._min_s = settings.policy_timeout_s
-        self.lost_since: Instant | None = None
+        self.limit_s = settings.policy_timeout_steps * step_s  # vehicle time
+        self._min_s = settings.policy_timeout_s  # steady time
+        self.lost_since: Instant | None = None  # loss of the policy; None: it is alive
 
     def has_expired(self, since: Instant, now: Instant) -> bool:
         """Whether the time since an instant exceeds both limits."""

@@ -25,24 +25,10 @@ COMMANDS = {20: "returning", 21: "landing", 176: "the change of mode", ARM: "arm
 # By NAVIGATION_STATE; 12 is DESCEND, which lands without a position.
 MODES = {14: Mode.COMMANDED, 4: Mode.HOLD, 5: Mode.RETURN, 12: Mode.LAND, 18: Mode.LAND, 20: Mode.LAND}
 MODE_NAMES = {
-    0: "MANUAL",
-    1: "ALTCTL",
-    2: "POSCTL",
-    3: "AUTO_MISSION",
-    4: "AUTO_LOITER",
-    5: "AUTO_RTL",
-    6: "POSITION_SLOW",
-    10: "ACRO",
-    12: "DESCEND",
-    13: "TERMINATION",
-    14: "OFFBOARD",
-    15: "STAB",
-    17: "AUTO_TAKEOFF",
-    18: "AUTO_LAND",
-    19: "AUTO_FOLLOW_TARGET",
-    20: "AUTO_PRECLAND",
-    21: "ORBIT",
-}
+    0: "MANUAL", 1: "ALTCTL", 2: "POSCTL", 3: "AUTO_MISSION", 4: "AUTO_LOITER", 5: "AUTO_RTL",
+    6: "POSITION_SLOW", 10: "ACRO", 12: "DESCEND", 13: "TERMINATION", 14: "OFFBOARD", 15: "STAB",
+    17: "AUTO_TAKEOFF", 18: "AUTO_LAND", 19: "AUTO_FOLLOW_TARGET", 20: "AUTO_PRECLAND", 21: "ORBIT",
+}  # fmt: skip
 ORDERED = {"vehicle_status", "vehicle_local_position", "vehicle_land_detected", "vehicle_attitude"}
 REASONS = (  # of failsafe_flags: what keeps PX4 from OFFBOARD, or from arming
     *("angular_velocity_invalid", "attitude_invalid", "local_position_invalid", "global_position_invalid"),
@@ -51,28 +37,18 @@ REASONS = (  # of failsafe_flags: what keeps PX4 from OFFBOARD, or from arming
 
 
 class Px4Telemetry:
-    """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`.
-
-    Attributes:
-        datum, frame: of the grid, and of PX4's local position in it; None until known.
-        status: the last VehicleStatus; None: none came yet.
-        position_s: when the last position came that PX4 trusts.
-        vehicle_s: the vehicle's own time, seconds.
-
-    Raises:
-        VehicleError: the grid origin is invalid.
-    """
+    """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`."""
 
     def __init__(self, *, start: Enu, grid_origin: str = "", datum: Geodetic | None = None) -> None:
         self.start, self.datum = start, datum
-        self.frame: LocalFrame | None = None
+        self.frame: LocalFrame | None = None  # of PX4's local position in the grid; None: not known yet
         if grid_origin.startswith(LOCAL):
             self.datum, self.frame = None, LocalFrame(origin=Enu.parse(grid_origin.removeprefix(LOCAL)))
         elif grid_origin:
             self.datum = Geodetic.parse(grid_origin)
-        self.status: Any = None
-        self.position_s: float | None = None
-        self.vehicle_s = 0.0
+        self.status: Any = None  # the last VehicleStatus; None: none came yet
+        self.position_s: float | None = None  # when the last position came that PX4 trusts
+        self.vehicle_s = 0.0  # the vehicle's own time
         self.discarded: Counter[str] = Counter()
         self._reference: Geodetic | None = None  # origin of PX4's local position
         self._position: Enu | None = None
@@ -245,4 +221,4 @@ def _reference(message: Any) -> Geodetic | None:
     where = message.ref_lat, message.ref_lon, float(message.ref_alt)
     if not (message.xy_global and message.z_global and all(map(math.isfinite, where))):
         return None
-    return Geodetic(latitude_deg=where[0], longitude_deg=where[1], altitude_m=where[2])
+    return Geodetic(*where)
