@@ -278,7 +278,7 @@ class MavrosVehicle:
         try:
             local = Enu(*position_m(message).tolist())
         except MessageError as error:
-            self._telemetry.on_invalid_pose(str(error))
+            self._telemetry.pose_error = str(error)
             return
         q = message.pose.orientation
         yaw_rad = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))  # from the east

@@ -9,8 +9,8 @@ from typing import Any
 from uav_dc_ros.offboard import limits
 from uav_dc_ros.offboard.flight_stacks import BATTERY, LANDING, ON_GROUND, FlightStack
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, sphere_scale
-from uav_dc_ros.offboard.mavlink.message_order import Discard, Sequence, VehicleClock
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM, OtherControllers, Systems
+from uav_dc_ros.offboard.message_order import Discard, Sequence, VehicleClock
 from uav_dc_ros.offboard.rejections import Rejections
 from uav_dc_ros.offboard.vehicle import Limits, Mode, Telemetry
 

@@ -24,8 +24,8 @@ from uav_dc_ros.offboard.flight_stacks import (
 )
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mavros.diagnostics import Diagnostics
+from uav_dc_ros.offboard.message_order import LEAP_S, MAX_SPEED, StampOrder
 from uav_dc_ros.offboard.rejections import Rejections
-from uav_dc_ros.offboard.stamp_order import FASTEST, LEAP_S, StampOrder
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry
 
 POSE, FIX = "mavros/local_position/pose", "mavros/global_position/global"
@@ -34,14 +34,9 @@ HOME, TARGET = "mavros/home_position/home", "mavros/setpoint_raw/target_local"
 SYS_STATUS, ESTIMATOR_STATUS = "mavros/sys_status", "mavros/estimator_status"
 STATUS_TEXT = "mavros/statustext/recv"
 MESSAGES = {  # of mavros_msgs, by topic
-    STATE: "State",
-    EXTENDED_STATE: "ExtendedState",
-    SYS_STATUS: "SysStatus",
-    HOME: "HomePosition",
-    ESTIMATOR_STATUS: "EstimatorStatus",
-    TARGET: "PositionTarget",
-    STATUS_TEXT: "StatusText",
-}
+    STATE: "State", EXTENDED_STATE: "ExtendedState", SYS_STATUS: "SysStatus", HOME: "HomePosition",
+    ESTIMATOR_STATUS: "EstimatorStatus", TARGET: "PositionTarget", STATUS_TEXT: "StatusText",
+}  # fmt: skip
 ESTIMATOR_FLAGS = (  # fields of EstimatorStatus: the bits of ESTIMATOR_STATUS_FLAGS, lowest first
     *("attitude", "velocity_horiz", "velocity_vert", "pos_horiz_rel", "pos_horiz_abs", "pos_vert_abs"),
     *("pos_vert_agl", "const_pos_mode", "pred_pos_horiz_rel", "pred_pos_horiz_abs", "gps_glitch"),
@@ -73,7 +68,7 @@ class VehicleTime:
         """Process a stamp received at a steady time, seconds."""
         if not math.isnan(self._received_s):
             passed_s, advance_s = now_s - self._received_s, stamp_s - self._stamp_s
-            plausible = 0.0 < advance_s <= LEAP_S + FASTEST * passed_s
+            plausible = 0.0 < advance_s <= LEAP_S + MAX_SPEED * passed_s
             self._time_s += advance_s if plausible else passed_s
         self._stamp_s, self._received_s = stamp_s, now_s
 
@@ -102,7 +97,7 @@ class MavrosTelemetry:
         self.discarded: Counter[str] = Counter()
         self._messages: dict[str, Any] = {}  # of mavros_msgs: the last one by topic
         self._local: Enu | None = None
-        self._pose_error = ""  # why the last pose was rejected
+        self.pose_error = ""  # why the last pose was rejected
         self._fix: Geodetic | None = None
         self._batteries: dict[str, tuple[float | None, float | None]] = {}  # charge, volts
         self._time = VehicleTime()
@@ -220,8 +215,8 @@ class MavrosTelemetry:
 
     def _missing(self, now_s: float) -> str | None:
         diagnostics = self.diagnostics
-        if self._pose_error and now_s - self.received_s.get(POSE, -math.inf) > STALE_S:
-            return f"{POSE}: {self._pose_error}"
+        if self.pose_error and now_s - self.received_s.get(POSE, -math.inf) > STALE_S:
+            return f"{POSE}: {self.pose_error}"
         lacking = [name for name in self.required_topics() if name not in self.received_s]
         if diagnostics.flight_stack is None and diagnostics.problem(now_s) is None:
             lacking.insert(0, "the status Heartbeat of MAVROS on /diagnostics")
@@ -255,9 +250,10 @@ class MavrosTelemetry:
         arms = not self.armed and self.flight_stack is not None and self.flight_stack.reports_readiness
         if (AHRS | (PREARM_CHECK if arms else 0)) & enabled & ~health:
             return False
-        if ESTIMATOR_STATUS not in self._messages:  # without an estimate there is no local position either
-            return True
-        flags = _flags(self._messages[ESTIMATOR_STATUS])
+        if (status := self._messages.get(ESTIMATOR_STATUS)) is None:
+            return True  # without an estimate there is no local position either
+        reported = (getattr(status, f"{name}_status_flag") for name in ESTIMATOR_FLAGS)
+        flags = sum(1 << bit for bit, flag in enumerate(reported) if flag)
         fresh = now_s - self.received_s[ESTIMATOR_STATUS] <= STALE_S
         return fresh and flags & FLYABLE == FLYABLE and not flags & CONST_POS_MODE
 
@@ -283,17 +279,13 @@ class MavrosTelemetry:
         self, local: Enu, yaw_rad: float, stamp_s: float, now_s: float, tilt_rad: float | None = None
     ) -> None:
         """Process a pose in MAVROS's local frame."""
-        if (why := self._order.refusal(stamp_s, now_s)) is not None:
+        if (why := self._order.check(stamp_s, now_s)) is not None:
             self.discarded[why] += 1
             return
         self._time.update(stamp_s, now_s)
         self.received_s[POSE] = now_s
-        self._local, self.yaw_rad, self._tilt_rad, self._pose_error = local, yaw_rad, tilt_rad, ""
+        self._local, self.yaw_rad, self._tilt_rad, self.pose_error = local, yaw_rad, tilt_rad, ""
         self._locate(now_s)
-
-    def on_invalid_pose(self, error: str) -> None:
-        """Record why a pose was rejected."""
-        self._pose_error = error
 
     def on_fix(self, has_fix: bool, latitude_deg: float, longitude_deg: float, now_s: float) -> None:
         """Process a NavSatFix; its altitude (above the ellipsoid) is not used."""
@@ -315,12 +307,6 @@ class MavrosTelemetry:
             self.rejections.on_status_text(message.severity, message.text, now_s)
         elif topic != STATE or message.connected:
             self._messages[topic], self.received_s[topic] = message, now_s
-
-
-def _flags(status: Any) -> int:
-    """ESTIMATOR_STATUS_FLAGS of an EstimatorStatus."""
-    flags = (getattr(status, f"{name}_status_flag") for name in ESTIMATOR_FLAGS)
-    return sum(1 << bit for bit, flag in enumerate(flags) if flag)
 
 
 def _finite(point: Any) -> Enu | None:

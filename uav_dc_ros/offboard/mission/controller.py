@@ -33,9 +33,8 @@ POLICY_LOST = "policy lost"
 class MissionController:
     """Controls one mission of one vehicle; a `checkpoint` is that of a mission that is resumed."""
 
-    is_strict: ClassVar[bool] = (
-        False  # an impossible transition raises PhaseError (in tests), or else ends it
-    )
+    # An impossible transition raises PhaseError (in tests); otherwise it ends the mission.
+    is_strict: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -9,7 +9,7 @@ from typing import Any
 
 from uav_dc_ros.offboard.flight_stacks import COPTERS, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, tilt_rad, to_enu
-from uav_dc_ros.offboard.stamp_order import StampOrder
+from uav_dc_ros.offboard.message_order import StampOrder
 from uav_dc_ros.offboard.vehicle import Mode, Telemetry
 
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: source of commands, by which their answers are recognised
@@ -106,11 +106,12 @@ class Px4Telemetry:
 
     def update(self, topic: str, message: Any, now_s: float) -> None:
         """Process a message, unless it is another vehicle's or out of order."""
-        why, status = None, self.status
+        why: str | None = None
+        status = self.status
         if topic == "vehicle_status" and status is not None and message.system_id != status.system_id:
             why = "of another system"
         elif (order := self._orders.get(topic)) is not None:
-            why = order.refusal(message.timestamp / 1e6, now_s)
+            why = order.check(message.timestamp / 1e6, now_s)
         if why is not None:
             self.discarded[why] += 1
             return

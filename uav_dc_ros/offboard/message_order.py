@@ -1,9 +1,10 @@
-"""Which messages of a vehicle are new: by MAVLink's sequence numbers, and by the vehicle's own time.
+"""Which messages of a vehicle are new: by MAVLink's sequence numbers, the vehicle's time, or ROS stamps.
 
 A datagram may arrive late, twice, or with an impossible time. A single such message is discarded, with its
 reason. Several messages that agree are accepted: the vehicle restarted, or more was lost than numbers show.
 """
 
+import math
 from enum import StrEnum
 
 SILENT_S = 0.5  # after this time without a message any number is accepted, steady clock
@@ -12,11 +13,12 @@ NUMBERS = 256  # of MAVLink's messages, which then wrap around
 REORDERED = 16  # a message at most this many numbers behind is accepted, if it is the newest of its name
 
 LAG_S = 1.0  # a message that is further behind the newest is late, vehicle time
-LEAP_S = 1.0  # a message that is further ahead needs others to confirm it, vehicle time
+LEAP_S = 1.0  # further ahead, a message needs others to confirm it, and a stamp is impossible
 CONFIRMED = 3  # messages that agree on a time further ahead
 RESTARTED = 5  # messages that agree on a time further back,
 RESTARTED_S = 1.0  # for this long, while none has a time of before, steady clock
 MAX_SPEED = 100.0  # of a simulator's time, times the clock
+RESYNC_S = 1.0  # time without an accepted message after which any stamp is accepted: reboot, clock change
 
 
 class Discard(StrEnum):
@@ -123,3 +125,26 @@ class VehicleClock:
         self._newest_ms[name] = boot_ms
         self._boot_s = max(self._boot_s or 0.0, boot_ms / 1e3)
         self._received_s = now_s
+
+
+class StampOrder:
+    """Order of the messages of one stream, by the sender's stamps. Unstamped streams are accepted."""
+
+    def __init__(self) -> None:
+        self._stamp_s, self._accepted_s = 0.0, -math.inf  # stamp and arrival of the last accepted message
+
+    def check(self, stamp_s: float, now_s: float) -> Discard | None:
+        """Why a message received at a steady time is discarded; None: it is new."""
+        if self._stamp_s:
+            passed_s, advance_s = now_s - self._accepted_s, stamp_s - self._stamp_s
+            if not advance_s:
+                return Discard.REPEATED
+            if passed_s <= RESYNC_S:
+                if not stamp_s:
+                    return Discard.ZEROED
+                if advance_s < 0:
+                    return Discard.LATE
+                if advance_s > LEAP_S + MAX_SPEED * passed_s:
+                    return Discard.IMPOSSIBLE
+        self._stamp_s, self._accepted_s = stamp_s, now_s
+        return None
