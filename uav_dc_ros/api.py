@@ -14,32 +14,21 @@ from uav_dc_ros.recordings.recorded_step import RecordedStep
 
 
 def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Missions:
-    """Fly one mission per seed in parallel, in numpy, without ROS.
+    """Fly one mission per seed of the users in parallel, in numpy, without ROS: results `[S]` each.
 
-    Args:
-        act: a policy, or a function from the missions' state (`core.world.State`, `[S, ...]`) to their
-            actions, integers `[S]`.
-        seeds: of the users, S of them.
+    `act` is a policy, or a function from the missions' state (`core.world.State`, `[S, ...]`) to their
+    actions, integers `[S]`.
 
-    Returns:
-        Results, `[S]` each.
-
-    Raises:
-        PolicyError: the policy does not fit the scenario.
+    Raises PolicyError if the policy does not fit the scenario.
     """
     return roll_out(scenario, greedy_act(act, scenario) if isinstance(act, Policy) else act, seeds)
 
 
 def read_steps(bag: str | Path, namespace: str | None = None) -> Iterator[RecordedStep]:
-    """The steps of the missions in a bag, in order, with bounded memory.
+    """The steps of the missions in a bag (a folder, or one of its files), in order, with bounded memory.
 
-    Args:
-        bag: folder of a bag, or one of its files.
-        namespace: of the missions; None: the only one in the bag.
-
-    Raises:
-        BagError: the bag cannot be read, or has no such missions.
-        ScenarioError: the bag's scenario cannot be read.
+    `namespace` is that of the missions; None: the only one in the bag. Raises BagError if the bag cannot be
+    read, or has no such missions, and ScenarioError if its scenario cannot be read.
     """
     with BagReader(Path(bag)) as reader:
         name = step_reader.namespace(reader, namespace)

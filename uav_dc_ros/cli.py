@@ -106,10 +106,9 @@ def namespace(text: str) -> str:
 
 
 def without_verb(word: str, verbs: Mapping[str, tuple[str, str]], prog: str, description: str) -> int:
-    """Print the help or the version of a command with verbs; `verbs` holds a module and a description each.
+    """Print help or version of a command with verbs, which have a module and a description each.
 
-    Raises:
-        ParameterError: `word` is none of --help, -h and --version.
+    Raises ParameterError for a `word` other than --help, -h and --version.
     """
     if word == "--version":
         print(__version__)
@@ -260,9 +259,7 @@ class _OutputStream(io.TextIOBase):
 class LiveDisplay:
     """A progress bar on a terminal, plain lines elsewhere; a context manager.
 
-    Args:
-        columns: of the bar, after the description and the bar itself.
-        settings: of rich's Progress.
+    `columns` follow the description and the bar itself; `settings` are those of rich's Progress.
     """
 
     def __init__(self, *columns: "ProgressColumn", **settings: Any) -> None:

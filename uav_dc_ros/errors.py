@@ -10,11 +10,7 @@ class ScenarioError(UavDcError):
 
 
 class MessageError(UavDcError):
-    """A payload that does not match its schema.
-
-    Attributes:
-        reason: short, stable name of the error (`malformed`, `invalid`, ...), for counters.
-    """
+    """A payload that does not match its schema; `reason` names the error (`malformed`, ...) for counters."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)

@@ -97,7 +97,19 @@ class Stepped(RunPayload, frozen=True, kw_only=True):
     step: Annotated[Index, Meta(description="steps flown in this mission")]
 
 
-class Users(Stepped, frozen=True, kw_only=True):
+class PerUser(Stepped, frozen=True, kw_only=True):
+    """A payload whose lists are columns of equal lengths, with an entry per user."""
+
+    def __post_init__(self) -> None:
+        """Reject columns of different lengths."""
+        values = {name: getattr(self, name) for name in self.__struct_fields__}
+        lengths = {name: len(column) for name, column in values.items() if isinstance(column, list)}
+        if len(set(lengths.values())) > 1:
+            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise ValueError(f"columns of different length: {listed}")
+
+
+class Users(PerUser, frozen=True, kw_only=True):
     """Positions of the users, frame `map` (ENU). Columns have equal lengths, an entry per user."""
 
     stamp_ns: Annotated[
@@ -108,12 +120,8 @@ class Users(Stepped, frozen=True, kw_only=True):
     x_m: Annotated[list[float], Meta(description="metres east")]
     y_m: Annotated[list[float], Meta(description="metres north")]
 
-    def __post_init__(self) -> None:
-        """Reject columns of different lengths."""
-        _check_lengths(self, "cluster", "x_m", "y_m")
 
-
-class Rates(Stepped, frozen=True, kw_only=True):
+class Rates(PerUser, frozen=True, kw_only=True):
     """The channel during a step, and the data after it. Columns have equal lengths, an entry per user."""
 
     sum_rate_bps: Annotated[NotNegative, Meta(description="sum of the rates of the served users, bit/s")]
@@ -122,10 +130,6 @@ class Rates(Stepped, frozen=True, kw_only=True):
     data_bits: Annotated[list[NotNegative], Meta(description="data collected in this mission, bit")]
     served: Annotated[list[bool], Meta(description="within range and not collected before this step")]
     collected: Annotated[list[bool], Meta(description="has sent enough data")]
-
-    def __post_init__(self) -> None:
-        """Reject columns of different lengths."""
-        _check_lengths(self, "sinr", "rate_bps", "data_bits", "served", "collected")
 
 
 class Mission(Stepped, frozen=True, kw_only=True):
@@ -254,13 +258,6 @@ def one_line(text: str) -> str:
     """A text from outside as at most `TEXT_MAX` characters in one line, without control characters."""
     line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:TEXT_MAX])
     return line if len(line) < TEXT_MAX else f"{line[: TEXT_MAX - 3]}..."
-
-
-def _check_lengths(payload: Payload, *columns: str) -> None:
-    lengths = {name: len(getattr(payload, name)) for name in columns}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise ValueError(f"columns of different length: {listed}")
 
 
 def schema_text(kind: type[Payload]) -> str:

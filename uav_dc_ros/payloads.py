@@ -65,11 +65,10 @@ def counted_data(payload: messages.Rates, scenario: Scenario) -> Array:
 
 
 def check(payload: messages.Payload, scenario: Scenario) -> None:
-    """Reject a payload of another world.
+    """Raise MessageError for a payload of another world.
 
-    Raises:
-        MessageError: a mission with another fingerprint, a cell outside the grid, or more steps than the
-            battery allows; users, or rates of users, other than the scenario's.
+    That is a mission with another fingerprint, a cell outside the grid, or more steps than the battery
+    allows; users, or rates of users, other than the scenario's.
     """
     match payload:
         case messages.Mission() if payload.fingerprint != scenario.fingerprint:

@@ -28,72 +28,47 @@ LIVE_PORT = 8765  # Foxglove's default
 
 def parser(prog: str = PROG) -> cli.Parser:
     """The command line."""
-    options = cli.Parser(
-        prog=prog,
-        description="Fly recorded missions with a trained policy: world, channel monitor, policy and "
-        "recorder as separate ROS 2 nodes.",
+    description = (
+        "Fly recorded missions with a trained policy: world, channel monitor, policy and recorder as "
+        "separate ROS 2 nodes."
     )
+    options = cli.Parser(prog=prog, description=description)
     add = options.add_argument
-    add(
-        "--scenario",
-        default="five_clusters",
-        metavar="NAME|FILE",
-        help="shipped scenario, or a TOML file (default: %(default)s)",
+    scenario = "shipped scenario, or a TOML file (default: %(default)s)"
+    add("--scenario", default="five_clusters", metavar="NAME|FILE", help=scenario)
+    policy = "shipped policy, or its folder (default: the scenario's name with '_dueling')"
+    add("--policy", metavar="NAME|DIR", help=policy)
+    seed = "seed of the users (default: %(default)s)"
+    add("--seed", type=cli.whole_number(0), default=0, metavar="N", help=seed)
+    missions = "missions, with seeds N, N+1, ... (default: %(default)s)"
+    add("--missions", type=cli.count, default=1, metavar="N", help=missions)
+    pace = (
+        "as fast as the nodes can, or how many times faster than real time (default: %(default)g); not for a "
+        "real vehicle"
     )
-    add(
-        "--policy",
-        metavar="NAME|DIR",
-        help="shipped policy, or its folder (default: the scenario's name with '_dueling')",
+    add("--pace", type=_pace, default=paces.WATCHABLE, metavar="lockstep|FACTOR", help=pace)
+    real = options.add_argument_group("a real vehicle, or one of another simulator").add_argument
+    vehicle = (
+        "what flies: the world node's own, or an autopilot's over MAVLink, MAVROS or PX4's uXRCE-DDS "
+        "(default: %(default)s)"
     )
-    seed = cli.whole_number(0)
-    add("--seed", type=seed, default=0, metavar="N", help="seed of the users (default: %(default)s)")
-    add(
-        "--missions",
-        type=cli.count,
-        default=1,
-        metavar="N",
-        help="missions, with seeds N, N+1, ... (default: %(default)s)",
+    real("--vehicle", choices=(SIMULATED, *VEHICLES), default=SIMULATED, help=vehicle)
+    connect = (
+        "of a vehicle on MAVLink: tcp:HOST:PORT, udp:HOST:PORT (listens), udpout:HOST:PORT, "
+        "serial:DEVICE:BAUD"
     )
-    add(
-        "--pace",
-        type=_pace,
-        default=paces.WATCHABLE,
-        metavar="lockstep|FACTOR",
-        help="as fast as the nodes can, or how many times faster than real time (default: %(default)g); not "
-        "for a real vehicle",
+    real("--connect", metavar="ADDRESS", help=connect)
+    number = cli.whole_number(1, SYSTEM_MAX, f"a MAVLink system number from 1 to {SYSTEM_MAX}")
+    system = "MAVLink system number of the vehicle, 1 to 255 (default: the only autopilot on the link)"
+    real("--system", type=number, metavar="N", help=system)
+    arm = "set the mode, arm and take off; without it a pilot does the first two"
+    real("--arm", action="store_true", help=arm)
+    datum = (
+        "position of the grid's corner: such that the vehicle stands at the scenario's start, that of "
+        "the last flight, or coordinates; required with --arm (default: here)"
     )
-    vehicle = options.add_argument_group("a real vehicle, or one of another simulator").add_argument
-    vehicle(
-        "--vehicle",
-        choices=(SIMULATED, *VEHICLES),
-        default=SIMULATED,
-        help="what flies: the world node's own, or an autopilot's over MAVLink, MAVROS or PX4's uXRCE-DDS "
-        "(default: %(default)s)",
-    )
-    vehicle(
-        "--connect",
-        metavar="ADDRESS",
-        help="of a vehicle on MAVLink: tcp:HOST:PORT, udp:HOST:PORT (listens), udpout:HOST:PORT, "
-        "serial:DEVICE:BAUD",
-    )
-    vehicle(
-        "--system",
-        type=cli.whole_number(1, SYSTEM_MAX, f"a MAVLink system number from 1 to {SYSTEM_MAX}"),
-        metavar="N",
-        help="MAVLink system number of the vehicle, 1 to 255 (default: the only autopilot on the link)",
-    )
-    vehicle(
-        "--arm",
-        action="store_true",
-        help="set the mode, arm and take off; without it a pilot does the first two",
-    )
-    vehicle(
-        "--datum",
-        metavar="here|last|LAT,LON,ALT",
-        help="position of the grid's corner: such that the vehicle stands at the scenario's start, that of "
-        "the last flight, or coordinates; required with --arm (default: here)",
-    )
-    vehicle(
+    real("--datum", metavar="here|last|LAT,LON,ALT", help=datum)
+    real(
         "--set",
         dest="settings",
         type=_setting,
@@ -105,34 +80,17 @@ def parser(prog: str = PROG) -> cli.Parser:
     recording = options.add_mutually_exclusive_group().add_argument
     recording("--bag", type=Path, metavar="DIR", help="folder of the new bag (default: a dated one in bags/)")
     recording("--no-record", action="store_true", help="fly without a bag")
-    cli.add_namespace(
-        options, "namespace of the mission: several fly side by side on one network, each in its own"
-    )
-    add(
-        "--nodes",
-        type=cli.names("names of nodes"),
-        metavar="A,B,...",
-        help="nodes to start on this host, the others being started elsewhere (default: all)",
-    )
-    add(
-        "--compose",
-        action=argparse.BooleanOptionalAction,
-        help="world, channel monitor and policy in one process (default: in lockstep)",
-    )
-    add(
-        "--live",
-        type=cli.whole_number(0, PORT_MAX, f"a TCP port from 0 (any) to {PORT_MAX}"),
-        nargs="?",
-        const=LIVE_PORT,
-        metavar="PORT",
-        help="serve the mission to Foxglove over WebSocket (default port: %(const)s)",
-    )
-    add(
-        "--summary",
-        type=Path,
-        metavar="FILE",
-        help="write the summary as JSON, also to /dev/stdout, a FIFO or a device",
-    )
+    namespace = "namespace of the mission: several fly side by side on one network, each in its own"
+    cli.add_namespace(options, namespace)
+    nodes = "nodes to start on this host, the others being started elsewhere (default: all)"
+    add("--nodes", type=cli.names("names of nodes"), metavar="A,B,...", help=nodes)
+    compose = "world, channel monitor and policy in one process (default: in lockstep)"
+    add("--compose", action=argparse.BooleanOptionalAction, help=compose)
+    port = cli.whole_number(0, PORT_MAX, f"a TCP port from 0 (any) to {PORT_MAX}")
+    live = "serve the mission to Foxglove over WebSocket (default port: %(const)s)"
+    add("--live", type=port, nargs="?", const=LIVE_PORT, metavar="PORT", help=live)
+    summary = "write the summary as JSON, also to /dev/stdout, a FIFO or a device"
+    add("--summary", type=Path, metavar="FILE", help=summary)
     add("--version", action="version", version=__version__)
     return options
 
@@ -170,12 +128,8 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
     restored at the end. In the main thread Ctrl-C stops the nodes in order and closes the bag; other threads
     handle no signal. A process can have one run at a time.
 
-    Args:
-        config: the run; by default one mission of ten seconds.
-        show: whether progress and summary are printed.
-
-    Returns:
-        One summary per mission. That of an aborted mission has the outcome `aborted`, and a reason.
+    The default `config` is one mission of ten seconds. Progress and summary are printed if `show`. Returns a
+    summary per mission. That of an aborted mission has the outcome `aborted`, and a reason.
 
     Raises:
         UavDcError: a value that cannot be flown (nothing was started), or an incomplete bag.

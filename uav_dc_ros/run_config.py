@@ -24,50 +24,31 @@ OPTIONAL = ("policy", "bag", "summary", "system", "live", "compose")
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """A run of missions: the options of run_all. `MissionRunner` checks what depends on this machine.
+    """A run of missions: the options of run_all. Raises ParameterError for an invalid value.
 
-    Attributes:
-        scenario: name of a shipped scenario, or the path of a TOML file.
-        policy: name of a shipped policy, or its folder; None: the scenario's name with `_dueling`.
-        seed: seed of the first mission's users; each further mission takes the next one.
-        missions: number of missions.
-        pace: how many times faster than real time, or `lockstep`: as fast as the nodes can.
-        vehicle: `simulated`, `mavlink`, `mavros` or `px4`.
-        connect: address of a vehicle on MAVLink.
-        system: its MAVLink system number; None: the only autopilot on the link.
-        arm: whether the bridge arms the vehicle and takes off.
-        datum: position of the grid's corner: `here`, `last` or `LAT,LON,ALT`.
-        settings: parameters of nodes by `NODE.PARAMETER`. Text is parsed as by `--set`.
-        bag: folder of the new bag; None: a dated one in `bags/`.
-        record: whether a bag is written.
-        namespace: ROS namespace of the mission.
-        nodes: nodes to start on this host; None: all.
-        compose: whether world, channel monitor and policy share a process; None: in lockstep.
-        live: TCP port of the Foxglove server; None: no server.
-        summary: JSON file for the summary; None: no file.
-
-    Raises:
-        ParameterError: an invalid value.
+    `MissionRunner` checks what depends on this machine.
     """
 
-    scenario: str | Path = "five_clusters"
-    policy: str | Path | None = None
-    seed: int = 0
-    missions: int = 1
-    pace: float | Literal["lockstep"] = paces.WATCHABLE
-    vehicle: str = SIMULATED
-    connect: str | None = None
-    system: int | None = None
-    arm: bool = False
-    datum: str | None = None
+    scenario: str | Path = "five_clusters"  # name of a shipped scenario, or the path of a TOML file
+    policy: str | Path | None = None  # shipped policy, or its folder; None: scenario's name with `_dueling`
+    seed: int = 0  # seed of the first mission's users; each further mission takes the next one
+    missions: int = 1  # number of missions
+    pace: float | Literal["lockstep"] = paces.WATCHABLE  # times faster than real time, or as fast as possible
+    vehicle: str = SIMULATED  # `simulated`, `mavlink`, `mavros` or `px4`
+    connect: str | None = None  # address of a vehicle on MAVLink
+    system: int | None = None  # its MAVLink system number; None: the only autopilot on the link
+    arm: bool = False  # whether the bridge arms the vehicle and takes off
+    datum: str | None = None  # position of the grid's corner: `here`, `last` or `LAT,LON,ALT`
+    # Parameters of nodes by `NODE.PARAMETER`. Text is parsed as by `--set`.
     settings: Mapping[str, object] = field(default_factory=dict)
-    bag: str | Path | None = None
-    record: bool = True
-    namespace: str = "/"
-    nodes: tuple[str, ...] | None = None
+    bag: str | Path | None = None  # folder of the new bag; None: a dated one in `bags/`
+    record: bool = True  # whether a bag is written
+    namespace: str = "/"  # ROS namespace of the mission
+    nodes: tuple[str, ...] | None = None  # nodes to start on this host; None: all
+    # Whether world, channel monitor and policy share a process; None: in lockstep.
     compose: bool | None = None
-    live: int | None = None
-    summary: str | Path | None = None
+    live: int | None = None  # TCP port of the Foxglove server; None: no server
+    summary: str | Path | None = None  # JSON file for the summary; None: no file
 
     def __post_init__(self) -> None:
         """Check each value."""

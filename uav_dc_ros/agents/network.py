@@ -1,9 +1,8 @@
 """The Q-network: one definition, as functions over a dict of arrays.
 
 It runs on numpy (a node in flight) and on torch (training, with gradients). Parameters may have leading run
-dimensions: `[N, in, out]` are N independent networks for observations `[N, B, D]`; `[in, out]` is one
-    network for
-`[B, D]`.
+dimensions: `[N, in, out]` are N independent networks for observations `[N, B, D]`; `[in, out]` is one network
+for `[B, D]`.
 """
 
 import math

@@ -56,11 +56,9 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     format: Literal[1] = 1  # version of this file's layout
     name: Annotated[str, Meta(pattern=NAME)]  # the policy's name
     algorithm: Algorithm  # `dqn` or `dueling_dqn`
-    # Subtracted from the advantage by the dueling network; ignored for `dqn`
-    aggregation: network.Aggregation = "mean"
+    aggregation: network.Aggregation = "mean"  # subtracted by the dueling network; ignored for `dqn`
     observation: Observation  # encoding, see `core.observations`
-    # Units of each hidden layer
-    hidden: Annotated[tuple[network.Width, ...], Meta(min_length=1, max_length=16)]
+    hidden: Annotated[tuple[network.Width, ...], Meta(min_length=1, max_length=16)]  # units of each layer
     actions: tuple[str, ...] = ACTION_LABELS  # labels of the actions, in the order of the network's outputs
     hyperparameters: Hyperparameters  # of training
     seed: Annotated[int, Meta(ge=0)]  # seed of its run
@@ -99,17 +97,15 @@ class Policy:
 
     @cached_property
     def _float64(self) -> network.Parameters:
-        # The last digit of a product depends on the batch size: in float64 it cannot decide between two
-        # actions.
+        # The last digit of a product depends on the batch size: in float64 it cannot decide an action.
         return {name: np.asarray(values, np.float64) for name, values in self.parameters.items()}
 
     def observe(
         self, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
     ) -> Array:
         """The policy's observation of a mission, float32 `[..., D]`; see `core.observations.encode`."""
-        kind = self.config.observation
         return observations.encode(
-            kind, scenario, cell=cell, step=step, data_bits=data_bits, collected=collected
+            self.config.observation, scenario, cell=cell, step=step, data_bits=data_bits, collected=collected
         )
 
     def q_values(self, observation: Array) -> Array:

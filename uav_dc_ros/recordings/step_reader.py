@@ -118,12 +118,8 @@ class Steps:
     """Iterates over the steps of all missions in a namespace, in order, in bounded memory.
 
     A step is released when it is complete and newer ones have come. An incomplete step waits for late
-    messages, within `OPEN_MAX` and `OPEN_BYTES_MAX`.
-
-    Args:
-        reader: of the bag.
-        namespace: as `namespace` returns it.
-        step_ns: duration of a step; later poses do not belong to it.
+    messages, within `OPEN_MAX` and `OPEN_BYTES_MAX`. Poses later than `step_ns`, its duration, do not belong
+    to a step.
 
     Raises:
         BagError: a topic has another type.
@@ -160,7 +156,10 @@ class Steps:
             topic = self._topics[message.topic]
             try:
                 if topic == "pose":
-                    self._add_pose(read_pose(message)._replace(order=order))
+                    pose = read_pose(message)._replace(order=order)
+                    self._poses.append(pose)
+                    for step in self._open.values():
+                        self._assign(step, pose)
                     continue
                 payload = messages.decode(cdr.decode_string(message.data), messages.PAYLOADS[topic])
             except MessageError as error:
@@ -248,11 +247,6 @@ class Steps:
             step.clock_resets = resets
             for pose in self._poses:
                 self._assign(step, pose)
-
-    def _add_pose(self, pose: RecordedPose) -> None:
-        self._poses.append(pose)
-        for step in self._open.values():
-            self._assign(step, pose)
 
     def _assign(self, step: RecordedStep, pose: RecordedPose) -> None:
         """Add a pose to a step if it is of the step's own time, by the rule of the channel monitor."""

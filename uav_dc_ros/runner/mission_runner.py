@@ -61,10 +61,7 @@ class Network:
 
 
 class MissionRunner:
-    """A run of missions; prints progress and summary if `show`.
-
-    Raises UavDcError before anything was started or written, if the run cannot be flown.
-    """
+    """A run of missions. Raises UavDcError before anything is started or written if it cannot be flown."""
 
     def __init__(self, config: RunConfig, *, show: bool = True) -> None:
         self.config = config
@@ -109,10 +106,7 @@ class MissionRunner:
             return self._console
 
     def run(self) -> int:
-        """Fly; returns the exit status of the command.
-
-        It uses its own ROS context, and sets no signal handler.
-        """
+        """Fly, in a ROS context of its own and without signal handlers; returns the command's exit status."""
         status = 0
         with tempfile.TemporaryDirectory(prefix="uav_dc_ros_") as temporary, ExitStack() as stack:
             folder = Path(temporary)

@@ -19,15 +19,10 @@ SOCKETS = Path("/proc/net/unix")  # lists the names of all Unix sockets of this 
 
 @contextmanager
 def held(domain: int, nodes: Sequence[str], run: str) -> Iterator[None]:
-    """Hold the locks of nodes.
+    """Hold the locks of nodes, by full names such as `/uav1/world`, in a ROS domain.
 
-    Args:
-        domain: the ROS domain.
-        nodes: full names of the nodes, such as `/uav1/world`.
-        run: identity of the run, shown to others that are refused; empty: unknown.
-
-    Raises:
-        AnotherMissionError: another process holds the lock of one of the nodes.
+    `run` is shown to others that are refused; empty: unknown. Raises AnotherMissionError if another process
+    holds one of the locks.
     """
     with ExitStack() as stack:
         for node in nodes:

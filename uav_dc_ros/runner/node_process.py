@@ -25,16 +25,10 @@ READER_S = 1.0  # timeout for the last lines of output
 
 
 class NodeProcess:
-    """A running process of one node, or of several.
+    """A running process of one node, or of several, with ROS parameters by node name.
 
-    Args:
-        parameters: ROS parameters by node name.
-        restarts: number of earlier processes of these nodes.
-        folder: for the parameter file.
-        on_line: called from a thread with the name of the process and each line of its output.
-
-    Raises:
-        NodeError: the parameter file cannot be written.
+    `restarts` counts earlier processes of these nodes. A thread calls `on_line` with the name of the process
+    and each line of its output. Raises NodeError if the parameter file cannot be written into `folder`.
     """
 
     def __init__(

@@ -62,14 +62,10 @@ class SupervisedNode:
 
 
 class Supervisor:
-    """The nodes of a mission on this host; a context manager that stops all processes.
+    """The nodes of a mission on this host, with ROS parameters by name; a context manager that stops them.
 
-    Args:
-        parameters: ROS parameters by node name.
-        composed: names of nodes that share a process. After its end each gets its own, which isolates a
-            faulty node.
-        folder: for parameter files.
-        on_line: called from threads with the name of a process and a line of its output.
+    `composed` nodes share a process. After its end each gets its own, which isolates a faulty node. `folder`
+    is for parameter files. Threads call `on_line` with the name of a process and a line of its output.
     """
 
     def __init__(
@@ -124,8 +120,7 @@ class Supervisor:
     def tick(self, may_bring_up: bool) -> None:
         """Bring nodes up, if they may be, and restart them; to be called often.
 
-        Raises:
-            NodeError: a required node cannot be brought up, gave up, or has too many restarts.
+        Raises NodeError if a required node cannot be brought up, gave up, or has too many restarts.
         """
         self._check_reports()
         for node in list(self.nodes):

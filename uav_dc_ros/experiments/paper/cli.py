@@ -19,7 +19,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainin
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.paper.setting import SCALES
+from uav_dc_ros.experiments.paper.setting import SCALES, PlannedRun
 from uav_dc_ros.experiments.paper.shards import Shard, result_file
 from uav_dc_ros.experiments.paper.workers import train_locally, train_on_ray
 from uav_dc_ros.experiments.train.progress import ProgressBar
@@ -30,11 +30,9 @@ if TYPE_CHECKING:
 
 PROG = "python -m uav_dc_ros.paper"
 NETWORKS_FILE = "trajectories.safetensors"
-# The options that the shards in a folder belong to.
-_PLAN_FILE = "plan.json"
+_PLAN_FILE = "plan.json"  # the options that the shards in a folder belong to
 _FROM_TRAIN = 'is not installed; expected it from: pip install "uav_dc_ros[train]"'
-# Seconds between two lines of progress without a terminal.
-_LINE_EVERY_S = 30.0
+_LINE_EVERY_S = 30.0  # between two lines of progress without a terminal
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -81,7 +79,7 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         networks = sweep.load_networks(out / NETWORKS_FILE, scale)
     else:
         try:
-            results, networks = _train(options, command)
+            results, networks = _train(planned, options, command)
         except KeyboardInterrupt:
             hint = "; --resume continues" if out.exists() else ""
             print(f"{PROG}: stopped{hint}", file=sys.stderr)
@@ -92,13 +90,14 @@ def _paper(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _train(options: argparse.Namespace, command: str) -> "tuple[Results, Networks]":
+def _train(
+    planned: Sequence[PlannedRun], options: argparse.Namespace, command: str
+) -> "tuple[Results, Networks]":
     """Trains the planned runs, and saves the results."""
-    from uav_dc_ros.experiments.paper import plan, sweep
+    from uav_dc_ros.experiments.paper import sweep
     from uav_dc_ros.experiments.paper.results import Metadata, ScenarioFacts
 
     scale, out = SCALES[options.scale], options.out
-    planned = plan.runs(scale, options.only)
     folder = out / "shards"
     resumed = _reserve(folder, options)
     started = time.monotonic()
@@ -115,13 +114,11 @@ def _train(options: argparse.Namespace, command: str) -> "tuple[Results, Network
     finally:
         _discard_empty(folder)
     local = f"{options.workers} processes on {_cores()} cores of {platform.machine()}"
+    names = sorted({one.setting.scenario for one in planned})
     metadata = Metadata(
         command=command,
         scale=scale,
-        worlds={
-            name: ScenarioFacts.of(scenarios.load(name))
-            for name in sorted({one.setting.scenario for one in planned})
-        },
+        worlds={name: ScenarioFacts.of(scenarios.load(name)) for name in names},
         greedy_missions=sweep.GREEDY_SEEDS[1],
         wall_time_s=None if resumed else time.monotonic() - started,
         device=f"Ray cluster {options.ray}" if options.ray is not None else local,

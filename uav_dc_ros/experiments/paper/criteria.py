@@ -13,8 +13,7 @@ from uav_dc_ros.experiments.paper.setting import Ratio, Setting, name
 
 Verdict: TypeAlias = Literal["holds", "does not hold", "undecided", "not tested"]
 
-# Relative margin of "similar" and "stable".
-MARGIN = 0.05
+MARGIN = 0.05  # relative, of "similar" and "stable"
 
 # Fixed before any result of the sweep was seen.
 RULES = f"""\
@@ -94,7 +93,12 @@ def beside(criterion: Criterion) -> Criterion:
 def greater(text: str, effect: Array | Interval, unit: str) -> Criterion:
     """A direction: the effect, `[E]` or its interval, is above 0."""
     effect = effect if isinstance(effect, Interval) else interval(effect)
-    return Criterion(text, effect, unit, "above 0", _direction(effect))
+    verdict: Verdict = "undecided"
+    if effect.low > 0:
+        verdict = "holds"
+    elif effect.high <= 0:
+        verdict = "does not hold"
+    return Criterion(text, effect, unit, "above 0", verdict)
 
 
 def over_ratios(text: str, effects: Array, ratios: Sequence[Ratio], unit: str) -> Criterion:
@@ -163,12 +167,6 @@ def fall(values: Array) -> Array:
     """Decrease of a measure per step from ratio to ratio (least squares), `[E, R]` to `[E]`."""
     rank = np.arange(values.shape[1]) - (values.shape[1] - 1) / 2
     return -(values * rank).sum(axis=1) / (rank**2).sum()
-
-
-def _direction(effect: Interval) -> Verdict:
-    if effect.low > 0:
-        return "holds"
-    return "does not hold" if effect.high <= 0 else "undecided"
 
 
 def _signs(effects: Array, ratios: Sequence[Ratio]) -> str:

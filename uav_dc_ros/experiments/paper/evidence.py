@@ -7,12 +7,9 @@ from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Results
 from uav_dc_ros.experiments.paper.setting import Setting, domain
 
-# Last share of the episodes, whose mean is the performance of a run.
-FINAL = 0.2
-# Points of a curve's moving average: fifty episodes in the full sweep.
-SMOOTHING = 5
-# Share of the way to its final level after which a run has converged.
-SETTLED = 0.9
+FINAL = 0.2  # last share of the episodes, whose mean is the performance of a run
+SMOOTHING = 5  # points of a curve's moving average: fifty episodes in the full sweep
+SETTLED = 0.9  # share of the way to its final level after which a run has converged
 
 
 class NotMeasured(Exception):

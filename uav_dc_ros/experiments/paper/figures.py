@@ -24,8 +24,7 @@ from uav_dc_ros.experiments.paper.plan import FIGURES, FigurePlan, Panel, figure
 from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import Scale, Setting, domain, name
 
-# Dots per inch: of a figure, and of pictures of missions, which are not scaled.
-_DPI, _PICTURE_DPI = 150, 100
+_DPI, _PICTURE_DPI = 150, 100  # of a figure, and of pictures of missions, which are not scaled
 # Sizes in inches: of a panel, and of its margins.
 _WIDE, _HIGH, _LEFT, _RIGHT, _BELOW, _ABOVE = 5.3, 3.3, 0.75, 0.25, 0.6, 0.8
 # Metric: title of the axis, divisor. The words of `MISSION_REWARD` replace r^t.

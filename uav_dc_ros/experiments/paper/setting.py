@@ -21,10 +21,8 @@ from uav_dc_ros.experiments.train.population import Run
 
 Ratio: TypeAlias = tuple[float, float]
 
-# The paper's state: a network's input is the UAV's cell.
-OBSERVATION: Observation = "position"
-# The paper names no layers. Two of 64 are ample for the 363 cells of the field.
-HIDDEN = (64, 64)
+OBSERVATION: Observation = "position"  # the paper's state: a network's input is the UAV's cell
+HIDDEN = (64, 64)  # the paper names no layers; two of 64 are ample for the 363 cells of the field
 ALGORITHMS: tuple[Algorithm, ...] = ("dqn", "dueling_dqn")
 R_PLUS: tuple[RPlus, ...] = ("binary", "exponential")
 FORMS: tuple[RewardForm, ...] = ("immediate", "episode")

@@ -27,8 +27,7 @@ from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.rollout import Missions
 from uav_dc_ros.experiments.train.population import Population
 
-# Called with the name of a shard, and the episodes flown by each of its runs.
-OnProgress = Callable[[str, int], None]
+OnProgress = Callable[[str, int], None]  # gets the name of a shard, and the episodes flown by each run
 _CHECKPOINT_EVERY_S = 30.0
 # The modules that train a shard; everything that they import decides its result.
 _ROOTS = ("uav_dc_ros.experiments.paper.shards", "uav_dc_ros.experiments.train.checkpoint")

@@ -27,13 +27,10 @@ from uav_dc_ros.experiments.train.population import Population, architecture, la
 # Runs of a shard: enough to hide the overhead of an operation, few enough for a core's cache, and enough
 # shards to keep the workers busy to the end.
 _SHARD_RUNS = 128
-# First seed of the greedy missions and their number: disjoint from training, validation and test.
-GREEDY_SEEDS = (2_000_000, 20)
+GREEDY_SEEDS = (2_000_000, 20)  # first seed and number; disjoint from training, validation and test
 
-# The result of each run's shard, and the index of the run in it.
-RunResults: TypeAlias = dict[PlannedRun, tuple[ShardResult, int]]
-# Trained networks of the figure `Traj`, by environment.
-Networks: TypeAlias = dict[int, network.Parameters]
+RunResults: TypeAlias = dict[PlannedRun, tuple[ShardResult, int]]  # result of its shard, and its index there
+Networks: TypeAlias = dict[int, network.Parameters]  # trained ones of the figure `Traj`, by environment
 
 
 def make_shards(planned: Sequence[PlannedRun], scale: Scale) -> list[tuple[Shard, list[PlannedRun]]]:
