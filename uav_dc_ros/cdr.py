@@ -35,11 +35,7 @@ def encode_string(text: bytes) -> bytes:
 
 
 def byte_order(data: bytes) -> Literal["little", "big"]:
-    """The byte order of a serialised message, by its encapsulation header.
-
-    Raises:
-        MessageError: the encapsulation is not plain CDR, or is missing.
-    """
+    """The byte order of a serialised message; raises MessageError if its encapsulation is not plain CDR."""
     kind = data[:2] if len(data) >= HEADER_BYTES else b""
     if kind == CDR_LITTLE_ENDIAN[:2]:
         return "little"
@@ -52,11 +48,7 @@ def byte_order(data: bytes) -> Literal["little", "big"]:
 
 
 def decode_string(data: bytes) -> bytes:
-    """The bytes of the text in a std_msgs/String.
-
-    Raises:
-        MessageError: the encapsulation is not plain CDR, or the text is shorter than its length field.
-    """
+    """The bytes of the text in a std_msgs/String; raises MessageError if it is torn or not plain CDR."""
     length = int.from_bytes(data[4:8], byte_order(data))  # with the terminating zero
     if len(data) < 8 + length:
         raise MessageError("malformed", f"{len(data) - 8} bytes of text; expected {length}, its length field")
@@ -117,12 +109,7 @@ def encode_pose(position_m: Array, time_ns: int) -> bytes:
 class Pose:
     """A decoded geometry_msgs/PoseStamped in the frame `map`.
 
-    Attributes:
-        position_m: x, y, altitude.
-        body: the message in little endian, without its encapsulation header.
-
-    Raises:
-        MessageError: no such message, another frame, or a position that is not finite.
+    Raises MessageError for no such message, another frame, or a position that is not finite.
     """
 
     __slots__ = ("body", "position_m", "stamp_ns")
@@ -130,14 +117,14 @@ class Pose:
     def __init__(self, data: bytes) -> None:
         if not data.startswith(CDR_LITTLE_ENDIAN + data[HEADER_BYTES : HEADER_BYTES + 8] + _FRAME_CDR):
             data = _reencoded(data)
-        self.body = data[HEADER_BYTES : HEADER_BYTES + _POSE.size]
+        self.body = data[HEADER_BYTES : HEADER_BYTES + _POSE.size]  # little endian, without encapsulation
         if len(self.body) < _POSE.size:
             raise MessageError(
                 "malformed", f"{len(data)} bytes; expected a pose of {HEADER_BYTES + _POSE.size}"
             )
         sec, nanosec, _, x_m, y_m, z_m, *_ = _POSE.unpack(self.body)
         self.stamp_ns: int = sec * 10**9 + nanosec
-        self.position_m: tuple[float, float, float] = (x_m, y_m, z_m)
+        self.position_m: tuple[float, float, float] = (x_m, y_m, z_m)  # x, y, altitude
         check_position(FRAME, self.position_m)
 
 

@@ -25,11 +25,7 @@ _FOLDER_SYNC_ERRORS = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
 
 def shipped_folder(name: str) -> Path:
-    """The folder `policies`, `msgs_json` or one in `share`: inside the package, or beside it in a checkout.
-
-    Raises:
-        FileNotFoundError: the installation lacks the folder.
-    """
+    """The folder `policies`, `msgs_json` or one in `share`: in the package, or beside it in a checkout."""
     candidates = (_PACKAGE / name, _PACKAGE.parent / name)
     for folder in candidates:
         if folder.is_dir():
@@ -38,11 +34,7 @@ def shipped_folder(name: str) -> Path:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a whole file.
-
-    Raises:
-        UavDcError: the file cannot be written; a regular file keeps its previous content.
-    """
+    """Write a whole file; after a UavDcError a regular file keeps its previous content."""
     try:
         if is_replaced(path):
             with replacing(path) as partial:
@@ -65,11 +57,7 @@ def is_replaced(path: Path) -> bool:
 
 
 def check_writable(path: Path) -> None:
-    """Reject, before any work is done, what `write` cannot write.
-
-    Raises:
-        UavDcError: the file cannot be written.
-    """
+    """Raise UavDcError, before any work is done, for what `write` cannot write."""
     try:
         descriptor = _descriptor(path)
         if descriptor is not None:
@@ -89,11 +77,8 @@ def check_writable(path: Path) -> None:
 def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """A temporary file that replaces `path` if the block succeeds, and is removed otherwise.
 
-    An existing file keeps its permissions, and its content after an error. With `durable`, a power cut leaves
-    the old content or the new one.
-
-    Raises:
-        OSError: the file cannot be written.
+    An existing file keeps its permissions, and its content after an OSError. With `durable`, a power cut
+    leaves the old content or the new one.
     """
     if not is_replaced(path):
         with tempfile.TemporaryDirectory() as folder:
@@ -116,11 +101,7 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def building(folder: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` if the block succeeds, and is removed otherwise.
-
-    Raises:
-        OSError: the folder cannot be made or renamed, or the disk failed.
-    """
+    """A temporary folder that becomes `folder` if the block succeeds, and is removed otherwise (OSError)."""
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
@@ -134,9 +115,6 @@ def move(source: Path, path: Path, *, durable: bool = True) -> None:
     """Rename a file, or a folder, to `path` in the same file system; a file of that name is replaced.
 
     With `durable`, the content is synced to disk before the rename, and the rename before this returns.
-
-    Raises:
-        OSError: the rename or the disk failed.
     """
     if durable:
         for entry in (*source.rglob("*"), source) if source.is_dir() else (source,):

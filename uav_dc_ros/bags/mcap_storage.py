@@ -32,16 +32,11 @@ WAITING_BYTES = 64 * 2**20  # of messages that wait for earlier ones
 
 
 def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False, repeats: bool = True) -> Storage:
-    """Open an MCAP file.
+    """Open an MCAP file, which `closing` closes.
 
-    Args:
-        path: the file.
-        closing: closes it.
-        torn: scan the file as far as possible, if it has no end or is damaged.
-        repeats: keep the latched messages at its head that an earlier part of the bag has.
-
-    Raises:
-        BagError: not an MCAP file. Without `torn`: a file without its end, or a damaged one.
+    With `torn`, it is scanned as far as possible. With `repeats`, the latched messages at its head that an
+    earlier part of the bag has are kept. Raises BagError if it is no MCAP file; without `torn` also if it has
+    no end or is damaged.
     """
     with read_errors(path):
         file = closing.enter_context(path.open("rb"))
@@ -155,11 +150,7 @@ def _open_indexed(
 
 
 def _indexed_times(file: IO[bytes], summary: Summary) -> Iterator[tuple[int, int]]:
-    """Channel and log time of each message, in order within a channel, by the message indexes.
-
-    Raises:
-        ValueError: a message index is invalid.
-    """
+    """Channel and log time of each message, in order within a channel, by the indexes (or ValueError)."""
     for chunk in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
         for channel, offset in chunk.message_index_offsets.items():
             file.seek(offset)

@@ -27,29 +27,19 @@ METADATA_FILE = "metadata.yaml"
 
 @dataclass
 class Part:
-    """The contents of one MCAP file of a bag.
+    """The contents of one MCAP file of a bag."""
 
-    Attributes:
-        name: file name.
-        about: description of the bag, text by key.
-        topics: `topic_metadata` of metadata.yaml by topic.
-        counts: messages by topic.
-        published_ns: latest publish time by topic with messages.
-        first_ns, last_ns: earliest and latest log time; None and 0 without messages.
-        repeated: messages by topic that repeat latched ones of earlier parts; included in `counts`.
-        dropped: published messages by topic that the recorder lost; None: not counted.
-        latest: last message and its publish time by latched topic; only of a part that was read.
-    """
-
-    name: str
-    about: dict[str, str] = field(default_factory=dict)
-    topics: dict[str, dict[str, Any]] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
-    published_ns: dict[str, int] = field(default_factory=dict)
-    first_ns: int | None = None
-    last_ns: int = 0
+    name: str  # of the file
+    about: dict[str, str] = field(default_factory=dict)  # description of the bag, text by key
+    topics: dict[str, dict[str, Any]] = field(default_factory=dict)  # `topic_metadata` of metadata.yaml
+    counts: dict[str, int] = field(default_factory=dict)  # messages by topic
+    published_ns: dict[str, int] = field(default_factory=dict)  # latest publish time by topic with messages
+    first_ns: int | None = None  # earliest log time; None without messages
+    last_ns: int = 0  # latest log time; 0 without messages
+    # Messages by topic that repeat latched ones of earlier parts; included in `counts`.
     repeated: dict[str, int] = field(default_factory=dict)
-    dropped: dict[str, int] | None = None
+    dropped: dict[str, int] | None = None  # published messages that the recorder lost; None: not counted
+    # Last message and its publish time by latched topic; only of a part that was read.
     latest: dict[str, tuple[bytes, int]] = field(default_factory=dict)
 
     @property
@@ -58,11 +48,7 @@ class Part:
         return sum(self.counts.values())
 
     def add_topic(self, topic: str, type: str, encoding: str, channel: Mapping[str, str]) -> None:
-        """Add a topic with rosbag2's metadata of its channel; a known topic stays as it is.
-
-        Raises:
-            BagError: the channel's QoS is not in rosbag2's format.
-        """
+        """Add a topic, unless it is known; raises BagError if its QoS is not in rosbag2's format."""
         if topic in self.topics:
             return
         offered = channel.get("offered_qos_profiles", "")
@@ -174,11 +160,7 @@ def write_metadata(folder: Path, parts: Sequence[Part]) -> None:
 
 
 def read_metadata(folder: Path) -> dict[str, Any] | None:
-    """The content of metadata.yaml; None if the file is missing or does not describe a bag.
-
-    Raises:
-        BagError: the file cannot be read.
-    """
+    """The content of metadata.yaml; None if it is missing or describes no bag, BagError if unreadable."""
     try:
         content = YAML(typ="safe").load(folder / METADATA_FILE)["rosbag2_bagfile_information"]
     except FileNotFoundError:

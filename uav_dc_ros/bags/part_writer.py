@@ -25,11 +25,7 @@ def part_number(name: str) -> int:
 
 
 def part_paths(folder: Path, suffix: str = ".mcap") -> list[Path]:
-    """The storage files of a bag in the order of their numbers, without hidden files.
-
-    Raises:
-        BagError: the folder cannot be read.
-    """
+    """The storage files of a bag, without hidden ones, by number; BagError if the folder is unreadable."""
     try:
         paths = [path for path in folder.iterdir() if path.suffix == suffix and not path.name.startswith(".")]
     except OSError as error:
@@ -41,10 +37,8 @@ def part_paths(folder: Path, suffix: str = ".mcap") -> list[Path]:
 def folder_lock(folder: Path) -> Iterator[None]:
     """Lock a bag's folder, so that no repair replaces a file that is still written.
 
-    The kernel releases the lock of a process that ends.
-
-    Raises:
-        BagError: the bag is being written or repaired, or there is no such folder.
+    The kernel releases the lock of a process that ends. Raises BagError if the bag is being written or
+    repaired, or there is no such folder.
     """
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -64,15 +58,10 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 
 class PartWriter:
-    """Writes one MCAP file in chunks, and records its contents in `part`.
+    """Writes one new MCAP file in chunks, and records its contents in `part`.
 
-    Args:
-        path: must not exist.
-        name: the part's name, if `path` is temporary.
-        compression: one of `bags.COMPRESSIONS`.
-        chunk_bytes: size of a chunk before compression.
-
-    Raises (all methods): OSError, which the owner of the bag translates.
+    `name` is the part's name, if `path` is temporary; `chunk_bytes` the size of a chunk before compression.
+    All methods may raise OSError, which the owner of the bag translates.
     """
 
     def __init__(

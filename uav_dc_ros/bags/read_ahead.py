@@ -22,17 +22,7 @@ STOP_CHECK_S = 0.1  # interval in which a blocked thread checks whether it must 
 
 
 class ReadAhead:
-    """Iterates once over the messages of `BagReader.messages`; a context manager.
-
-    Args:
-        path: the bag's.
-        topics: full names.
-        start_ns: earliest log time.
-        end_ns: end of the log times (excluded); None: the bag's end.
-
-    Raises:
-        BagError: (iteration) the bag is damaged there.
-    """
+    """Iterates once over `BagReader.messages`, which a thread reads ahead; a context manager."""
 
     def __init__(self, path: Path, topics: Collection[str], *, start_ns: int, end_ns: int | None) -> None:
         self._path = path

@@ -27,14 +27,10 @@ class _Last(NamedTuple):
 
 
 class _Clock:
-    """Counts how often the clock had been set back when each message was received.
-
-    Attributes:
-        set_back_ns: the longest step back.
-    """
+    """Counts how often the clock had been set back when each message was received."""
 
     def __init__(self) -> None:
-        self.set_back_ns = 0
+        self.set_back_ns = 0  # the longest step back
         self._ends_ns = [0]  # latest log time by setting
         self._last: dict[str, _Last] = {}
 

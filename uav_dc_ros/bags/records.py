@@ -95,19 +95,13 @@ def complete_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]
 
 @dataclass(frozen=True, kw_only=True)
 class ChunkHeader:
-    """The fields of a chunk before its data.
+    """The fields of a chunk before its data."""
 
-    Attributes:
-        size, crc: of the decompressed data; a CRC of 0 is none.
-        data_at: offset of the data in the chunk's content.
-        data_bytes: length of the compressed data.
-    """
-
-    size: int
-    crc: int
+    size: int  # of the decompressed data, bytes
+    crc: int  # of the decompressed data; 0: none
     compression: str
-    data_at: int
-    data_bytes: int
+    data_at: int  # offset of the data in the chunk's content
+    data_bytes: int  # length of the compressed data
 
     @property
     def length(self) -> int:

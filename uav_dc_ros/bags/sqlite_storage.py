@@ -20,11 +20,7 @@ ROWS = 1000  # read at a time
 
 
 def open_sqlite(path: Path, closing: ExitStack) -> Storage:
-    """Open a file of rosbag2's SQLite storage; only the same thread may read it.
-
-    Raises:
-        BagError: the file cannot be read, or is damaged.
-    """
+    """Open a file of rosbag2's SQLite storage for this thread only; raises BagError if it is damaged."""
     # The write-ahead log of a killed recorder is read, too; that needs a lock.
     mode = "mode=ro" if path.with_name(f"{path.name}-wal").exists() else "immutable=1"
     with damage_errors(path, ""):

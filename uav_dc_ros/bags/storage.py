@@ -43,41 +43,27 @@ _Key = TypeVar("_Key", int, tuple[int, int])
 
 
 class BagMessage(NamedTuple):
-    """A message of a bag, its data serialised (CDR).
-
-    Attributes:
-        log_time_ns: receive time, nanoseconds since the epoch.
-        publish_time_ns: publish time; the log time, if the bag has none.
-    """
+    """A message of a bag, its data serialised (CDR)."""
 
     topic: str
     type: str
     data: bytes
-    log_time_ns: int
-    publish_time_ns: int
+    log_time_ns: int  # receive time, nanoseconds since the epoch
+    publish_time_ns: int  # publish time; the log time, if the bag has none
 
 
 @dataclass(kw_only=True)
 class RecordedTopic:
-    """A topic of a bag.
-
-    Attributes:
-        definition: the type with all types inside it, as text in `encoding`; empty if the bag has none.
-        encoding: of the definition: `ros2msg`, or `ros2idl`.
-        serialization: of the messages, `cdr` in ROS 2.
-        offered_qos: the publishers' QoS, rosbag2's YAML; empty if the bag has none.
-        count: messages.
-        other_types: further types of the topic's messages; ROS 2 allows only one.
-    """
+    """A topic of a bag."""
 
     name: str
     type: str
-    definition: bytes = b""
-    encoding: str = "ros2msg"
-    serialization: str = "cdr"
-    offered_qos: str = ""
-    count: int = 0
-    other_types: tuple[str, ...] = ()
+    definition: bytes = b""  # the type with all types inside it, as text in `encoding`; empty without one
+    encoding: str = "ros2msg"  # of the definition: `ros2msg`, or `ros2idl`
+    serialization: str = "cdr"  # of the messages, `cdr` in ROS 2
+    offered_qos: str = ""  # the publishers' QoS, rosbag2's YAML; empty if the bag has none
+    count: int = 0  # messages
+    other_types: tuple[str, ...] = ()  # further types of the topic's messages; ROS 2 allows only one
 
     def merge(self, other: "RecordedTopic") -> None:
         """Add the same topic of another channel, or of another file."""
@@ -100,43 +86,30 @@ Messages = Callable[[Collection[str] | None, int | None, int | None], Iterator[B
 
 @dataclass(kw_only=True)
 class Storage:
-    """The contents of a storage file.
-
-    Attributes:
-        messages: those of some topics (None: all) from a log time on and before another, sorted by log time.
-        recorded: those of some topics, or all, in the order of recording.
-        goes_back_ns: the longest step back in log time within a topic; reads the file.
-        about, dropped, repeated: as in `metadata.Part`; repeated messages are those left out.
-        library: name of the software that wrote the file.
-        damages: unusable places; only known of a file that was scanned.
-        has_end: whether the file is finished.
-        has_index: whether messages are found without reading the whole file.
-        compressed: topics whose messages rosbag2 compressed individually, among those read so far.
-    """
+    """The contents of a storage file; `about`, `dropped` and `repeated` are as in `metadata.Part`."""
 
     path: Path
     topics: list[RecordedTopic]
     first_ns: int
     last_ns: int
+    # Those of some topics (None: all) from a log time on and before another, sorted by log time.
     messages: Messages
+    # Those of some topics, or all, in the order of recording.
     recorded: Callable[[Collection[str] | None], Iterator[BagMessage]]
-    goes_back_ns: Callable[[], int]
+    goes_back_ns: Callable[[], int]  # the longest step back in log time within a topic; reads the file
     about: dict[str, str] = field(default_factory=dict)
     dropped: dict[str, int] | None = None
-    repeated: dict[str, int] = field(default_factory=dict)
-    library: str = ""
-    damages: Sequence[Damage] = ()
-    has_end: bool = True
-    has_index: bool = True
+    repeated: dict[str, int] = field(default_factory=dict)  # those left out
+    library: str = ""  # name of the software that wrote the file
+    damages: Sequence[Damage] = ()  # unusable places; only known of a file that was scanned
+    has_end: bool = True  # whether the file is finished
+    has_index: bool = True  # whether messages are found without reading the whole file
+    # Topics whose messages rosbag2 compressed individually, among those read so far.
     compressed: set[str] = field(default_factory=set)
 
 
 def storage_files(path: Path) -> list[Path]:
-    """The MCAP files of a bag, or the files of its SQLite storage, in their order.
-
-    Raises:
-        BagError: there is no bag, or it cannot be read.
-    """
+    """The MCAP files of a bag, or the files of its SQLite storage, in their order; may raise BagError."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:

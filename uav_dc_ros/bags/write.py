@@ -34,38 +34,23 @@ MIN_CHUNK_BYTES = 1024
 
 @dataclass(kw_only=True)
 class _WrittenTopic:
-    """A topic of the bag.
-
-    Attributes:
-        metadata: rosbag2's, of the topic's channels.
-        latest: last messages with their publish times; None unless the topic is latched.
-        sequence: of the last message, counted from 1 over all parts.
-        channel: id in the current part.
-    """
-
     type: str
     definition: bytes
-    metadata: Mapping[str, str]
-    latest: deque[tuple[bytes, int]] | None
-    sequence: int
-    channel: int = 0
+    metadata: Mapping[str, str]  # rosbag2's, of the topic's channels
+    latest: deque[tuple[bytes, int]] | None  # last messages with publish times; None unless it is latched
+    sequence: int  # of the last message, counted from 1 over all parts
+    channel: int = 0  # id in the current part
 
 
 class BagWriter:
-    """Writes a bag; a context manager that closes it.
+    """Writes a bag into a new folder; a context manager that closes it.
 
-    Args:
-        folder: the bag's folder; must not exist, unless writing is resumed.
-        about: description of the bag, text by key. Values of earlier parts stay.
-        resume: continue a bag whose writer was killed: its parts are repaired, and a new one begins.
-        compression: of the chunks: one of `bags.COMPRESSIONS`.
-        split_bytes: size of a part's file at which the next part begins; 0: never. A part exceeds it by at
-            most a chunk, one message and the index.
-        split_s: log time after which the next part begins; 0: never.
+    `resume` continues a bag whose writer was killed: its parts are repaired, and a new one begins. Of
+    `about`, the bag's description by key, values of earlier parts stay. The next part begins at `split_bytes`
+    (a part exceeds them by at most a chunk, a message and the index) or after `split_s` of log time (0: off).
 
-    Raises:
-        BagError: the folder exists, or cannot be made. When resuming: there is no such folder, the bag was
-            closed, is still being written, or cannot be repaired. Of all methods: the disk is full or gone.
+    Raises BagError if the folder exists or cannot be made; when resuming, if there is none, or the bag was
+    closed, is still being written, or cannot be repaired; in all methods, if the disk is full or gone.
     """
 
     def __init__(
@@ -153,17 +138,9 @@ class BagWriter:
         """Add a topic, once, before its first message.
 
         A topic with messages in earlier parts keeps their QoS: metadata.yaml has one QoS for a topic, and
-        rosbags skips channels with another one.
-
-        Args:
-            name: full name, with its namespace.
-            type: ROS 2 message type, such as `std_msgs/msg/String`.
-            offered_qos: QoS that the topic's publishers offer.
-            definition: of a type that ROS 2 does not have, with all types inside it, as `ros2msg`.
-            type_hash: of such a type (REP-2011).
-
-        Raises:
-            BagError: ROS 2 has no such type, or earlier parts have another one.
+        rosbags skips channels with another one. A type that ROS 2 does not have needs its `definition`, with
+        all types inside it, as `ros2msg`, and its hash (REP-2011). Raises BagError without that, or if
+        earlier parts have another type.
         """
         qos = dump_qos_v9(list(offered_qos))
         earlier = self._resumed.topics.get(name)
@@ -202,14 +179,7 @@ class BagWriter:
             written.latest = deque(written.latest, maxlen=n)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:
-        """Append a message.
-
-        Args:
-            topic: full name of a topic that was added.
-            data: serialised (CDR).
-            log_time_ns: receive time, nanoseconds since the epoch.
-            publish_time_ns: publish time.
-        """
+        """Append a message of an added topic, serialised (CDR); times are nanoseconds since the epoch."""
         written = self._topics[topic]
         try:
             if self._begun_ns is None:

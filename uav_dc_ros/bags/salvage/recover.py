@@ -23,22 +23,14 @@ MAX_LISTED = 20  # damaged places of a file
 
 @dataclass(frozen=True, kw_only=True)
 class RecoveredPart:
-    """The result for one file.
-
-    Attributes:
-        part: the recovered contents; None: nothing was recovered, for `reason`.
-        had_end: whether the file had an undamaged end.
-        expected: messages of the file by its summary; None without one.
-        damages: unusable places.
-        unreadable: recovered messages that cannot be decoded.
-    """
+    """The result for one file."""
 
     source: Path
-    part: Part | None = None
-    had_end: bool = False
-    expected: int | None = None
-    damages: Sequence[Damage] = ()
-    unreadable: Unreadable = field(default_factory=Unreadable)
+    part: Part | None = None  # the recovered contents; None: nothing was recovered, for `reason`
+    had_end: bool = False  # whether the file had an undamaged end
+    expected: int | None = None  # messages of the file by its summary; None without one
+    damages: Sequence[Damage] = ()  # unusable places
+    unreadable: Unreadable = field(default_factory=Unreadable)  # recovered messages that cannot be decoded
     reason: str = ""
 
     @property
@@ -68,14 +60,9 @@ class Recovered:
 
 
 def recover(path: Path, folder: Path) -> Recovered:
-    """Copy what can be read of a bag into a new one.
+    """Copy what can be read of a bag, or of one MCAP file, into a new one, renamed into place when complete.
 
-    Args:
-        path: the bag's folder, or one of its MCAP files.
-        folder: of the new bag; must not exist. It is renamed into place once it is complete.
-
-    Raises:
-        BagError: `folder` exists, there is no bag, nothing of it can be recovered, or the disk is full.
+    Raises BagError if `folder` exists, there is no bag, nothing of it can be recovered, or the disk is full.
     """
     taken = f"bag folder {folder} exists already; expected a new one"
     if folder.exists() or folder.is_symlink():
@@ -100,12 +87,7 @@ def recover(path: Path, folder: Path) -> Recovered:
 
 
 def _recover_part(source: Path, path: Path) -> RecoveredPart:
-    """Copy what can be read of a file.
-
-    Raises:
-        BagError: its compression is unsupported.
-        OSError: the disk is full.
-    """
+    """Copy what can be read of a file; BagError: unsupported compression, OSError: the disk is full."""
     try:
         file = source.open("rb")
     except OSError as error:

@@ -20,17 +20,11 @@ from uav_dc_ros.errors import BagError
 
 @dataclass(frozen=True)
 class Repaired:
-    """A repaired bag.
+    """A repaired bag."""
 
-    Attributes:
-        parts: contents of all parts, in their order.
-        rewritten: file names of those that lacked their end.
-        lost_bytes: bytes at the torn ends that could not be used.
-    """
-
-    parts: list[Part]
-    rewritten: list[str]
-    lost_bytes: int
+    parts: list[Part]  # contents of all parts, in their order
+    rewritten: list[str]  # file names of those that lacked their end
+    lost_bytes: int  # at the torn ends, which could not be used
 
     @property
     def whole(self) -> Part:
@@ -45,9 +39,8 @@ class Repaired:
 def repair(folder: Path) -> Repaired:
     """Make the bag of a killed writer whole; a whole one stays as it is, byte for byte.
 
-    Raises:
-        BagError: no such folder, no MCAP file in it, a file that is not one, damage that is not a torn end, a
-            full disk, or another process that writes or repairs it. Each part is then whole or unchanged.
+    Raises BagError for no such folder, no MCAP file in it, a file that is not one, damage that is not a torn
+    end, a full disk, or another process that writes or repairs it. Each part is then whole or unchanged.
     """
     with folder_lock(folder):
         if not part_paths(folder):
@@ -59,11 +52,7 @@ def repair(folder: Path) -> Repaired:
 
 
 def repair_parts(folder: Path) -> Repaired:
-    """Repair the parts of a bag, but not metadata.yaml; the caller holds the folder's lock.
-
-    Raises:
-        BagError: as for `repair`.
-    """
+    """Repair the parts of a bag, as `repair`, but not metadata.yaml; the caller holds the folder's lock."""
     parts: list[Part] = []
     rewritten: list[str] = []
     lost_bytes = 0

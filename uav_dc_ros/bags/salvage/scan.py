@@ -51,11 +51,7 @@ _COPIED = (Schema, Channel, Metadata, Attachment)  # indexes are written anew
 
 
 def has_end(file: IO[bytes]) -> bool:
-    """Whether an MCAP file has a footer, the closing magic, and an undamaged summary or none.
-
-    Raises:
-        OSError: the disk is gone.
-    """
+    """Whether an MCAP file has a footer, the closing magic, and an undamaged summary or none."""
     size = os.fstat(file.fileno()).st_size
     if size < len(MAGIC) + _END_BYTES:
         return False
@@ -78,9 +74,7 @@ def has_end(file: IO[bytes]) -> bool:
 def metadata_records(path: Path, file: IO[bytes]) -> Iterator[Metadata]:
     """The metadata records of a finished MCAP file without an index; chunks, which have none, are skipped.
 
-    Raises:
-        BagDamagedError: a record is invalid.
-        OSError: the disk is gone.
+    Raises BagDamagedError for an invalid record.
     """
     reader, at, opcode = RecordReader(file), len(MAGIC), 0
     while opcode not in (Opcode.DATA_END, Opcode.FOOTER):
@@ -98,20 +92,13 @@ def metadata_records(path: Path, file: IO[bytes]) -> Iterator[Metadata]:
 
 @dataclass
 class Damage:
-    """An unusable place in a file.
+    """An unusable place in a file."""
 
-    Attributes:
-        at: its offset, bytes.
-        n_bytes: its length in the file.
-        reason: what is damaged.
-        after_ns, before_ns: log times of the messages around it; None without one.
-    """
-
-    at: int
-    n_bytes: int
-    reason: str
-    after_ns: int | None = None
-    before_ns: int | None = None
+    at: int  # its offset, bytes
+    n_bytes: int  # its length in the file
+    reason: str  # what is damaged
+    after_ns: int | None = None  # log time of the message before it; None without one
+    before_ns: int | None = None  # and of the message after it
 
 
 class Scan:
