@@ -17,9 +17,7 @@ def rollout(act: Policy | Act, scenario: Scenario, seeds: Sequence[int] = TEST_S
     """Fly one mission per seed of the users in parallel, in numpy, without ROS: results `[S]` each.
 
     `act` is a policy, or a function from the missions' state (`core.world.State`, `[S, ...]`) to their
-    actions, integers `[S]`.
-
-    Raises PolicyError if the policy does not fit the scenario.
+    actions, integers `[S]`. Raises PolicyError if the policy does not fit the scenario.
     """
     return roll_out(scenario, greedy_act(act, scenario) if isinstance(act, Policy) else act, seeds)
 

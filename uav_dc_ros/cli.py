@@ -106,10 +106,7 @@ def namespace(text: str) -> str:
 
 
 def without_verb(word: str, verbs: Mapping[str, tuple[str, str]], prog: str, description: str) -> int:
-    """Print help or version of a command with verbs, which have a module and a description each.
-
-    Raises ParameterError for a `word` other than --help, -h and --version.
-    """
+    """Print help or version of a command with verbs (a module and a description each) as `word` requests."""
     if word == "--version":
         print(__version__)
     elif word in ("-h", "--help"):
@@ -152,7 +149,12 @@ def run(command: Callable[[], int], prog: str) -> NoReturn:
         else:
             status = print_error(f"{prog}: the output cannot be written: {error.strerror}")
     for stream in (sys.stdout, sys.stderr):
-        _release(stream)
+        try:
+            stream.flush()
+        except OSError:  # redirect it, so that Python exits without a traceback
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, stream.fileno())
+            os.close(null)
     sys.exit(status)
 
 
@@ -180,16 +182,6 @@ def open_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _release(stream: TextIO) -> None:
-    """Flush a stream; redirect it to /dev/null if that fails, so that Python exits without a traceback."""
-    try:
-        stream.flush()
-    except OSError:
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, stream.fileno())
-        os.close(null)
-
-
 def _check_working_directory() -> None:
     try:
         os.getcwd()
@@ -198,10 +190,7 @@ def _check_working_directory() -> None:
 
 
 class Output:
-    """Writes the text of consoles in a thread: a full disk, closed pipe or stalled terminal never blocks.
-
-    Text that cannot be written is dropped.
-    """
+    """Writes text of consoles in a thread, or drops it: a full disk or stalled terminal blocks no caller."""
 
     def __init__(self) -> None:
         self._queue: queue.Queue[tuple[int, bytes] | threading.Event] = queue.Queue(QUEUE_MAX)

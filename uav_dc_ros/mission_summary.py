@@ -20,8 +20,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     data_bits: float  # collected from all users, bit
     sum_rate_bps: float  # sum of the served users' rates, mean over the steps, bit/s
     distance_m: float  # length of the path, metres
-    # Of the mission (eq. 7), as in `evaluate` and policy cards: with the data `so_far`, r^t at the end; with the
-    # data of the `step`, the mean of r^t over the steps with rates.
+    # Of the mission (eq. 7), as in `evaluate` and policy cards: with the data `so_far`, r^t at the end; with
+    # the data of the `step`, the mean of r^t over the steps with rates.
     reward: float
     reward_data: RewardData  # data in r^t, `so_far` or `step`
     reason: str  # end of a real vehicle's mission, or cause of an abort, in words; else empty

@@ -110,10 +110,7 @@ class Learner:
         return torch.where(explore < self._epsilon, self.greedy(observation[:, None])[:, 0], random)
 
     def update(self, batch: TransitionBatch) -> Tensor:
-        """One gradient step on a mini-batch `[N, B, ...]`; returns each run's loss before the step, `[N]`.
-
-        A run with a smaller batch size uses the first rows.
-        """
+        """One gradient step on a mini-batch `[N, B, ...]`; returns each run's loss before the step, `[N]`."""
         next_q = self._q(self._forward(self._theta_target, batch.next_observation)[-1])
         y = td_target(batch.reward, batch.terminated, next_q.mT, self._gamma)
         *features, head = self._forward(self._theta, batch.observation)
@@ -209,14 +206,13 @@ def _layers(flat: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
 def _stacked(parameters: network.Parameters) -> network.Parameters:
     """One network's parameters in the learner's layout: biases as rows, both streams in `head`."""
     own = {name: v[None] if v.ndim == 1 else v for name, v in parameters.items() if "hidden" in name}
-    streams = {"weight": [], "bias": []}  # type: dict[str, list[np.ndarray]]
-    for name in ("value", "advantage") if "value.bias" in parameters else ("q",):
-        for part, values in streams.items():
-            values.append(np.atleast_2d(parameters[f"{name}.{part}"]))
-    head = {part: np.concatenate(values, axis=-1).T for part, values in streams.items()}
-    if "q.bias" in parameters:  # no V: a row of zeros
-        head = {part: np.concatenate([np.zeros_like(values[:1]), values]) for part, values in head.items()}
-    return own | {f"head.{part}": np.ascontiguousarray(values) for part, values in head.items()}
+    names = ("value", "advantage") if "value.bias" in parameters else ("q",)
+    for part in ("weight", "bias"):
+        streams = [np.atleast_2d(parameters[f"{name}.{part}"]) for name in names]
+        if "q" in names:  # no V: a column of zeros
+            streams.insert(0, np.zeros_like(streams[0][:, :1]))
+        own[f"head.{part}"] = np.ascontiguousarray(np.concatenate(streams, axis=-1).T)
+    return own
 
 
 def _unstacked(own: network.Parameters, architecture: network.Architecture) -> network.Parameters:

@@ -32,11 +32,7 @@ class RecordedPose(NamedTuple):
 
 
 class PhaseReport(NamedTuple):
-    """Phase and reason as the vehicle reported them, with log and publish times (ns).
-
-    `clock_resets`: times that the recorder's clock had been set back by then. Times compare only between
-    equal values.
-    """
+    """Phase and reason as the vehicle reported them, with log and publish times (ns)."""
 
     phase: Phase
     reason: str
@@ -44,7 +40,7 @@ class PhaseReport(NamedTuple):
     fault: FaultKind | None
     log_ns: int
     publish_ns: int
-    clock_resets: int = 0
+    clock_resets: int = 0  # of the recorder's clock until then: times compare only between equal values
 
 
 @dataclass(kw_only=True)
@@ -95,10 +91,7 @@ class RecordedStep:
         return before is not None and (before.flight, before.mission, before.step) == key
 
     def observed(self, scenario: Scenario) -> dict[str, Array] | None:
-        """Arguments of `core.observations.encode`; None without status or rates.
-
-        Raises MessageError if they are of another world.
-        """
+        """Arguments of `observations.encode`, or None without status or rates; may raise MessageError."""
         if self.status is None or self.rates is None:
             return None
         payloads.check(self.status, scenario)
@@ -113,10 +106,8 @@ class RecordedStep:
         return [next(reports) for _, reports in groupby(self.phase_reports, attrgetter("phase"))]
 
     def add_report(self, status: Mission, log_ns: int, publish_ns: int, clock_resets: int = 0) -> bool:
-        """Add the phase of a status; False if it repeats an earlier report.
-
-        A vehicle that gives reasons may enter a phase twice. One that gives none repeats itself.
-        """
+        """Add the phase of a status; False if it repeats an earlier report."""
+        # A vehicle that gives reasons may enter a phase twice. One that gives none repeats itself.
         state = status.phase, status.reason, status.held, status.fault
         for known in self.phase_reports:
             repeats = publish_ns == known.publish_ns or not status.reason or known is self.phase_reports[-1]
@@ -198,10 +189,7 @@ def differ_in_time_only(one: messages.Stepped, other: messages.Stepped) -> bool:
 
 
 def supersedes(status: Mission, before: Mission, newer: bool) -> bool:
-    """Whether a status replaces another one of its step: see `RecordedStep.status`; `newer`: published later.
-
-    Of several ends of a mission the last one counts.
-    """
+    """Whether a status replaces another of its step: see `RecordedStep`; of several ends the last counts."""
     ranks = _rank(status), _rank(before)
     return ranks[0] > ranks[1] or (newer and ranks in ((0, 0), (2, 2)))
 

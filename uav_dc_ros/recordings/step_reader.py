@@ -44,12 +44,8 @@ Key: TypeAlias = tuple[int, int, int]  # flight, mission, step
 
 def namespaces(reader: BagReader) -> list[str]:
     """Namespaces with a `mission` topic of our type, sorted. The root is the empty text."""
-    ending = "/mission"
-    return sorted(
-        topic.name.removesuffix(ending)
-        for topic in reader.topics.values()
-        if topic.name.endswith(ending) and topic.type == topics.JSON
-    )
+    names = (topic.name for topic in reader.topics.values() if topic.type == topics.JSON)
+    return sorted(name.removesuffix("/mission") for name in names if name.endswith("/mission"))
 
 
 def namespace(reader: BagReader, wanted: str | None = None) -> str:

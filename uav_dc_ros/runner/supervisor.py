@@ -105,23 +105,16 @@ class Supervisor:
         return all(node.process is not None and bool(node.process.reports) for node in self.nodes)
 
     def _start(self, nodes: Sequence[SupervisedNode]) -> None:
-        parameters = {
-            node.row.name: {
-                **node.parameters,
-                **(node.row.restart_parameters if node.restarts else {}),
-                "autostart": False,
-            }
-            for node in nodes
-        }
+        parameters = {}
+        for node in nodes:
+            restarted = node.row.restart_parameters if node.restarts else {}
+            parameters[node.row.name] = {**node.parameters, **restarted, "autostart": False}
         process = NodeProcess(parameters, self._namespace, nodes[0].restarts, self._folder, self._on_line)
         for node in nodes:
             node.attach(process)
 
     def tick(self, may_bring_up: bool) -> None:
-        """Bring nodes up, if they may be, and restart them; to be called often.
-
-        Raises NodeError if a required node cannot be brought up, gave up, or has too many restarts.
-        """
+        """Bring nodes up, if they may be, and restart them; raises NodeError if the mission loses one."""
         self._check_reports()
         for node in list(self.nodes):
             if node.process is None:
@@ -149,11 +142,8 @@ class Supervisor:
                 process.kill(f"gave no sign of life for {timeout_s:.0f} s")
 
     def _lower_ranks_are_active(self, node: SupervisedNode) -> bool:
-        return all(
-            other.state == "active"
-            for other in self.nodes
-            if other.row.rank < node.row.rank and (other.row.needed or other.row.on_request)
-        )
+        lower = (other for other in self.nodes if other.row.rank < node.row.rank)
+        return all(other.state == "active" for other in lower if other.row.needed or other.row.on_request)
 
     def _handle_exit(self, process: NodeProcess) -> None:
         """Schedule restarts of the nodes of an ended process, each in its own, or drop them."""

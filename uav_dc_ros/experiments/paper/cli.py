@@ -131,10 +131,7 @@ def _train(
 
 
 def _reserve(folder: Path, options: argparse.Namespace) -> bool:
-    """Makes the folder of the shards; returns whether it holds shards to resume.
-
-    Raises TrainingError if it cannot be made, or belongs to a sweep with other options.
-    """
+    """Makes the folder of the shards, if it is not of another sweep; returns whether it holds any."""
     only = None if options.only is None else sorted(set(options.only))
     plan = msgspec.json.encode({"scale": options.scale, "only": only})
     try:

@@ -34,10 +34,7 @@ class Evidence:
         self._measures: dict[str, Array] = {}
 
     def of(self, measure: str, setting: Setting, *axes: str) -> Array:
-        """A measure in every environment along `axes` of the sweep, `[E, ...]`; means over repeats.
-
-        Raises NotMeasured if a setting has no run in one of the environments.
-        """
+        """A measure along `axes` of the sweep, `[E, ...]`, mean over repeats; may raise NotMeasured."""
         values = self._of_runs(measure)
         cells = [self._by_environment(values, one) for one in setting.along(axes, self.scale)]
         return np.stack(cells, axis=-1).reshape(-1, *(len(domain(axis, self.scale)) for axis in axes))

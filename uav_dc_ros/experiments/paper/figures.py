@@ -59,10 +59,7 @@ def drawable(results: Results) -> list[str]:
 
 
 def draw(figure: str, results: Results, tracks: Sequence[Trajectory], path: Path) -> None:
-    """Writes a figure as a PNG file; `tracks` are the greedy missions of the figure `Traj`.
-
-    Raises TrainingError if there is no such figure, it lacks runs or missions, or the file cannot be written.
-    """
+    """Writes a figure as PNG, `Traj` with greedy missions; raises TrainingError where it cannot."""
     plan = figure_plan(figure)
     dpi = _DPI
     if plan.panels[0].kind == "tracks":

@@ -148,10 +148,7 @@ def figure_plan(name: str) -> FigurePlan:
 
 
 def runs(scale: Scale, only: Iterable[str] | None = None) -> list[PlannedRun]:
-    """The runs that figures need, each once, in a fixed order; of all figures without `only`.
-
-    Raises TrainingError if there is no such figure.
-    """
+    """The runs that figures need (without `only` all), each once, in a fixed order; or a TrainingError."""
     names = list(FIGURES if only is None else only)
     for name in names:
         figure_plan(name)

@@ -49,10 +49,7 @@ _UNITS = {
 def write(
     results: Results, tracks: Sequence[Trajectory], folder: Path, only: Sequence[str] | None = None
 ) -> None:
-    """Writes the figures in `only`, or all that the results allow, and the claims into an existing folder.
-
-    `tracks` are the greedy missions of the figure `Traj`.
-    """
+    """Writes the claims, and the figures in `only` or all that the results allow, into an existing folder."""
     for figure in drawable(results) if only is None else only:
         draw(figure, results, tracks, folder / f"{figure}.png")
     findings = check(results)

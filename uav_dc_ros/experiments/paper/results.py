@@ -38,19 +38,11 @@ _KEY = b"uav_dc_ros"
 
 _TYPES = {str: pa.string(), int: pa.int32(), float: pa.float64()}
 _SETTING_TYPES = {f.name: _TYPES.get(f.type, pa.string()) for f in msgspec.structs.fields(Setting)}
+_RUN_TYPES = {"environment": pa.int32(), "repeat": pa.int32(), "seed": pa.int64()}
 _RUNS_SCHEMA = pa.schema(
-    [
-        ("run", pa.int32()),
-        *_SETTING_TYPES.items(),
-        ("environment", pa.int32()),
-        ("repeat", pa.int32()),
-        ("seed", pa.int64()),
-        *((name, pa.float32()) for name in GREEDY),
-    ]
+    {"run": pa.int32(), **_SETTING_TYPES, **_RUN_TYPES, **dict.fromkeys(GREEDY, pa.float32())}
 )
-_CURVES_SCHEMA = pa.schema(
-    [("run", pa.int32()), ("episode", pa.int32()), *((name, pa.float32()) for name in METRICS)]
-)
+_CURVES_SCHEMA = pa.schema({"run": pa.int32(), "episode": pa.int32(), **dict.fromkeys(METRICS, pa.float32())})
 
 
 class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -143,10 +135,7 @@ class Results:
         runs = {
             "run": range(n_runs),
             **{name: [getattr(run.setting, name) for run in self.planned] for name in _SETTING_TYPES},
-            **{
-                name: [getattr(run, name) for run in self.planned]
-                for name in ("environment", "repeat", "seed")
-            },
+            **{name: [getattr(run, name) for run in self.planned] for name in _RUN_TYPES},
             **{name: np.asarray(self.greedy[name], np.float32) for name in GREEDY},
         }
         curves = {
@@ -160,10 +149,7 @@ class Results:
 
     @classmethod
     def load(cls, folder: Path) -> "Results":
-        """Reads what `save` wrote.
-
-        Raises TrainingError if a file is missing or damaged, has other columns, or is of another sweep.
-        """
+        """Reads what `save` wrote; raises TrainingError for missing, damaged or other files."""
         runs, metadata = _read(folder / RUNS_FILE, _RUNS_SCHEMA)
         curves, other = _read(folder / CURVES_FILE, _CURVES_SCHEMA)
         if metadata != other:

@@ -34,9 +34,8 @@ _RAY_RETRIES = 5  # of a shard whose worker or node dies, on a cluster
 def train_locally(shards: Sequence[Shard], folder: Path, n_workers: int, on_progress: OnProgress) -> None:
     """Trains shards, `n_workers` at a time, and saves their results in `folder`.
 
-    A worker that dies is replaced; the new one resumes from the checkpoint.
-
-    Raises TrainingError if a shard failed, or its worker died three times.
+    A worker that dies is replaced; the new one resumes from the checkpoint. Raises TrainingError if a shard
+    failed, or its worker died three times.
     """
     context = multiprocessing.get_context("spawn")  # a fork would inherit threads of torch and numpy
     waiting = [(shard, 1) for shard in shards]
@@ -102,9 +101,8 @@ def train_on_ray(shards: Sequence[Shard], folder: Path, address: str, on_progres
     """Trains shards, one to a core of the cluster, and saves their results in `folder` of this machine.
 
     Ray restarts a shard whose worker or node dies. `address` is that of `ray.init`, such as `HOST:6379`,
-    `ray://HOST:10001`, or `auto`. `on_progress` is called for finished shards only.
-
-    Raises TrainingError if ray is not installed, the cluster cannot be reached, or a shard failed.
+    `ray://HOST:10001`, or `auto`. `on_progress` is called for finished shards only. Raises TrainingError if
+    ray is not installed, the cluster cannot be reached, or a shard failed.
     """
     try:
         import ray

@@ -24,9 +24,8 @@ MISSIONS_MAX = 30  # listed one by one
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
-    parser.add_argument(
-        "--json", nargs="?", const="-", metavar="FILE", help="JSON instead, into a file or to the output"
-    )
+    json = "JSON instead, into a file or to the output"
+    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help=json)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -63,9 +62,8 @@ def show(found: Survey, console: Console) -> None:
         if mission.reason:
             where = f" in {mission.namespace}" if mission.namespace else ""
             name = mission_name(mission.mission, mission.flight)
-            console.print(
-                Text(f" {name}{where}: {mission.outcome}: {printable(mission.reason)}"), soft_wrap=True
-            )
+            text = f" {name}{where}: {mission.outcome}: {printable(mission.reason)}"
+            console.print(Text(text), soft_wrap=True)
 
 
 def _facts(found: Survey) -> dict[str, str]:

@@ -171,10 +171,8 @@ def verify(
 
 
 def _check_topics(reader: BagReader, namespace: str) -> None:
-    """Raises BagError for a bag without a needed topic.
-
-    A real vehicle's mission that ends before takeoff has no users and no rates.
-    """
+    """Raises BagError for a bag without a needed topic."""
+    # A real vehicle's mission that ends before takeoff has no users and no rates.
     needed = NEEDED if step_reader.vehicle(reader, namespace) == SIMULATED else ("mission",)
     counts = {name.removeprefix(f"{namespace}/"): topic.count for name, topic in reader.topics.items()}
     missing = [f"{namespace}/{name}" for name in needed if not counts.get(name)]

@@ -171,11 +171,9 @@ class ChannelCheck(Check):
                 link, after = self._measure(step, pose.position_m, users_m, before)
                 ours = payloads.rates(link, *after, mission=step.mission, step=step.step)
                 within = self.within
-                found = [
-                    one
-                    for name in COLUMNS
-                    for one in self.compare(step, "rates", name, getattr(rates, name), getattr(ours, name))
-                ]
+                found: list[Difference] = []
+                for name in COLUMNS:
+                    found += self.compare(step, "rates", name, getattr(rates, name), getattr(ours, name))
                 if not found:
                     self._later_poses += i > 0
                     self.count([])
@@ -249,9 +247,8 @@ class WorldCheck(Check):
         remaining = max(scenario.mission.max_steps - step.step, 0)
         found = self.compare(step, "mission", "fingerprint", status.fingerprint, scenario.fingerprint)
         found += self.compare(step, "mission", "remaining_steps", status.remaining_steps, remaining)
-        terminated, truncated, landed = world.end_of_mission(
-            scenario, np.asarray(step.step), np.asarray(status.cell)
-        )
+        number, at = np.asarray(step.step), np.asarray(status.cell)
+        terminated, truncated, landed = world.end_of_mission(scenario, number, at)
         phase = Phase.READY
         if step.step and (terminated or truncated):
             phase = Phase.LANDED if landed else Phase.TIMEOUT
@@ -268,10 +265,8 @@ class WorldCheck(Check):
         actions = [Action[before.move.action.upper()]] if before.move else list(Action)
         if before.move and not self._lockstep:
             actions.append(Action.HOVER)
-        reached = [
-            scenario.grid.move(np.asarray(before.status.cell), np.asarray(int(action))).tolist()
-            for action in actions
-        ]
+        left = np.asarray(before.status.cell)
+        reached = [scenario.grid.move(left, np.asarray(int(action))).tolist() for action in actions]
         wrong = _cell(step, cell, reached)
         if not wrong and reached[0] != cell and before.move:
             self._hovered += 1
