@@ -18,6 +18,7 @@ from collections import deque
 import msgspec
 import numpy as np
 from rclpy.duration import Duration
+from rosgraph_msgs.msg import Clock
 
 from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core import pace
@@ -179,7 +180,9 @@ class WorldNode(MissionNode):
         self._due_s = self._step_began_s + self._period_s
         self.timer(self._period_s or STALL_S, self._tick, self.get_clock() if use_sim_time else None)
         if not use_sim_time:
-            self.timer(CLOCK_PERIOD_S, lambda: self.publish("clock", convert.clock(self._now_ns())))
+            self.timer(
+                CLOCK_PERIOD_S, lambda: self.publish("clock", Clock(clock=convert.stamp(self._now_ns())))
+            )
 
     # Missions.
 

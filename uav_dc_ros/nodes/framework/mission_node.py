@@ -77,10 +77,8 @@ class MissionNode(ManagedNode):
         for name in self.row.publishes:
             topic = TOPICS[name]
             kind, profile = qos.MESSAGE_TYPES[topic.type], qos.offered(topic, self.message_bytes.get(name, 0))
-            with qos.overridden(name):
-                publisher = qos.create_publisher(
-                    self, kind, name, profile, qos_overriding_options=qos.OVERRIDES
-                )
+            with qos.overridable(name) as options:
+                publisher = qos.create_publisher(self, kind, name, profile, **options)
             self.publishers_of[name] = publisher
             self._until_cleanup.callback(self.destroy_publisher, publisher)
         timer = self.create_timer(diagnostics.PERIOD_S, self._publish_diagnostics, clock=self.steady)
@@ -169,10 +167,8 @@ class MissionNode(ManagedNode):
     def create_raw_subscription(self, topic: Topic, callback: Callable[[bytes, Any], None]) -> Any:
         """Subscribe with the table's QoS, as overridden; the callback takes serialised messages and info."""
         kind, profile = qos.MESSAGE_TYPES[topic.type], qos.requested(topic, keep_all=self.row.keeps_all)
-        with qos.overridden(topic.name):
-            return qos.create_subscription(
-                self, kind, topic.name, callback, profile, qos_overriding_options=qos.OVERRIDES
-            )
+        with qos.overridable(topic.name) as options:
+            return qos.create_subscription(self, kind, topic.name, callback, profile, **options)
 
     def subscribe_serialised(self, topic: Topic, handle: Callable[[bytes, Any], None]) -> Any:
         """Subscribe to the serialised messages of this run; `handle` takes a message and its info."""

@@ -165,8 +165,8 @@ def _play(reader: BagReader, options: "PlaybackOptions") -> None:
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions
 
-    from uav_dc_ros.nodes.play.display import PlaybackDisplay, rate_text
     from uav_dc_ros.nodes.play.player import Player
+    from uav_dc_ros.nodes.play.terminal import PlaybackDisplay, rate_text
     from uav_dc_ros.nodes.ros.executor import shut_down
 
     length_s = (reader.last_ns - reader.first_ns) * 1e-9

@@ -17,9 +17,8 @@ from uav_dc_ros.bags.read_ahead import ReadAhead
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN, PlaybackClock
-from uav_dc_ros.nodes.play.display import PlaybackDisplay
-from uav_dc_ros.nodes.play.keyboard import HELP, Keyboard
 from uav_dc_ros.nodes.play.playback_publisher import PlaybackPublisher, SubscriberMonitor
+from uav_dc_ros.nodes.play.terminal import HELP, Keyboard, PlaybackDisplay
 from uav_dc_ros.nodes.ros import convert, qos
 from uav_dc_ros.topics import TOPICS
 
@@ -218,7 +217,8 @@ class Player:
         period_s = TICK_S
         if self.options.clock_hz is not None:
             if now_s >= self._clock_at_s:
-                self._clock_publisher.publish(convert.clock(min(self.clock.position_ns(), CLOCK_MAX_NS)))
+                stamp = convert.stamp(min(self.clock.position_ns(), CLOCK_MAX_NS))
+                self._clock_publisher.publish(Clock(clock=stamp))
                 self._clock_at_s = max(self._clock_at_s + 1.0 / self.options.clock_hz, now_s)
             period_s = min(period_s, max(0.0, self._clock_at_s - now_s))
         self._handle_keys(0.0)

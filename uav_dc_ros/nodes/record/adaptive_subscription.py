@@ -57,10 +57,7 @@ class AdaptiveSubscription:
         """Create a subscription that matches all these publishers."""
         self._class = message_class
         self._profile = common_qos(ends)
-        self._create(self.callback)
-
-    def _create(self, callback: Callback) -> None:
-        self._add(qos.create_subscription(self._node, self._class, self.name, callback, self._profile))
+        self._add(qos.create_subscription(self._node, self._class, self.name, self.callback, self._profile))
 
     def _add(self, subscription: Any) -> None:
         event = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST
@@ -81,7 +78,7 @@ class AdaptiveSubscription:
         if _requests_less(profile, self._profile):
             self._profile = profile
             self.subscription.callback = self._once
-            self._create(self._once)
+            self._add(qos.create_subscription(self._node, self._class, self.name, self._once, profile))
 
     def _once(self, data: bytes, info: Any) -> None:
         key = (info["publication_sequence_number"], info["source_timestamp"])

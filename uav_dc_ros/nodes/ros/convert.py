@@ -3,15 +3,9 @@
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
-from rosgraph_msgs.msg import Clock
 
 from uav_dc_ros import cdr
 from uav_dc_ros.core.arrays import Array
-
-
-def clock(time_ns: int) -> Clock:
-    """A message for `clock`."""
-    return Clock(clock=stamp(time_ns))
 
 
 def stamp(stamp_ns: int) -> Time:

@@ -88,10 +88,10 @@ def create_subscription(
 
 
 @contextmanager
-def overridden(topic: str) -> Iterator[None]:
-    """Create a publisher or subscription in this context: raises ParameterError for an invalid override."""
+def overridable(topic: str) -> Iterator[dict[str, QoSOverridingOptions]]:
+    """Options to create an endpoint with overridable QoS; raises ParameterError for an invalid override."""
     try:
-        yield
+        yield {"qos_overriding_options": OVERRIDES}
     except (RuntimeError, InvalidParameterTypeException) as error:
         raise ParameterError(f"qos_overrides of {topic}: {error}") from None
 
