@@ -23,7 +23,7 @@ class NodeRow:
     rank: int = 1
     # Within `supervisor.RESTART_WINDOW_S`. One more failure ends the mission or, if not needed, its restarts.
     max_restarts: int = 3
-    # An active node without a report for this time is killed and restarted: no callback takes as long.
+    # An active node without a report for so long is restarted: no callback takes it on a busy computer.
     hang_timeout_s: float = 5.0
     needed: bool = True  # the mission cannot fly without it (the bridge: only with a real vehicle)
     on_request: bool = False  # it starts only if the user requests it

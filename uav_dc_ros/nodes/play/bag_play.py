@@ -92,7 +92,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Play; raises UavDcError for an option or a bag that cannot be played, KeyboardInterrupt for SIGTERM."""
+    """Play; raises UavDcError for invalid options or bags, KeyboardInterrupt for Ctrl-C or SIGTERM."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A bag with moves and poses must not reach a vehicle on the network by accident.
     environment.prepare(local_only=True)
@@ -132,10 +132,11 @@ def _names(reader: BagReader, options: argparse.Namespace) -> dict[str, str]:
 
     remapped = dict(options.remap)
     given = {"--topics": options.topics or (), "--exclude": options.exclude or (), "--remap": remapped}
-    for option, topic in ((option, topic) for option, topics in given.items() for topic in topics):
-        if topic not in reader.topics:
-            known = ", ".join(sorted(reader.topics)) or "none"
-            raise ParameterError(f"{option} {topic}: no such topic in bag {reader.path}; it has {known}")
+    for option, topics in given.items():
+        for topic in topics:
+            if topic not in reader.topics:
+                known = ", ".join(sorted(reader.topics)) or "none"
+                raise ParameterError(f"{option} {topic}: no such topic in bag {reader.path}; it has {known}")
     excluded = {*(options.exclude or ()), *([CLOCK_TOPIC] if options.clock else ())}
     prefix = options.namespace.rstrip("/")
     played = [topic for topic in options.topics or sorted(reader.topics) if topic not in excluded]

@@ -88,7 +88,7 @@ def create_subscription(
 
 
 @contextmanager
-def overridable(topic: str) -> Iterator[dict[str, QoSOverridingOptions]]:
+def overridable(topic: str) -> Iterator[dict[str, Any]]:
     """Options to create an endpoint with overridable QoS; raises ParameterError for an invalid override."""
     try:
         yield {"qos_overriding_options": OVERRIDES}

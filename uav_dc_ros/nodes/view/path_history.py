@@ -57,7 +57,7 @@ class PathHistory:
         return not self._path.kept or target.stamp_ns < self._path.kept[0][1].stamp_ns
 
     def add_users(self, *, mission: int, step: int, stamp_ns: int, published_ns: int) -> int | None:
-        """Assign a mission and step to a time; before a new mission, returns when the last `users` came."""
+        """Assign mission and step to a time; returns when the last `users` before a new mission were sent."""
         before_ns, self._users_ns = self._users_ns, published_ns
         last, self._current = self._current, (mission, step)
         if mission == last[0] and step >= last[1]:
