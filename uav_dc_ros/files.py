@@ -25,7 +25,10 @@ _FOLDER_SYNC_ERRORS = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
 
 def shipped_folder(name: str) -> Path:
-    """The folder `policies`, `msgs_json` or one in `share`: in the package, or beside it in a checkout."""
+    """The folder `policies`, `msgs_json` or one in `share`: in the package, or beside it in a checkout.
+
+    Raises FileNotFoundError if the installation lacks it.
+    """
     candidates = (_PACKAGE / name, _PACKAGE.parent / name)
     for folder in candidates:
         if folder.is_dir():

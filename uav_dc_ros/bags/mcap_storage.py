@@ -91,10 +91,8 @@ def _open_indexed(
         library = reader.get_header().library
     for index in summary.chunk_indexes:
         if index.compression not in CHUNK_COMPRESSIONS:
-            raise BagError(
-                f"{path}: unsupported compression type {index.compression!r}; expected one of "
-                f"{CHUNK_COMPRESSIONS}"
-            )
+            unsupported = f"unsupported compression type {index.compression!r}"
+            raise BagError(f"{path}: {unsupported}; expected one of {CHUNK_COMPRESSIONS}")
     left_out = {} if repeats else part.repeated
     topics: dict[str, RecordedTopic] = {}
     for channel in summary.channels.values():
@@ -124,14 +122,12 @@ def _open_indexed(
                 compressed.add(channel.topic)
             yield _message(channel.topic, schema.name if schema else "", message, data)
 
-    def recorded(topics: Collection[str] | None) -> Iterator[BagMessage]:
-        return read(topics, None, None, sort=False)
-
     def log_goes_back_ns() -> int:
         if all(chunk.message_index_offsets for chunk in summary.chunk_indexes):
             with suppress(ValueError), read_errors(path):
                 return goes_back_ns(_indexed_times(file, summary))
-        return goes_back_ns((message.topic, message.log_time_ns) for message in recorded(None))
+        messages = read(None, None, None, sort=False)
+        return goes_back_ns((message.topic, message.log_time_ns) for message in messages)
 
     return Storage(
         path=path,
@@ -139,7 +135,7 @@ def _open_indexed(
         first_ns=min(statistics.message_start_time, TIME_MAX_NS),
         last_ns=min(statistics.message_end_time, TIME_MAX_NS),
         messages=read,
-        recorded=recorded,
+        recorded=lambda topics: read(topics, None, None, sort=False),
         goes_back_ns=log_goes_back_ns,
         about=part.about,
         dropped=part.dropped,
@@ -176,11 +172,6 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
                     if not is_repeated and (topics is None or topic in topics):
                         yield _message(topic, type, record, record.data)
 
-    def messages(
-        topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[BagMessage]:
-        return _sorted(recorded(topics), scan.lag_ns, start_ns, end_ns)
-
     schemas: dict[int, Schema] = {}
     topics: dict[str, RecordedTopic] = {}
     with read_errors(path):
@@ -198,7 +189,7 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
         topics=list(topics.values()),
         first_ns=scan.part.first_ns or 0,
         last_ns=scan.part.last_ns,
-        messages=messages,
+        messages=lambda topics, *range_ns: _sorted(recorded(topics), scan.lag_ns, *range_ns),
         recorded=recorded,
         goes_back_ns=lambda: scan.goes_back_ns,
         about=scan.part.about,

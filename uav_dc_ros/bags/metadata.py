@@ -38,7 +38,7 @@ class Part:
     last_ns: int = 0  # latest log time; 0 without messages
     # Messages by topic that repeat latched ones of earlier parts; included in `counts`.
     repeated: dict[str, int] = field(default_factory=dict)
-    dropped: dict[str, int] | None = None  # published messages that the recorder lost; None: not counted
+    dropped: dict[str, int] | None = None  # messages that the recorder lost, by topic; None: not counted
     # Last message and its publish time by latched topic; only of a part that was read.
     latest: dict[str, tuple[bytes, int]] = field(default_factory=dict)
 

@@ -65,12 +65,7 @@ class PartWriter:
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        name: str | None = None,
-        compression: str = "zstd",
-        chunk_bytes: int = CHUNK_BYTES,
+        self, path: Path, *, name: str = "", compression: str = "zstd", chunk_bytes: int = CHUNK_BYTES
     ) -> None:
         self.part = Part(name or path.name)
         self._topics: dict[int, str] = {}  # by channel
@@ -103,9 +98,8 @@ class PartWriter:
 
     def add_attachment(self, record: Attachment) -> None:
         """Append a copy of an attachment."""
-        self._mcap.add_attachment(
-            record.create_time, record.log_time, record.name, record.media_type, record.data
-        )
+        times = record.create_time, record.log_time
+        self._mcap.add_attachment(*times, record.name, record.media_type, record.data)
 
     def add_schema(self, type: str, encoding: str, definition: bytes) -> int:
         """Append a message type; returns its schema id."""

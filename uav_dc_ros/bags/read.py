@@ -42,15 +42,6 @@ class BagReader:
         torn: read files without their end, or damaged ones, as far as possible. They are scanned once before
             their messages are read.
 
-    Attributes:
-        parts: storage files, in their order.
-        storages: contents of each of them.
-        topics: by name.
-        about: description by this package's recorder, text by key; empty for other bags.
-        dropped: published messages by topic that the recorder lost; None: not counted.
-        first_ns, last_ns: log times of the first and last message, nanoseconds since the epoch; 0 without
-            messages.
-
     Raises:
         BagError: no bag; a part without its end, since its recorder was killed; a damaged one, or one of an
             unsupported kind.
@@ -58,17 +49,16 @@ class BagReader:
 
     def __init__(self, path: Path, *, torn: bool = False) -> None:
         self.path = path
-        self.topics: dict[str, RecordedTopic] = {}
-        self.about: dict[str, str] = {}
+        self.topics: dict[str, RecordedTopic] = {}  # by name
+        self.about: dict[str, str] = {}  # description by this package's recorder, text by key; else empty
+        # Published messages by topic that the recorder lost; None: not counted.
         self.dropped: dict[str, int] | None = None
-        self._closing = ExitStack()
-        try:
+        with ExitStack() as self._closing:
             files = storage_files(path)
-            self.storages = [self._open(part, torn, repeats=part is files[0]) for part in files]
-        except BaseException:
-            self._closing.close()
-            raise
-        self.parts = tuple(part.path for part in self.storages)
+            opened = [self._open(part, torn, repeats=part is files[0]) for part in files]
+            self._closing = self._closing.pop_all()
+        self.storages: list[Storage] = opened  # contents of each part
+        self.parts: tuple[Path, ...] = tuple(part.path for part in opened)  # storage files, in their order
         for part in self.storages:
             self.about = part.about | self.about  # the first value stays
             if part.dropped is not None:
@@ -76,8 +66,9 @@ class BagReader:
             for topic in part.topics:
                 merge_topic(self.topics, replace(topic))
         with_messages = [part for part in self.storages if _topics_with_messages(part)]
-        self.first_ns = min((part.first_ns for part in with_messages), default=0)
-        self.last_ns = max((part.last_ns for part in with_messages), default=0)
+        # Log time of the first message, nanoseconds since the epoch; 0 without messages.
+        self.first_ns: int = min((part.first_ns for part in with_messages), default=0)
+        self.last_ns: int = max((part.last_ns for part in with_messages), default=0)  # of the last one
 
     def __enter__(self) -> Self:
         return self
@@ -91,11 +82,7 @@ class BagReader:
         return sum(topic.count for topic in self.topics.values())
 
     def messages(
-        self,
-        topics: Collection[str] | None = None,
-        *,
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Collection[str] | None = None, *, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[BagMessage]:
         """Messages sorted by log time; those of equal times are in the order of the bag.
 

@@ -8,6 +8,7 @@ back.
 """
 
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 from uav_dc_ros.bags.storage import BagMessage, sorted_within
@@ -18,12 +19,12 @@ WAITING_BYTES = 16 * 2**20  # of messages that wait for earlier ones
 
 
 class _Last(NamedTuple):
-    """A topic's last message: clock settings before it, its times, shortest latency since the last one."""
+    """A topic's last message."""
 
-    setting: int
+    setting: int  # how often the clock had been set back before it
     log_ns: int
     publish_ns: int
-    min_latency_ns: int
+    min_latency_ns: int  # the shortest latency since the clock was last set back
 
 
 class _Clock:
@@ -49,9 +50,9 @@ class _Clock:
                 self.set_back_ns = max(self.set_back_ns, back_ns)
                 setting, min_latency_ns = setting + 1, latency_ns
         # Other topics went back: a topic without messages meanwhile belongs where its time is closest.
-        while setting < len(ends_ns) - 1 and abs(log_ns - ends_ns[setting + 1]) < abs(
-            log_ns - ends_ns[setting]
-        ):
+        for end_ns, next_end_ns in pairwise(ends_ns[setting:]):
+            if abs(log_ns - next_end_ns) >= abs(log_ns - end_ns):
+                break
             setting, min_latency_ns = setting + 1, latency_ns
         if setting == len(ends_ns):
             ends_ns.append(0)

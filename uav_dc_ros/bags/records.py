@@ -83,17 +83,7 @@ def parse(opcode: int, content: bytes, *, exact: bool = False) -> records.McapRe
     return record
 
 
-def complete_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of each complete record within the next `size` bytes."""
-    while size >= HEADER.size:
-        opcode, length = HEADER.unpack(stream.read(HEADER.size))
-        size -= HEADER.size + length
-        if opcode == 0 or size < 0:  # 0 is no opcode: a power cut left zeros
-            return
-        yield opcode, stream.read(length)
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ChunkHeader:
     """The fields of a chunk before its data."""
 
@@ -128,10 +118,7 @@ def _decompressed(compression: str, data: bytes) -> bytes | None:
 
 
 def decompress_chunk(header: ChunkHeader, data: bytes) -> bytes | None:
-    """The data of a whole chunk, decompressed and checked; None if it is damaged.
-
-    Raises UnsupportedCompressionError.
-    """
+    """The data of a whole chunk, checked; None if it is damaged; may raise UnsupportedCompressionError."""
     known = header.compression in CHUNK_COMPRESSIONS
     for compression in (header.compression,) if known else CHUNK_COMPRESSIONS:  # the name may be damaged
         content = _decompressed(compression, data)
@@ -150,10 +137,9 @@ def decompress_torn(compression: str, data: bytes) -> bytes:
     if compression not in CHUNK_COMPRESSIONS[1:]:
         return data
     try:
-        content: bytes = _decompressor(compression).decompress(data)
+        return bytes(_decompressor(compression).decompress(data))
     except Exception:  # of zstandard, lz4
         return b""
-    return content
 
 
 def decompress_payload(payload: bytes) -> bytes:
@@ -199,9 +185,7 @@ class RecordReader:
         if name_bytes > _NAME_MAX or len(fields) < data_at or not name.isascii():
             return None
         data_bytes = int.from_bytes(fields[data_at - 8 : data_at], "little")
-        return ChunkHeader(
-            size=size, crc=crc, compression=name.decode(), data_at=data_at, data_bytes=data_bytes
-        )
+        return ChunkHeader(size, crc, name.decode(), data_at, data_bytes)
 
     def chunk(self, at: int) -> tuple[ChunkHeader, int] | None:
         """The chunk at `at` and its end; None if its lengths differ and no CRC shows which is right.

@@ -65,23 +65,17 @@ class RecordedTopic:
     count: int = 0  # messages
     other_types: tuple[str, ...] = ()  # further types of the topic's messages; ROS 2 allows only one
 
-    def merge(self, other: "RecordedTopic") -> None:
-        """Add the same topic of another channel, or of another file."""
-        if not self.count and other.count:
-            self.offered_qos = other.offered_qos
-        self.count += other.count
-        new = {other.type, *other.other_types} - {self.type, *self.other_types}
-        self.other_types += tuple(sorted(new))
-
 
 def merge_topic(topics: dict[str, RecordedTopic], topic: RecordedTopic) -> None:
-    """Add a topic to those by name."""
+    """Add a topic to those by name, also one of another channel or file with the same name."""
     known = topics.setdefault(topic.name, topic)
-    if known is not topic:
-        known.merge(topic)
-
-
-Messages = Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
+    if known is topic:
+        return
+    if not known.count and topic.count:
+        known.offered_qos = topic.offered_qos
+    known.count += topic.count
+    new = {topic.type, *topic.other_types} - {known.type, *known.other_types}
+    known.other_types += tuple(sorted(new))
 
 
 @dataclass(kw_only=True)
@@ -93,7 +87,7 @@ class Storage:
     first_ns: int
     last_ns: int
     # Those of some topics (None: all) from a log time on and before another, sorted by log time.
-    messages: Messages
+    messages: Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
     # Those of some topics, or all, in the order of recording.
     recorded: Callable[[Collection[str] | None], Iterator[BagMessage]]
     goes_back_ns: Callable[[], int]  # the longest step back in log time within a topic; reads the file
@@ -129,9 +123,8 @@ def storage_files(path: Path) -> list[Path]:
             f"bag {path} holds {compressed[0]}, which is compressed as a whole; expected its files unpacked, "
             "as `zstd -d` does"
         )
-    raise BagError(
-        f"bag {path} holds no MCAP file; expected at least one (*.mcap), or SQLite storage (*.db3)"
-    )
+    expected = "expected at least one (*.mcap), or SQLite storage (*.db3)"
+    raise BagError(f"bag {path} holds no MCAP file; {expected}")
 
 
 def describe_foreign(beginning: bytes) -> str:

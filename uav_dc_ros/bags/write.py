@@ -10,9 +10,9 @@ the sequence 0, and are counted in a metadata record.
 
 import os
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -146,9 +146,8 @@ class BagWriter:
         earlier = self._resumed.topics.get(name)
         if earlier is not None:
             if earlier["type"] != type:
-                raise BagError(
-                    f"topic {name} is of type {type}; expected {earlier['type']}, as in earlier parts"
-                )
+                expected = f"expected {earlier['type']}, as in earlier parts"
+                raise BagError(f"topic {name} is of type {type}; {expected}")
             if self._resumed.counts[name]:
                 qos = earlier["offered_qos_profiles"]
         if not definition:
@@ -166,10 +165,8 @@ class BagWriter:
         )
         if topic.latest is not None and name in self._resumed.latest:
             topic.latest.append(self._resumed.latest[name])
-        try:
+        with self._disk_errors():  # a definition can fill the chunk
             self._add_channel(name, topic)
-        except OSError as error:  # a definition can fill the chunk
-            raise self._abandoned(error) from None
         self._topics[name] = topic
 
     def keep_latched(self, topic: str, n: int) -> None:
@@ -181,7 +178,7 @@ class BagWriter:
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:
         """Append a message of an added topic, serialised (CDR); times are nanoseconds since the epoch."""
         written = self._topics[topic]
-        try:
+        with self._disk_errors():
             if self._begun_ns is None:
                 self._begun_ns = log_time_ns
             elif self._splits and self._is_full(self._begun_ns, log_time_ns, len(data)):
@@ -191,18 +188,14 @@ class BagWriter:
                 self._repeat_latched(log_time_ns)
             written.sequence += 1
             self._writer.add_message(written.channel, data, log_time_ns, publish_time_ns, written.sequence)
-        except OSError as error:
-            raise self._abandoned(error) from None
         if written.latest is not None:
             written.latest.append((data, publish_time_ns))
 
     def add_about(self, about: Mapping[str, str]) -> None:
         """Add to the description of the bag."""
         self._about |= about
-        try:
+        with self._disk_errors():
             self._writer.add_metadata(metadata.ABOUT_RECORD, about)
-        except OSError as error:
-            raise self._abandoned(error) from None
 
     def set_dropped(self, dropped: Mapping[str, int]) -> None:
         """Record how many messages of each topic were lost since this writer began."""
@@ -210,10 +203,8 @@ class BagWriter:
         in_part = {topic: n - self._dropped_before[topic] for topic, n in dropped.items()}
         changes = {topic: str(n) for topic, n in in_part.items() if n != (recorded or {}).get(topic, 0)}
         if changes or recorded is None:
-            try:
+            with self._disk_errors():
                 self._writer.add_metadata(metadata.DROPPED_RECORD, changes)
-            except OSError as error:
-                raise self._abandoned(error) from None
 
     def sync(self) -> None:
         """Write everything to the operating system, and start a sync to disk in a thread.
@@ -221,27 +212,22 @@ class BagWriter:
         A kill then loses only what follows this call; a power cut, what follows the call before it, if the
         disk keeps up: no sync starts while another one runs.
         """
-        try:
+        with self._disk_errors():
             self._writer.flush()
             if self._last_sync is None or self._last_sync.done():
                 self._finish_sync()
                 folder = os.open(self.folder, os.O_RDONLY)  # for the names of new parts
                 descriptors = (self._writer.descriptor(), folder)
                 self._last_sync = self._sync_thread.submit(_fsync_and_close, descriptors)
-        except OSError as error:
-            raise self._abandoned(error) from None
 
     def close(self) -> None:
         """Finish the part and write metadata.yaml over all parts; a second call does nothing."""
         if self.closed:
             return
-        with self._closing:
-            try:
-                self._finish_sync()
-                self._writer.finish()
-                metadata.write_metadata(self.folder, self._parts)
-            except OSError as error:
-                raise self._abandoned(error) from None
+        with self._closing, self._disk_errors():
+            self._finish_sync()
+            self._writer.finish()
+            metadata.write_metadata(self.folder, self._parts)
 
     def __enter__(self) -> Self:
         return self
@@ -310,22 +296,25 @@ class BagWriter:
             for data, publish_time_ns in topic.latest or ():
                 self._writer.add_message(topic.channel, data, log_time_ns, publish_time_ns, sequence=0)
 
-    def _abandoned(self, error: OSError) -> BagError:
-        """Abandon the bag after an error of the disk: what was written stays."""
-        self._writer.abandon()
-        self._closing.close()
-        return BagError(
-            f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no index, "
-            "and holds what was written so far"
-        )
+    @contextmanager
+    def _disk_errors(self) -> Iterator[None]:
+        """Raises BagError for an OSError in the block, and abandons the bag: what was written stays."""
+        try:
+            yield
+        except OSError as error:
+            self._writer.abandon()
+            self._closing.close()
+            raise BagError(
+                f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no "
+                "index, and holds what was written so far"
+            ) from None
 
 
 def _earlier_parts(folder: Path) -> list[Part]:
     """The repaired parts of a bag whose writer was killed; none if it was killed before the first one."""
     if (folder / metadata.METADATA_FILE).exists():
-        raise BagError(
-            f"bag {folder} was closed: it has a metadata.yaml; expected one whose writer was killed"
-        )
+        expected = "expected one whose writer was killed"
+        raise BagError(f"bag {folder} was closed: it has a metadata.yaml; {expected}")
     if not part_paths(folder) and any(folder.iterdir()):
         raise BagError(f"folder {folder} holds files, but no MCAP file; expected a bag to resume")
     return repair_parts(folder).parts

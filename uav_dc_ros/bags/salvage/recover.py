@@ -43,10 +43,10 @@ class RecoveredPart:
 
 @dataclass(frozen=True, kw_only=True)
 class Recovered:
-    """A recovered bag: its folder, and the result for each file of the source."""
+    """A recovered bag."""
 
     folder: Path
-    parts: Sequence[RecoveredPart]
+    parts: Sequence[RecoveredPart]  # the result for each file of the source
 
     @property
     def whole(self) -> Part:
@@ -103,9 +103,8 @@ def _recover_part(source: Path, path: Path) -> RecoveredPart:
             copy(scan, writer)
             if not (scan.part.topics or scan.part.about):
                 path.unlink()
-                return RecoveredPart(
-                    source=source, reason=f"{scan.size} bytes without a topic", damages=scan.damages
-                )
+                reason = f"{scan.size} bytes without a topic"
+                return RecoveredPart(source=source, reason=reason, damages=scan.damages)
             if scan.lost_bytes:
                 writer.add_metadata(ABOUT_RECORD, {LOST_BYTES_KEY: str(scan.lost_bytes)})
             writer.finish()
@@ -124,9 +123,8 @@ def _recover_part(source: Path, path: Path) -> RecoveredPart:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bag recover`."""
-    parser.add_argument(
-        "bag", type=Path, metavar="BAG", help="folder of a bag, or one MCAP file; it is not changed"
-    )
+    bag = "folder of a bag, or one MCAP file; it is not changed"
+    parser.add_argument("bag", type=Path, metavar="BAG", help=bag)
     parser.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder of the new bag")
 
 

@@ -109,16 +109,14 @@ def copy(scan: Scan, writer: PartWriter) -> None:
                 topic, _ = scan.channels[record.channel_id]
                 if record.sequence == 0 and topic in scan.part.repeated:
                     repeated[topic] += 1
-                channel = channels[record.channel_id]
-                writer.add_message(
-                    channel, record.data, record.log_time, record.publish_time, record.sequence
-                )
+                channel, times_ns = channels[record.channel_id], (record.log_time, record.publish_time)
+                writer.add_message(channel, record.data, *times_ns, record.sequence)
             case Schema():
                 schemas[record.id] = writer.add_schema(record.name, record.encoding, record.data)
             case Channel():
-                channels[record.id] = writer.add_channel(
-                    record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
-                )
+                schema = schemas[record.schema_id]
+                channel = writer.add_channel(record.topic, record.message_encoding, schema, record.metadata)
+                channels[record.id] = channel
             case Metadata(name="rosbag2") | Metadata(name=metadata.REPEATED_RECORD):
                 pass  # counts of the unfinished part: the copy has its own
             case Metadata():

@@ -12,7 +12,6 @@ from bisect import bisect_left
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
 from typing import IO
 
@@ -34,7 +33,6 @@ from uav_dc_ros.bags.records import (
     TIME_MAX_NS,
     ChunkHeader,
     RecordReader,
-    complete_records,
     decompress_chunk,
     decompress_payload,
     decompress_torn,
@@ -109,38 +107,24 @@ class Scan:
 
     Skipped are a chunk with a wrong CRC, and everything between a record of invalid length and the next
     valid chunk. A chunk torn at the end of the file yields its first records, as far as it can be
-    decompressed.
-
-    Attributes:
-        part: contents read so far.
-        channels: topic and type by channel id so far.
-        library: name of the software that wrote the file.
-        lag_ns: the longest step back in log time from any earlier message so far.
-        goes_back_ns: the longest step back from the message before on the same topic so far.
-        damages: unusable places so far.
-        unreadable: intact messages whose payload is not CDR.
-        compressed: topics whose messages rosbag2 compressed individually; they are decompressed.
-        size: of the file when it was opened, bytes; bytes appended later are not read.
-        magic: the file's first bytes.
-
-    Raises:
-        BagError: not an MCAP file, or an unsupported compression.
-        OSError: the disk is gone.
+    decompressed. The attributes are of what was read so far. Raises BagError if the file is not MCAP, or a
+    compression is unsupported, and OSError if the disk is gone.
     """
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self.path = path
         self.part = Part(path.name)
-        self.channels: dict[int, tuple[str, str]] = {}
-        self.damages: list[Damage] = []
-        self.unreadable = Unreadable()
-        self.compressed: set[str] = set()
-        self.library = ""
-        self.lag_ns = self.goes_back_ns = 0
+        self.channels: dict[int, tuple[str, str]] = {}  # topic and type by channel id
+        self.damages: list[Damage] = []  # unusable places
+        self.unreadable = Unreadable()  # intact messages whose payload is not CDR
+        self.compressed: set[str] = set()  # topics of individually compressed messages; yields them unpacked
+        self.library = ""  # name of the software that wrote the file
+        self.lag_ns = 0  # the longest step back in log time from any earlier message
+        self.goes_back_ns = 0  # the longest step back from the message before on the same topic
         self._file = file
         self._reader = RecordReader(file)
-        self.size = self._reader.size
-        self.magic = self._reader.read(0, len(MAGIC))
+        self.size = self._reader.size  # when the file was opened, bytes; bytes appended later are not read
+        self.magic = self._reader.read(0, len(MAGIC))  # the file's first bytes
         self._schemas: dict[int, str] = {0: ""}
         self._cdr_channels: set[int] = set()
         self._latched: set[str] = set()
@@ -218,11 +202,10 @@ class Scan:
         """Offsets of records by the summary."""
         if self.summary is None:
             return []
-        return sorted(
-            [index.chunk_start_offset for index in self.summary.chunk_indexes]
-            + [index.offset for index in self.summary.metadata_indexes]
-            + [index.offset for index in self.summary.attachment_indexes]
-        )
+        offsets = [index.chunk_start_offset for index in self.summary.chunk_indexes]
+        offsets += [index.offset for index in self.summary.metadata_indexes]
+        offsets += [index.offset for index in self.summary.attachment_indexes]
+        return sorted(offsets)
 
     def _next(self, at: int) -> int:
         """Offset of the next valid record after damage; the end of the file without one."""
@@ -263,11 +246,15 @@ class Scan:
 
     def _content(self, data: bytes) -> Generator[McapRecord, None, int]:
         """Records of a chunk. Returns the number of bytes after the last complete one."""
-        rest = len(data)
-        for opcode, content in complete_records(BytesIO(data), rest):
-            rest -= HEADER.size + len(content)
-            yield from self._record(opcode, content)
-        return rest
+        at = 0
+        while len(data) - at >= HEADER.size:
+            opcode, length = HEADER.unpack_from(data, at)
+            end = at + HEADER.size + length
+            if opcode == 0 or end > len(data):  # 0 is no opcode: a power cut left zeros
+                break
+            yield from self._record(opcode, data[at + HEADER.size : end])
+            at = end
+        return len(data) - at
 
     def _record(self, opcode: int, content: bytes) -> Iterator[McapRecord]:
         """A record inside or outside of chunks, if a copy needs it."""
@@ -314,11 +301,9 @@ class Scan:
 
     def _check_payload(self, topic: str, data: bytes) -> None:
         """Count a payload that is not CDR, by its encapsulation; a string is checked completely."""
+        check = cdr.decode_string if self.part.topics[topic]["type"] == JSON else cdr.byte_order
         try:
-            if self.part.topics[topic]["type"] == JSON:
-                cdr.decode_string(data)
-            else:
-                cdr.byte_order(data)
+            check(data)
         except MessageError as error:
             self.unreadable.add(topic, error)
 
