@@ -30,5 +30,4 @@ def read_steps(bag: str | Path, namespace: str | None = None) -> Iterator[Record
     """
     with BagReader(Path(bag)) as reader:
         name = step_reader.namespace(reader, namespace)
-        step_s = step_reader.scenario(reader, name).mission.step_s
-        yield from step_reader.Steps(reader, name, round(step_s * 1e9))
+        yield from step_reader.Steps(reader, name, step_reader.scenario(reader, name).step_ns)

@@ -13,19 +13,13 @@ PROG = "python -m uav_dc_ros.bag"
 DESCRIPTION = "Record, play, recover, verify and explain bags."
 # Module and description by verb; the module has `add_options(parser)` and `run(options) -> exit status`.
 VERBS = {
-    "record": ("uav_dc_ros.nodes.record.bag_record", "record topics into a new bag"),
-    "play": ("uav_dc_ros.nodes.play.bag_play", "publish a bag's messages again, with their timing and QoS"),
-    "info": ("uav_dc_ros.recordings.info.command", "show what a bag holds, and whether it is complete"),
-    "recover": ("uav_dc_ros.bags.salvage.recover", "make a whole bag of what a killed recorder left"),
-    "verify": (
-        "uav_dc_ros.recordings.verify.command",
-        "recompute everything that a bag holds of its missions",
-    ),
-    "report": ("uav_dc_ros.recordings.report", "write a page about missions, or compare several bags"),
-    "export": (
-        "uav_dc_ros.recordings.export.command",
-        "write missions as tables, or as transitions to learn from",
-    ),
+    "record": ("nodes.record.bag_record", "record topics into a new bag"),
+    "play": ("nodes.play.bag_play", "publish a bag's messages again, with their timing and QoS"),
+    "info": ("recordings.info.command", "show what a bag holds, and whether it is complete"),
+    "recover": ("bags.salvage.recover", "make a whole bag of what a killed recorder left"),
+    "verify": ("recordings.verify.command", "recompute everything that a bag holds of its missions"),
+    "report": ("recordings.report", "write a page about missions, or compare several bags"),
+    "export": ("recordings.export.command", "write missions as tables, or as transitions to learn from"),
 }
 
 
@@ -38,7 +32,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         if verb not in VERBS:
             return cli.without_verb(verb, VERBS, PROG, DESCRIPTION)
         name, description = VERBS[verb]
-        module = importlib.import_module(name)
+        module = importlib.import_module(f"uav_dc_ros.{name}")
         sentence = f"{description[0].upper()}{description[1:]}."
         parser = cli.Parser(prog=f"{PROG} {verb}", description=sentence)
         module.add_options(parser)

@@ -130,7 +130,10 @@ def run(command: Callable[[], int], prog: str) -> NoReturn:
     """Exit with the status that `command` returns; a UavDcError is one line and status 2."""
     open_streams()
     try:
-        _check_working_directory()
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise UavDcError("the working directory was deleted; expected one that exists") from None
         try:
             status = command()
         except SystemExit as exited:  # --help, or an invalid option
@@ -180,13 +183,6 @@ def open_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-
-
-def _check_working_directory() -> None:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        raise UavDcError("the working directory was deleted; expected one that exists") from None
 
 
 class Output:

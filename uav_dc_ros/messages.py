@@ -256,8 +256,13 @@ def decode(text: str | bytes, kind: type[P]) -> P:
 
 def one_line(text: str) -> str:
     """A text from outside as at most `TEXT_MAX` characters in one line, without control characters."""
-    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:TEXT_MAX])
+    line = printable(text[:TEXT_MAX])
     return line if len(line) < TEXT_MAX else f"{line[: TEXT_MAX - 3]}..."
+
+
+def printable(text: str) -> str:
+    """Text of a bag, or a file's name, as one line without control characters for a terminal."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def schema_text(kind: type[Payload]) -> str:

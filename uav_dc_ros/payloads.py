@@ -64,6 +64,11 @@ def counted_data(payload: messages.Rates, scenario: Scenario) -> Array:
     return world.counted_data(scenario, np.asarray(payload.served), rate_bps, data_bits)
 
 
+def total_reward(status: messages.Mission, payload: messages.Rates, scenario: Scenario) -> float:
+    """r^t (eq. 7) of a step but the first; raises MessageError as `check` does for rates."""
+    return float(world.total_reward(scenario, np.asarray(status.cell), counted_data(payload, scenario)))
+
+
 def check(payload: messages.Payload, scenario: Scenario) -> None:
     """Raise MessageError for a payload of another world.
 

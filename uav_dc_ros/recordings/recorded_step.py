@@ -170,11 +170,6 @@ def _of_flight(flight: int) -> str:
     return f" of flight {flight}" if flight else ""
 
 
-def printable(text: str) -> str:
-    """Text of a bag, or a file's name, as one line without control characters for a terminal."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-
-
 def with_progress_of(status: Mission, other: Mission) -> Mission:
     """A status with the fields of another one that may change during a step."""
     changing = ("phase", "reason", "held", "fault", "steps_not_reached")

@@ -9,13 +9,13 @@ from typing import Any
 from uav_dc_ros import __version__, cli, files
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagError, ParameterError
+from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.pages import compare
 from uav_dc_ros.recordings.pages.health import Health
 from uav_dc_ros.recordings.pages.missions import read_missions
 from uav_dc_ros.recordings.pages.page import Page, world_data
 from uav_dc_ros.recordings.pages.vehicle import read_path
-from uav_dc_ros.recordings.recorded_step import printable
 from uav_dc_ros.topics import SIMULATED
 
 SUMMARIES_MAX = 2_000  # rows in the list of missions

@@ -228,10 +228,8 @@ class Steps:
                 self.repeated[topic] += 1
                 return
             else:
-                known = step.conflicts.get(topic)
-                if known is None or (
-                    differ_in_time_only(known, before) and not differ_in_time_only(payload, before)
-                ):
+                known = step.conflicts.setdefault(topic, payload)
+                if differ_in_time_only(known, before) and not differ_in_time_only(payload, before):
                     step.conflicts[topic] = payload
                 return
         elif isinstance(payload, Mission):

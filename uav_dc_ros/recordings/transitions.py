@@ -43,16 +43,11 @@ class _State(NamedTuple):
 
 
 class RecordedTransitions:
-    """Iterates over the transitions of recorded steps, in order, with one step in memory.
-
-    Attributes:
-        skipped: steps without a transition, by reason.
-        deduced: transitions without a recorded move that was flown: the action follows from the cells.
-    """
+    """Iterates over the transitions of recorded steps, in order, with one step in memory."""
 
     def __init__(self, steps: Iterable[RecordedStep], scenario: Scenario, observation: Observation) -> None:
-        self.skipped: Counter[str] = Counter()
-        self.deduced = 0
+        self.skipped: Counter[str] = Counter()  # steps without a transition, by reason
+        self.deduced = 0  # transitions whose action follows from the cells: no recorded move was flown
         self._steps, self._scenario, self._observation = steps, scenario, observation
 
     def __iter__(self) -> Iterator[Transition]:
@@ -78,11 +73,10 @@ class RecordedTransitions:
         if observed is None:
             return None
         observation = observations.encode(self._observation, self._scenario, **observed)
-        cell, total = observed["cell"], 0.0
-        if step.step and step.rates:  # a mission starts from r = 0, whatever R_plus its start cell has
-            counted_bits = payloads.counted_data(step.rates, self._scenario)
-            total = float(world.total_reward(self._scenario, cell, counted_bits))
-        return _State((step.flight, step.mission, step.step), cell, observation, total)
+        total = 0.0
+        if step.step and step.status and step.rates:  # whatever R_plus its start cell has, r is 0 there
+            total = payloads.total_reward(step.status, step.rates, self._scenario)
+        return _State((step.flight, step.mission, step.step), observed["cell"], observation, total)
 
     def _action(self, cell: Array, after: Array, move: Action | None) -> Action | None:
         """The action between two cells: the recorded move if it leads there."""

@@ -10,7 +10,6 @@ import rclpy
 from rclpy.context import Context
 
 from uav_dc_ros import messages, payloads
-from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.mission_summary import Summary
@@ -60,24 +59,17 @@ class MonitoredMission(MissionTotals):
 
 
 class MissionMonitor(MissionNode):
-    """Follows `mission` and `rates`.
-
-    Args:
-        seed: seed of the first mission; None: any.
-        run: identity of the run; empty: that of the vehicle, which is started elsewhere.
-        peers: nodes of the mission.
-        local_nodes: those that this run_all starts; they publish only after `is_alone`.
-    """
+    """Follows `mission` and `rates`."""
 
     pause_s = 0.01  # no node waits for the monitor
 
     def __init__(
         self,
         scenario: Scenario,
-        seed: int | None,
-        run: str,
-        peers: list[str],
-        local_nodes: list[str],
+        seed: int | None,  # of the first mission; None: any
+        run: str,  # its identity; empty: that of the vehicle, which is started elsewhere
+        peers: list[str],  # nodes of the mission
+        local_nodes: list[str],  # those that this run_all starts; they publish only after `is_alone`
         on_status: Callable[[messages.Mission], None],
         on_step: Callable[[MonitoredMission], None],
         on_end: Callable[[MonitoredMission], None],
@@ -86,8 +78,7 @@ class MissionMonitor(MissionNode):
     ) -> None:
         overrides = [rclpy.Parameter("peers", value=peers), rclpy.Parameter("run", value=run)]
         super().__init__("mission_monitor", overrides, context)
-        self.scenario = scenario
-        self.seed = seed
+        self.scenario, self.seed = scenario, seed
         self.mission: MonitoredMission | None = None
         self.restarts_of: dict[str, int] = {}  # number by node name
         self.is_alone = False  # whether the mission may begin: no other one was found for long enough
@@ -201,9 +192,7 @@ class MissionMonitor(MissionNode):
         now.cell, now.rates = status.cell, rates
         now.add(status.step, status, rates)
         if status.step:
-            counted_bits = payloads.counted_data(rates, self.scenario)
-            total = world.total_reward(self.scenario, np.asarray(status.cell), counted_bits)
-            now.add_reward(float(total), self.scenario.reward.data)
+            now.add_reward(payloads.total_reward(status, rates, self.scenario), self.scenario.reward.data)
         self._on_step(now)
         if now.is_over:
             self._report_end(now)

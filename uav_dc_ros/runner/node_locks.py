@@ -26,7 +26,9 @@ def held(domain: int, nodes: Sequence[str], run: str) -> Iterator[None]:
     """
     with ExitStack() as stack:
         for node in nodes:
-            name = _name(domain, node)
+            name = f"uav_dc_ros/{domain}{node}"
+            if len(name) > 80:  # an address has 107 bytes, of which a run takes 21
+                name = f"uav_dc_ros/{hashlib.sha256(name.encode()).hexdigest()}"
             lock = _bound(name)
             if lock is None:
                 run = _run(name)
@@ -37,12 +39,6 @@ def held(domain: int, nodes: Sequence[str], run: str) -> Iterator[None]:
             if shown is not None:
                 stack.enter_context(shown)
         yield
-
-
-def _name(domain: int, node: str) -> str:
-    """Name of a node's lock: an address has 107 bytes, of which a run takes 21."""
-    name = f"uav_dc_ros/{domain}{node}"
-    return name if len(name) <= 80 else f"uav_dc_ros/{hashlib.sha256(name.encode()).hexdigest()}"
 
 
 def _bound(name: str) -> socket.socket | None:

@@ -36,11 +36,7 @@ class SupervisedNode:
         self.process: NodeProcess | None = None
         self.start_s = 0.0  # time of the next start, without a process
         self.exits_s: deque[float] = deque()
-        self._commanded: str | None = None  # last transition
-
-    def attach(self, process: NodeProcess) -> None:
-        """Use a new process."""
-        self.process, self.state, self._commanded = process, None, None
+        self.commanded: str | None = None  # last transition
 
     def bring_up(self, may_activate: bool) -> None:
         """Command the next transition towards active, once; raises NodeError if the node rejects it."""
@@ -50,14 +46,14 @@ class SupervisedNode:
             return
         self.state = report.state
         if report.refused is not None:
-            wanted = {CONFIGURE: "configured", ACTIVATE: "activated"}[self._commanded or CONFIGURE]
+            wanted = {CONFIGURE: "configured", ACTIVATE: "activated"}[self.commanded or CONFIGURE]
             raise NodeError(f"node {self.row.name} could not be {wanted}: {report.refused}")
         if report.state not in UP:
             raise NodeError(f"node {self.row.name} is {report.state}; expected some of {', '.join(UP)}")
         transition = TRANSITIONS.get(report.state)
-        if transition in (None, self._commanded) or (transition == ACTIVATE and not may_activate):
+        if transition in (None, self.commanded) or (transition == ACTIVATE and not may_activate):
             return
-        self._commanded = transition
+        self.commanded = transition
         self.process.command(transition, self.row.name)
 
 
@@ -111,7 +107,7 @@ class Supervisor:
             parameters[node.row.name] = {**node.parameters, **restarted, "autostart": False}
         process = NodeProcess(parameters, self._namespace, nodes[0].restarts, self._folder, self._on_line)
         for node in nodes:
-            node.attach(process)
+            node.process, node.state, node.commanded = process, None, None
 
     def tick(self, may_bring_up: bool) -> None:
         """Bring nodes up, if they may be, and restart them; raises NodeError if the mission loses one."""

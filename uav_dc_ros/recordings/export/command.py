@@ -21,9 +21,9 @@ from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import DATA, MISSION_REWARD, RewardData, RewardForm
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
+from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.export.tables import Format, MissionRows, new_table, table_columns
-from uav_dc_ros.recordings.recorded_step import printable
 from uav_dc_ros.recordings.step_reader import EXTERNAL, Steps
 from uav_dc_ros.recordings.transitions import RecordedTransitions, Transition
 
@@ -183,14 +183,11 @@ def _write_transitions(options: argparse.Namespace, recorded: Steps, scenario: S
         with (scratch / "result").open("wb") as result:
             np.savez_compressed(result, **arrays, metadata=np.asarray(json.dumps(metadata)))
     size, reward = observations.size(observation, scenario), scenario.reward
-    print(
-        f"{options.out}: {n} transitions of {size} numbers ({observation!r}), reward form {reward.form!r}, "
-        f"{DATA[reward.data]}"
-    )
+    rewards = f"reward form {reward.form!r}, {DATA[reward.data]}"
+    print(f"{options.out}: {n} transitions of {size} numbers ({observation!r}), {rewards}")
     if transitions.deduced:
-        print(
-            f"  {transitions.deduced} actions are deduced from the cells: no move was recorded, or not flown"
-        )
+        why = "no move was recorded, or not flown"
+        print(f"  {transitions.deduced} actions are deduced from the cells: {why}")
     for reason, count in transitions.skipped.most_common():
         print(f"  {count} skipped: {reason}")
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from uav_dc_ros import payloads
 from uav_dc_ros.core import reward as core_reward
-from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, MessageError, UavDcError
 from uav_dc_ros.messages import Phase
@@ -142,9 +141,7 @@ class MissionRows:
         if step.step > 0:
             if step.rates is None or step.status is None:
                 return None, None
-            cell = np.asarray(step.status.cell)
-            counted_bits = payloads.counted_data(step.rates, self._scenario)
-            total = float(world.total_reward(self._scenario, cell, counted_bits))
+            total = payloads.total_reward(step.status, step.rates, self._scenario)
             self._totals.add_reward(total, self._scenario.reward.data)
         self._total = step.step, total
         if before is None or before[0] != step.step - 1:

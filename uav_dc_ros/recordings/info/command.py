@@ -14,8 +14,9 @@ from rich.text import Text
 
 from uav_dc_ros import files
 from uav_dc_ros.bags.storage import RECOVER
+from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings.info.survey import MissionSurvey, Survey, survey
-from uav_dc_ros.recordings.recorded_step import mission_name, printable
+from uav_dc_ros.recordings.recorded_step import mission_name
 
 WIDTH = 80  # without a terminal
 MISSIONS_MAX = 30  # listed one by one

@@ -16,7 +16,8 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.records import TIME_MAX_NS
 from uav_dc_ros.bags.storage import Storage
 from uav_dc_ros.errors import BagDamagedError, BagError, UavDcError
-from uav_dc_ros.recordings.recorded_step import MissionTotals, RecordedStep, mission_name, printable
+from uav_dc_ros.messages import printable
+from uav_dc_ros.recordings.recorded_step import MissionTotals, RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps, namespaces, scenario
 
 HARDWARE_ID = "uav_dc_ros"  # of our nodes' diagnostics
@@ -212,13 +213,9 @@ def _topics(reader: BagReader, dropped: dict[str, int]) -> tuple[list[TopicSurve
                 restarts[node] = max(n, restarts.get(node, 0))
     found = []
     for name in sorted({*reader.topics, *dropped}):
-        known = reader.topics.get(name)
-        topic = TopicSurvey(
-            name=name,
-            type=known.type if known else "",
-            other_types=list(known.other_types) if known else [],
-            dropped=dropped.get(name, 0),
-        )
+        topic = TopicSurvey(name=name, type="", other_types=[], dropped=dropped.get(name, 0))
+        if known := reader.topics.get(name):
+            topic.type, topic.other_types = known.type, list(known.other_types)
         found.append(topic)
         of_topic = times.get(name, _Times())
         topic.messages = of_topic.n
@@ -284,9 +281,8 @@ def survey_missions(reader: BagReader, namespace: str, problems: list[str]) -> l
         problems.append(str(error))
     missing = sum((mission.missing for mission in found), Counter())
     if missing:
-        problems.append(
-            f"steps{where} lack messages: {', '.join(f'{n:,} {topic}' for topic, n in missing.items())}"
-        )
+        listed = ", ".join(f"{n:,} {topic}" for topic, n in missing.items())
+        problems.append(f"steps{where} lack messages: {listed}")
     for mission in found:
         if not mission.is_over:
             name = mission_name(mission.mission, mission.flight)

@@ -18,11 +18,11 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import MISSION_REWARD
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
-from uav_dc_ros.messages import Phase
+from uav_dc_ros.messages import Phase, printable
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.pages.missions import MissionData, read_missions, significant
 from uav_dc_ros.recordings.pages.page import PAGE_MAX, Page, world_data
-from uav_dc_ros.recordings.recorded_step import mission_name, printable
+from uav_dc_ros.recordings.recorded_step import mission_name
 from uav_dc_ros.recordings.thinning import spread
 
 GROUPS_MAX = 8  # distinguishable colours and dashes
@@ -129,6 +129,7 @@ def page(
     first = groups[0]
     title = f"{first.scenario.name}: {len(groups)} {'bags' if len(bags) > 1 else 'missions'} side by side"
     axis = spread(max(int(curve["step"][-1]) for group in groups for curve in group.curves) + 1, POINTS_MAX)
+    words = dict.fromkeys(MISSION_REWARD[group.scenario.reward.data] for group in groups)
     data = {
         "title": title,
         "version": __version__,
@@ -136,9 +137,7 @@ def page(
         "steps": axis.tolist(),
         "worlds_differ": len({group.scenario.fingerprint for group in groups}) > 1,
         "rewards_differ": len({repr(group.scenario.reward) for group in groups}) > 1,
-        "reward_words": " or ".join(
-            dict.fromkeys(MISSION_REWARD[one.scenario.reward.data] for one in groups)
-        ),
+        "reward_words": " or ".join(words),
         "groups": [group.data(first, axis) for group in groups],
     }
     made = Page("compare", title)
@@ -157,7 +156,7 @@ def _groups(
         scenario = step_reader.scenario(reader, name, wanted)
         policy = reader.about.get("policy", "unknown policy")
         recorded = step_reader.Steps(reader, name, scenario.step_ns)
-        for mission in read_missions(recorded, scenario):
+        for mission in read_missions(recorded, scenario, False):
             if missions is not None and mission.index not in missions:
                 continue
             if split and len(groups) == GROUPS_MAX:

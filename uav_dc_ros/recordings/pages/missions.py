@@ -31,7 +31,7 @@ WAITING, SERVED, COLLECTED = "012"  # state of a user in the page data
 class MissionData:
     """A mission as page data; `real`: whether a real vehicle flew it."""
 
-    def __init__(self, scenario: Scenario, flight: int, index: int, real: bool = False) -> None:
+    def __init__(self, scenario: Scenario, flight: int, index: int, real: bool) -> None:
         n_users = scenario.n_users
         self.scenario = scenario
         self.flight, self.index = flight, index
@@ -202,9 +202,7 @@ class MissionData:
         self._steps.add(step.step, self._last)
 
 
-def read_missions(
-    steps: Iterable[RecordedStep], scenario: Scenario, real: bool = False
-) -> Iterator[MissionData]:
+def read_missions(steps: Iterable[RecordedStep], scenario: Scenario, real: bool) -> Iterator[MissionData]:
     """The missions of a bag one by one, with only the steps shown in memory."""
     for (flight, index), mission_steps in groupby(steps, attrgetter("flight", "mission")):
         data = MissionData(scenario, flight, index, real)

@@ -1,11 +1,9 @@
 """Verify a bag: recompute its missions, and compare to the last bit."""
 
 import argparse
-from collections.abc import Iterator
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -65,25 +63,15 @@ def run(options: argparse.Namespace) -> int:
         namespace = step_reader.namespace(reader, options.namespace)
         _check_topics(reader, namespace)
         scenario = step_reader.scenario(reader, namespace, options.scenario)
-        other = OtherPolicy(scenario, policies.load(options.policy)) if options.policy else None
-        found = verify(reader, namespace, scenario, other, options.policy_dir, options.tolerance)
-        print(f"{options.bag}: {found.flown}", *found.lines, sep="\n")
-        if reader.about.get("version", __version__) != __version__ and found.differs:
+        lines, differs, has_gaps = _verify(reader, namespace, scenario, options)
+        print(f"{options.bag}: {lines[0]}", *lines[1:], sep="\n")
+        if reader.about.get("version", __version__) != __version__ and differs:
             print(f"  (recorded by version {reader.about['version']}; this is {__version__})")
-    if found.differs:
+    if differs:
         print("differs")
     else:
-        print("verified in part" if found.gaps else "verified")
-    return DIFFERS if found.differs or (options.complete and found.gaps) else 0
-
-
-class Verification(NamedTuple):
-    """Result of a verification."""
-
-    flown: str  # missions, steps, scenario and policy
-    lines: list[str]  # results of the checks
-    differs: bool  # whether a recorded value differs from the recomputed one
-    gaps: bool  # whether something could not be recomputed
+        print("verified in part" if has_gaps else "verified")
+    return DIFFERS if differs or (options.complete and has_gaps) else 0
 
 
 class OtherPolicy(DecisionCheck):
@@ -121,19 +109,19 @@ class OtherPolicy(DecisionCheck):
         return [summary, *self._details, *more]
 
 
-def verify(
-    reader: BagReader,
-    namespace: str,
-    scenario: Scenario,
-    other: OtherPolicy | None = None,
-    policy_dir: Path | None = None,
-    tolerance: float = 0.0,
-) -> Verification:
-    """Recompute the missions in a namespace; raises BagError if nothing can be recomputed."""
-    about = reader.about
+def _verify(
+    reader: BagReader, namespace: str, scenario: Scenario, options: argparse.Namespace
+) -> tuple[list[str], bool, bool]:
+    """Recompute the missions in a namespace; raises BagError if nothing can be recomputed.
+
+    Returns the result as text, whether a recorded value differs from the recomputed one, and whether
+    something could not be recomputed.
+    """
+    other = OtherPolicy(scenario, policies.load(options.policy)) if options.policy else None
+    about, tolerance = reader.about, options.tolerance
     vehicle = step_reader.vehicle(reader, namespace)
     seed, lockstep, real = about.get("seed"), about.get("pace") == pace.LOCKSTEP, vehicle != SIMULATED
-    policy, missing_policy = _policy(about, scenario, policy_dir)
+    policy, missing_policy = _policy(about, scenario, options.policy_dir)
     channel = ChannelCheck(scenario, tolerance)
     world = WorldCheck(scenario, seed=seed, lockstep=lockstep, real=real, tolerance=tolerance)
     flights = VehicleCheck(scenario, vehicle) if real else None
@@ -162,12 +150,10 @@ def verify(
     losses = list(recorded.losses())
     missions = f"{n_missions} mission{'s' * (n_missions != 1)}"
     by = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
-    return Verification(
-        f"{missions}, {n_steps} steps in scenario {scenario.name!r}{by}",
-        lines + losses + (other.lines() if other else []),
-        differs=any(check.differing for check in checks),
-        gaps=any(check.skipped for check in checks) or not decisions or bool(losses) or seed is None,
-    )
+    flown = f"{missions}, {n_steps} steps in scenario {scenario.name!r}{by}"
+    has_gaps = any(check.skipped for check in checks) or not decisions or bool(losses) or seed is None
+    lines = [flown, *lines, *losses, *(other.lines() if other else [])]
+    return lines, any(check.differing for check in checks), has_gaps
 
 
 def _check_topics(reader: BagReader, namespace: str) -> None:
@@ -190,8 +176,11 @@ def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> t
     name, sha256 = about.get("policy"), about.get("policy_sha256")
     if name is None or sha256 is None:
         return None, "the bag does not name the policy that flew; --policy NAME|DIR compares with one"
+    candidates: list[str | Path] = [name, *policies.names()]
+    if folder is not None:
+        candidates = [folder, *sorted(path.parent for path in folder.glob(f"*/{CONFIG}")), *candidates]
     other = ""
-    for candidate in _candidates(name, folder):
+    for candidate in candidates:
         try:
             policy = policies.load(candidate)
         except PolicyError:
@@ -203,11 +192,3 @@ def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> t
             other = f"; {str(candidate)!r} is another one (sha256 {policy.sha256[:12]})"
     missing = f"policy {name!r} (sha256 {sha256[:12]}) is missing{other}"
     return None, f"{missing}; expected it from --policy-dir DIR"
-
-
-def _candidates(name: str, folder: Path | None) -> Iterator[str | Path]:
-    if folder is not None:
-        yield folder
-        yield from sorted(path.parent for path in folder.glob(f"*/{CONFIG}"))
-    yield name
-    yield from policies.names()

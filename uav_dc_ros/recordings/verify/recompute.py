@@ -21,8 +21,8 @@ from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase, Rates, Stepped
 from uav_dc_ros.recordings.recorded_step import RecordedStep, differ_in_time_only, with_progress_of
 
-COLUMNS = ("sinr", "rate_bps", "served", "sum_rate_bps", "data_bits", "collected")  # causes before effects
 FIELDS = {"users": "users", "rates": "rates", "mission": "status", "move": "move"}
+COLUMNS = ("sinr", "rate_bps", "served", "sum_rate_bps", "data_bits", "collected")  # causes before effects
 Collection: TypeAlias = tuple[Array, Array]  # data of each user, bit, and whether it is collected, `[U]` each
 
 
