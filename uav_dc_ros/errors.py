@@ -1,5 +1,8 @@
 """The project's exceptions: one small tree with one base class."""
 
+# Behind the name of a package that the extra `train` brings.
+FROM_TRAIN = 'is not installed; expected it from: pip install "uav_dc_ros[train]"'
+
 
 class UavDcError(Exception):
     """An error that the user can fix. The message states what was wrong, the value, and what was expected."""

@@ -10,8 +10,7 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.experiments.evaluate.cli import main
 from uav_dc_ros.experiments.evaluate.rollout import roll_out, rollout_steps
-from uav_dc_ros.planners import PLANNERS
-from uav_dc_ros.planners.plans import ENOUGH, EXACT_TOUR_MAX
+from uav_dc_ros.planners import ENOUGH, EXACT_TOUR_MAX, PLANNERS
 
 SEEDS = range(20)
 

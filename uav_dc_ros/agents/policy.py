@@ -122,8 +122,7 @@ class Policy:
         """Reject a world in which the policy's observations have another meaning.
 
         Raises:
-            PolicyError: another grid, or another number of clusters unless the policy observes its position
-                only.
+            PolicyError: another grid or, unless it observes its position only, another number of clusters.
         """
         own = self.scenario
         facts: list[tuple[str, object, object]] = [
@@ -158,19 +157,18 @@ def load(name_or_path: str | Path) -> Policy:
             f"policy {name!r}: no such name or folder; expected one of {', '.join(names()) or '(none)'}, "
             f"or the path of a folder with {CONFIG} and {MODEL}"
         )
-    config_bytes, model_bytes = _read(folder / CONFIG), _read(folder / MODEL)
+    path, model_path = folder / CONFIG, folder / MODEL
+    config_bytes, model_bytes = _read(path), _read(model_path)
     try:
         config = msgspec.json.decode(config_bytes, type=PolicyConfig)
-        scenario = from_values(config.scenario, f"{folder / CONFIG}: scenario")
+        scenario = from_values(config.scenario, f"{path}: scenario")
     except msgspec.MsgspecError as error:
-        raise PolicyError(f"{folder / CONFIG}: {error}") from None
+        raise PolicyError(f"{path}: {error}") from None
     except ScenarioError as error:
         raise PolicyError(str(error)) from None
     if config.actions != ACTION_LABELS:
-        raise PolicyError(
-            f"{folder / CONFIG}: actions = {list(config.actions)}; expected {list(ACTION_LABELS)}"
-        )
-    parameters = _parameters(model_bytes, config.architecture(scenario), folder / MODEL)
+        raise PolicyError(f"{path}: actions = {list(config.actions)}; expected {list(ACTION_LABELS)}")
+    parameters = _parameters(model_bytes, config.architecture(scenario), model_path)
     sha256 = hashlib.sha256(config_bytes + model_bytes).hexdigest()
     return Policy(folder=folder, config=config, scenario=scenario, parameters=parameters, sha256=sha256)
 

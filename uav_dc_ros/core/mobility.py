@@ -35,19 +35,15 @@ def _polar(radius_m: Array, turn: Array) -> Array:
 
 
 class WalkingUsers:
-    """The users of one mission, drawn from its seed in the order of the environment.
-
-    Attributes:
-        step: steps walked.
-        positions_m: current positions, metres, `[U, 2]`.
-    """
+    """The users of one mission, drawn from its seed in the order of the environment."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._scenario = scenario
         self._rng = np.random.default_rng(seed)
-        self.step = 0
+        self.step = 0  # steps walked
         draws = self._draws()
         centres_m = constant(scenario.user_centres_m, draws)
+        # Current positions, metres, `[U, 2]`
         self.positions_m: Array = scatter(centres_m, scenario.users.cluster_radius_m, draws)
         self._next_m: Array | None = None
 

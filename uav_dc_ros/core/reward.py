@@ -68,9 +68,8 @@ def total(
     user that counts as 1: it brings the first term to order one; the paper leaves its unit open. It, `beta`
     and `zeta` are numbers or `[...]`.
     """
-    return (
-        beta * (array_namespace(counted_bits).mean(counted_bits, axis=-1) / data_scale_bits) + zeta * r_plus
-    )
+    mean_bits = array_namespace(counted_bits).mean(counted_bits, axis=-1)
+    return beta * (mean_bits / data_scale_bits) + zeta * r_plus
 
 
 def step_reward(total: Array, previous_total: Array, form: RewardForm | Array) -> Array:
@@ -97,11 +96,9 @@ def mission_reward(before: Array, total: Array, n_steps: Array, data: RewardData
     `so_far`: r^t at its end, which holds the data of all steps. `step`: the mean of r^t over its steps.
     `MISSION_REWARD` has the words.
 
-    Args:
-        before: the reward of the mission one step earlier, 0 before the first, `[...]`.
-        total: r^t of the last step, `[...]`.
-        n_steps: steps with a known r^t, `[...]`, with the dtype of `total`.
-        data: the reading's name, or for each world whether it is `step`, bool `[...]`.
+    `before` is the reward of the mission one step earlier, 0 before the first, and `total` is r^t of the
+    last step, both `[...]`. `n_steps` counts the steps with a known r^t, `[...]`, with the dtype of `total`.
+    `data` is the reading's name, or for each world whether it is `step`, bool `[...]`.
     """
     mean = before + (total - before) / n_steps
     if isinstance(data, str):

@@ -188,7 +188,10 @@ def from_values(values: dict[str, Any], source: str) -> Scenario:
         scenario = msgspec.convert(values, Scenario)
     except msgspec.ValidationError as error:
         raise ScenarioError(f"{source}: {_explain(str(error), values)}") from None
-    _check_finite(msgspec.to_builtins(scenario), source)
+    for key, value in leaves(msgspec.to_builtins(scenario)):
+        # TOML's `nan` and `inf`, which no range of the types excludes
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ScenarioError(f"{source}: {key} = {value}; expected a finite number")
     if (error_text := next(_inconsistencies(scenario), None)) is not None:
         raise ScenarioError(f"{source}: {error_text}")
     return scenario
@@ -238,16 +241,17 @@ def _explain(message: str, values: Any) -> str:
     return f"{path or 'scenario'} = {reprlib.repr(values)}; expected {expected}"
 
 
-def _check_finite(values: Any, source: str, key: str = "") -> None:
-    """Reject TOML's `nan` and `inf`, which no range of the types excludes."""
-    if isinstance(values, dict):
-        for name, value in values.items():
-            _check_finite(value, source, f"{key}.{name}" if key else name)
-    elif isinstance(values, list | tuple):
-        for i, value in enumerate(values):
-            _check_finite(value, source, f"{key}[{i}]")
-    elif isinstance(values, float) and not math.isfinite(values):
-        raise ScenarioError(f"{source}: {key} = {values}; expected a finite number")
+def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Key and value of every leaf of nested dicts and lists; a list yields its length first."""
+    if isinstance(value, dict):
+        for name, entry in value.items():
+            yield from leaves(entry, f"{key}.{name}" if key else name)
+    elif isinstance(value, list | tuple):
+        yield f"the number of {key}", len(value)
+        for i, entry in enumerate(value):
+            yield from leaves(entry, f"{key}[{i}]")
+    else:
+        yield key, value
 
 
 def _inconsistencies(scenario: Scenario) -> Iterator[str]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from uav_dc_ros.core.arrays import Array
 
+_ENDS = [(1 - 0.95) / 2, (1 + 0.95) / 2]  # quantiles at the ends of a 95% interval
 _RESAMPLES = 10_000
 _BAND_RESAMPLES = 2_000  # of whole curves: an interval's ends for each of many points
 _BLOCK = 1_000_000  # values resampled at a time: a large sample needs no memory for all of its resamples
@@ -21,15 +22,13 @@ class Interval(NamedTuple):
     high: float
 
 
-def interval(
-    values: Array, statistic: Callable[[Array], Array] = lambda means: means, level: float = 0.95
-) -> Interval:
+def interval(values: Array, statistic: Callable[[Array], Array] = lambda means: means) -> Interval:
     """The mean of a sample `[n, ...]`, or a statistic (`[R, ...]` to `[R]`) of means, with its interval.
 
     Values are finite, n >= 1. For small n the interval is somewhat too narrow.
     """
     values = np.asarray(values, np.float64)
-    low, high = np.quantile(statistic(_resampled_means(values)), [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.quantile(statistic(_resampled_means(values)), _ENDS)
     return Interval(float(statistic(values.mean(axis=0)[None])[0]), float(low), float(high))
 
 
@@ -48,7 +47,7 @@ def _draws(n: int) -> Array:
     return np.random.default_rng(0).integers(0, n, (_RESAMPLES, n))
 
 
-def band(curves: Array, level: float = 0.95) -> tuple[Array, Array, Array]:
+def band(curves: Array) -> tuple[Array, Array, Array]:
     """The mean of curves `[n, T]`, and both ends of its interval at each point, `[T]` each.
 
     Whole curves are resampled, since the points of one are dependent.
@@ -56,5 +55,5 @@ def band(curves: Array, level: float = 0.95) -> tuple[Array, Array, Array]:
     curves = np.asarray(curves, np.float64)
     n = len(curves)
     drawn = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), _BAND_RESAMPLES)
-    low, high = np.quantile(drawn / n @ curves, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    low, high = np.quantile(drawn / n @ curves, _ENDS, axis=0)
     return curves.mean(axis=0), low, high

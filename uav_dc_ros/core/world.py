@@ -129,12 +129,8 @@ def step(
 ) -> tuple[State, Outcome]:
     """The world after one step, and the step's outcome.
 
-    Args:
-        scenario: the world's values.
-        state: the world before the step.
-        action: value of a `grid.Action`, integers `[...]`.
-        draws: uniform in [0, 1), `[..., U, 2]`.
-        rewards: of each world, `[...]`; default: the scenario's.
+    `action` is the value of a `grid.Action`, integers `[...]`; `draws` are uniform in [0, 1), `[..., U, 2]`;
+    `rewards` are those of each world, `[...]`, by default the scenario's.
     """
     cell = scenario.grid.move(state.cell, action)
     users_m = mobility.walk(state.users_m, scenario.users.v_max_mps, scenario.mission.step_s, draws)
@@ -156,14 +152,8 @@ def step(
         total_reward=total,
         mission_reward=reward.mission_reward(state.mission_reward, total, n_rewards, values.data),
     )
-    outcome = Outcome(
-        reward=reward.step_reward(total, state.total_reward, values.form),
-        terminated=terminated,
-        truncated=truncated,
-        landed=landed,
-        link=link,
-    )
-    return after, outcome
+    agents = reward.step_reward(total, state.total_reward, values.form)
+    return after, Outcome(reward=agents, terminated=terminated, truncated=truncated, landed=landed, link=link)
 
 
 def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
@@ -183,18 +173,12 @@ def select(where: Array, chosen: State, other: State) -> State:
 
 
 class BatchWorld:
-    """Worlds `[N]` of one scenario that advance together and restart each by itself, on numpy or torch.
-
-    Attributes:
-        scenario: the values of every world.
-        state: all worlds between two steps, `[N, ...]`.
-    """
+    """Worlds `[N]` of one scenario that advance together and restart each by itself, on numpy or torch."""
 
     def __init__(self, scenario: Scenario, draws: Array, rewards: Rewards | None = None) -> None:
         """Worlds before their first step; arguments as in `initial` and `step`."""
-        self.scenario = scenario
-        self._rewards = rewards
-        self.state = initial(scenario, draws)
+        self.scenario, self._rewards = scenario, rewards
+        self.state = initial(scenario, draws)  # of all worlds between two steps, `[N, ...]`
 
     def step(self, action: Array, draws: Array) -> Outcome:
         """One step of every world: integers `[N]`, and uniform draws `[N, U, 2]`."""

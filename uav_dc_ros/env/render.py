@@ -104,7 +104,7 @@ def _draw_field(axes: Axes, trajectory: Trajectory) -> None:
 
 def _draw_steps(axes: Axes, trajectory: Trajectory) -> None:
     """Altitude and users collected over the steps."""
-    scenario = trajectory.scenario
+    scenario, grid = trajectory.scenario, trajectory.scenario.grid
     steps = np.arange(len(trajectory.cells))
     axes.fill_between(steps, trajectory.n_collected, color=COLLECTED, alpha=0.25, lw=0, step="post")
     axes.step(steps, trajectory.n_collected, color=COLLECTED, lw=1.6, where="post")
@@ -113,10 +113,8 @@ def _draw_steps(axes: Axes, trajectory: Trajectory) -> None:
     axes.set_ylabel("users\ncollected", color=COLLECTED, size=9)
     _style(axes)
     height = axes.twinx()
-    altitudes_m = (
-        scenario.grid.altitude_min_m + np.stack(trajectory.cells)[:, 2] * scenario.grid.altitude_step_m
-    )
-    top_m = scenario.grid.altitude_min_m + (scenario.grid.n_z - 1) * scenario.grid.altitude_step_m
+    altitudes_m = grid.altitude_min_m + np.stack(trajectory.cells)[:, 2] * grid.altitude_step_m
+    top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
     height.step(steps, altitudes_m, color=INK, lw=1.3, where="post")
     height.set_ylim(0, top_m * 1.2)
     height.set_ylabel("altitude, m", color=INK, size=9)

@@ -1,14 +1,99 @@
-"""Baselines that learn nothing. Each is a function from a scenario to an `core.world.Act`.
+"""Baselines that learn nothing: random moves, the nearest cluster first, and a tour of all clusters.
 
-Like a policy trained in the scenario, they know the cluster centres, but not where single users are.
+Each is a function from a scenario to a `core.world.Act`. Like a policy trained in the scenario, they know
+the cluster centres, but not where single users are.
 """
 
+import itertools
 from collections.abc import Callable
 
+import numpy as np
+
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.world import Act
-from uav_dc_ros.planners.plans import nearest, random, tour
+from uav_dc_ros.core.world import Act, State
+
+# Share of its users after which a cluster counts as served: the last tenth may have walked far away.
+ENOUGH = 0.9
+EXACT_TOUR_MAX = 8  # clusters of which every order is tried; with more, the nearest is next
+
+
+def random(scenario: Scenario) -> Act:
+    """Any of the seven actions with equal probability; every call returns the same sequence."""
+    rng = np.random.default_rng(0)
+    return lambda state: rng.integers(len(Action), size=state.step.shape)
+
+
+def nearest(scenario: Scenario) -> Act:
+    """Flies to the nearest cluster that is not served, at the lowest layer, and home in time."""
+    goals = _cluster_cells(scenario)
+
+    def act(state: State) -> Array:
+        distance = np.abs(state.cell[..., None, :2] - goals).sum(axis=-1)
+        distance = np.where(_served(scenario, state), np.iinfo(distance.dtype).max, distance)
+        return _towards(scenario, state, goals[np.argmin(distance, axis=-1)])
+
+    return act
+
+
+def tour(scenario: Scenario) -> Act:
+    """Flies to the clusters in the order of the shortest way from start to dock, and home in time."""
+    goals = _cluster_cells(scenario)
+    order = np.asarray(_shortest_order(scenario, goals))
+
+    def act(state: State) -> Array:
+        next_open = np.argmin(_served(scenario, state)[..., order], axis=-1)
+        return _towards(scenario, state, goals[order[next_open]])
+
+    return act
+
+
+def _towards(scenario: Scenario, state: State, goal: Array) -> Array:
+    """The move to `goal` `[..., 2]`; to the dock once all clusters are served, or time is running out."""
+    dock = np.asarray(scenario.dock_cell)
+    to_dock = np.abs(state.cell[..., :2] - dock).sum(axis=-1)
+    # One step of reserve: a hover or a descent may cost a move away from the dock.
+    home = (scenario.mission.max_steps - state.step <= to_dock + 1) | _served(scenario, state).all(axis=-1)
+    dx, dy = np.moveaxis(np.where(home[..., None], dock, goal) - state.cell[..., :2], -1, 0)
+    # Down comes first, then the x axis.
+    return np.select(
+        [(state.cell[..., 2] > 0) & ~home, dx < 0, dx > 0, dy < 0, dy > 0],
+        [Action.DOWNWARD, Action.LEFT, Action.RIGHT, Action.BACKWARD, Action.FORWARD],
+        Action.HOVER,
+    )
+
+
+def _served(scenario: Scenario, state: State) -> Array:
+    """Bool `[..., M]`."""
+    per_cluster = state.collected.reshape(*state.collected.shape[:-1], scenario.n_clusters, -1)
+    return per_cluster.mean(axis=-1) >= ENOUGH
+
+
+def _cluster_cells(scenario: Scenario) -> Array:
+    """The column of cells on the grid that is closest to each cluster's centre, integers `[M, 2]`."""
+    cells = np.rint(np.asarray(scenario.users.cluster_centres_m) / scenario.grid.cell_m).astype(np.int64)
+    return np.clip(cells, 0, np.asarray(scenario.grid.shape[:2]) - 1)
+
+
+def _shortest_order(scenario: Scenario, goals: Array) -> list[int]:
+    """Order of the clusters on the shortest way from start past all of them to the dock."""
+    start, dock = np.asarray(scenario.start_cell[:2]), np.asarray(scenario.dock_cell)
+    if len(goals) > EXACT_TOUR_MAX:
+        order: list[int] = []
+        open_goals, here = set(range(len(goals))), start
+        while open_goals:
+            distance = np.abs(goals - here).sum(axis=-1)
+            order.append(min(open_goals, key=lambda i: (distance[i], i)))
+            open_goals.remove(order[-1])
+            here = goals[order[-1]]
+        return order
+
+    def length(order: list[int]) -> int:
+        stops = np.stack([start, *goals[order], dock])
+        return int(np.abs(np.diff(stops, axis=0)).sum())
+
+    return min(map(list, itertools.permutations(range(len(goals)))), key=length)
+
 
 PLANNERS: dict[str, Callable[[Scenario], Act]] = {"random": random, "nearest": nearest, "tour": tour}
-
-__all__ = ["PLANNERS", "nearest", "random", "tour"]

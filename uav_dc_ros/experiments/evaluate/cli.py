@@ -50,28 +50,18 @@ class Candidate(NamedTuple):
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command, and exit."""
-    parser = cli.Parser(
-        prog=PROG, description="Fly policies over many missions, and show and compare their performance."
-    )
-    parser.add_argument(
-        "--policy",
-        nargs="+",
-        required=True,
-        metavar="NAME|DIR",
-        help=f"shipped: {', '.join(policies.names())}; baselines: {', '.join(PLANNERS)}; "
-        "all are compared with the first",
-    )
-    parser.add_argument(
-        "--scenario",
-        nargs="+",
-        default=[],
-        metavar="NAME|FILE",
-        help=f"every policy flies in each; shipped: {', '.join(scenarios.names())}; "
-        "default: by the name of the policy's own",
-    )
-    parser.add_argument("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write evaluations and comparisons")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
+    description = "Fly policies over many missions, and show and compare their performance."
+    parser = cli.Parser(prog=PROG, description=description)
+    add = parser.add_argument
+    text = f"shipped: {', '.join(policies.names())}; baselines: {', '.join(PLANNERS)}; "
+    text += "all are compared with the first"
+    add("--policy", nargs="+", required=True, metavar="NAME|DIR", help=text)
+    text = f"every policy flies in each; shipped: {', '.join(scenarios.names())}; "
+    text += "default: by the name of the policy's own"
+    add("--scenario", nargs="+", default=[], metavar="NAME|FILE", help=text)
+    add("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
+    add("--json", type=Path, metavar="FILE", help="write evaluations and comparisons")
+    add("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
 
     def command() -> int:
         options = parser.parse_args(argv)
@@ -150,22 +140,17 @@ def show(report: EvaluationReport) -> None:
         where = f"{evaluation.scenario}, {evaluation.users_total} users"
         title = f"{evaluation.policy} in {where}, {_missions(evaluation)}"
         console.print(title, style="bold", markup=False, soft_wrap=True)
-        console.print(_details(evaluation), "")
+        table = _table()
+        for column in COLUMNS:
+            table.add_column(column, justify="right" if column else "left", no_wrap=True)
+        for row in rows(evaluation):
+            table.add_row(*row)
+        console.print(table, "")
     if len(report.evaluations) > 1:
         title = f"Means and their 95% bootstrap intervals, {_missions(report.evaluations[0])}"
         console.print(title, style="bold", soft_wrap=True)
         console.print(_overview(report))
         console.print("Arrival: over missions that landed; its difference: over those in which both did.")
-
-
-def _details(evaluation: Evaluation) -> Table:
-    """Every figure of one evaluation."""
-    table = _table()
-    for column in COLUMNS:
-        table.add_column(column, justify="right" if column else "left", no_wrap=True)
-    for row in rows(evaluation):
-        table.add_row(*row)
-    return table
 
 
 def _overview(report: EvaluationReport) -> Table:

@@ -15,7 +15,7 @@ from uav_dc_ros.core.reward import MISSION_REWARD, RewardData
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.stats import interval
 from uav_dc_ros.core.world import Act, observe
-from uav_dc_ros.errors import UavDcError
+from uav_dc_ros.errors import FROM_TRAIN, UavDcError
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out, roll_out_trajectory
 
 # The missions on every policy card. Nothing is tuned or selected on them.
@@ -193,9 +193,7 @@ def save_mission_picture(act: Act, scenario: Scenario, seed: int, path: Path) ->
     try:
         from uav_dc_ros.env.render import save_picture  # slow to import, and optional
     except ModuleNotFoundError:
-        raise UavDcError(
-            'matplotlib is not installed; expected it from: pip install "uav_dc_ros[train]"'
-        ) from None
+        raise UavDcError(f"matplotlib {FROM_TRAIN}") from None
     try:
         save_picture(roll_out_trajectory(scenario, act, seed), path)
     except (OSError, ValueError) as error:

@@ -1,13 +1,12 @@
 """Missions flown side by side, one per seed, in numpy: the evaluation of every policy.
 
 Seed s draws from `numpy.random.default_rng(s)`: `(U, 2)` numbers for the start, then `(U, 2)` for each step.
-The
-environment and the ROS nodes do the same: seed s is the same mission everywhere.
+The environment and the ROS nodes do the same: seed s is the same mission everywhere.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -17,6 +16,9 @@ from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act
 from uav_dc_ros.env.trajectory import Trajectory
+
+# Of each run: the draws of its users' start positions, `[U, 2]`, or None for those of the mission's seed.
+Layouts: TypeAlias = Sequence[Array | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,23 +36,14 @@ class Missions:
 
 
 def rollout_steps(
-    scenario: Scenario,
-    act: Act,
-    seeds: Sequence[int],
-    layouts: Sequence[Array | None] | None = None,
-    rewards: Rewards | None = None,
+    scenario: Scenario, act: Act, seeds: Sequence[int], layouts: Layouts = (), rewards: Rewards | None = None
 ) -> Iterator[tuple[world.State, world.Outcome | None]]:
-    """The missions step by step: first their start, without an outcome, then every step.
+    """The S missions of `seeds` step by step: first their start, without an outcome, then every step.
 
-    Args:
-        scenario: the world's values.
-        act: the policy or planner.
-        seeds: the S missions.
-        layouts: for R runs that fly all S missions each, `[R, S]`: for each run the draws of the users' start
-            positions, `[U, 2]`, or None for the seed's own.
-        rewards: reward settings of each run, `[R, 1]`; default: the scenario's.
+    With the `layouts` of R runs, each run flies all missions: `[R, S]`, otherwise `[S]`. `rewards` are the
+    reward settings of each run, `[R, 1]`; default: the scenario's.
     """
-    runs = () if layouts is None else (len(layouts),)
+    runs = (len(layouts),) if layouts else ()
     rngs = [np.random.default_rng(seed) for seed in seeds]
 
     def draws() -> Array:
@@ -58,7 +51,7 @@ def rollout_steps(
         return np.broadcast_to(one, (*runs, *one.shape))
 
     start = draws().copy()
-    for run, own in enumerate(layouts or ()):
+    for run, own in enumerate(layouts):
         if own is not None:
             start[run] = own
     state = world.initial(scenario, start)
@@ -69,11 +62,7 @@ def rollout_steps(
 
 
 def roll_out(
-    scenario: Scenario,
-    act: Act,
-    seeds: Sequence[int],
-    layouts: Sequence[Array | None] | None = None,
-    rewards: Rewards | None = None,
+    scenario: Scenario, act: Act, seeds: Sequence[int], layouts: Layouts = (), rewards: Rewards | None = None
 ) -> Missions:
     """Fly every mission to its end; arguments as in `rollout_steps`, results `[S]` or `[R, S]`."""
     steps = rollout_steps(scenario, act, seeds, layouts, rewards)

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uav_dc_ros import cli, files, scenarios
-from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.errors import FROM_TRAIN, TrainingError
 from uav_dc_ros.experiments.paper.setting import SCALES, PlannedRun
 from uav_dc_ros.experiments.paper.shards import Shard, result_file
 from uav_dc_ros.experiments.paper.workers import train_locally, train_on_ray
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 PROG = "python -m uav_dc_ros.paper"
 NETWORKS_FILE = "trajectories.safetensors"
 _PLAN_FILE = "plan.json"  # the options that the shards in a folder belong to
-_FROM_TRAIN = 'is not installed; expected it from: pip install "uav_dc_ros[train]"'
 _LINE_EVERY_S = 30.0  # between two lines of progress without a terminal
 
 
@@ -58,9 +57,9 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         from uav_dc_ros.experiments.paper import plan, report, sweep
         from uav_dc_ros.experiments.paper.results import RUNS_FILE, Results
     except ModuleNotFoundError as error:
-        raise TrainingError(f"{error.name} {_FROM_TRAIN}") from None
+        raise TrainingError(f"{error.name} {FROM_TRAIN}") from None
     if find_spec("torch") is None:  # the workers need it
-        raise TrainingError(f"torch {_FROM_TRAIN}")
+        raise TrainingError(f"torch {FROM_TRAIN}")
     scale, out = SCALES[options.scale], options.out
     planned = plan.runs(scale, options.only)
     if out.exists() and not options.resume:

@@ -1,6 +1,5 @@
 """Checkpoints: the state of a training as one file, which is complete or absent."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import safetensors.torch
 from safetensors import SafetensorError, safe_open
 
 from uav_dc_ros import files
+from uav_dc_ros.core.scenario import leaves
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train.population import Population
 from uav_dc_ros.experiments.train.training import Training
@@ -48,8 +48,8 @@ def restore(path: Path, training: Training) -> dict[str, Any]:
         if values["format"] != _FORMAT:
             raise TrainingError(f"{path}: format is {values['format']}; expected {_FORMAT}")
         # Converted, it has the defaults of keys that it was saved without.
-        saved = dict(_flat(msgspec.to_builtins(msgspec.convert(values["population"], Population))))
-        expected = dict(_flat(msgspec.to_builtins(training.population)))
+        saved = dict(leaves(msgspec.to_builtins(msgspec.convert(values["population"], Population))))
+        expected = dict(leaves(msgspec.to_builtins(training.population)))
         for key in expected | saved:
             refuse_other(path, key, saved.get(key, "absent"), expected.get(key, "absent"))
         training.restore(arrays, values)
@@ -67,16 +67,3 @@ def refuse_other(path: Path, key: str, saved: object, expected: object) -> None:
             f"{path} is the state of a training with {key} = {saved!r}; "
             f"expected {expected!r}, as in this command"
         )
-
-
-def _flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Key and value of every leaf of nested dicts and lists; a list yields its length first."""
-    if isinstance(value, dict):
-        for name, entry in value.items():
-            yield from _flat(entry, f"{key}.{name}" if key else name)
-    elif isinstance(value, list | tuple):
-        yield f"the number of {key}", len(value)
-        for i, entry in enumerate(value):
-            yield from _flat(entry, f"{key}[{i}]")
-    else:
-        yield key, value

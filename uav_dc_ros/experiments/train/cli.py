@@ -18,7 +18,7 @@ from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Algorithm, Hype
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
-from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.errors import FROM_TRAIN, TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act, save_mission_picture
 from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run
@@ -41,15 +41,8 @@ _LEARNING_OPTIONS = {
     "target_every": "iterations between two copies to the target network",
     "buffer_size": "transitions that the replay buffer holds",
 }
-# Options that replace a value of the scenario's reward, and its key.
-_REWARD_OPTIONS = {
-    "beta": "beta",
-    "zeta": "zeta",
-    "r_plus": "r_plus",
-    "reward_form": "form",
-    "reward_data": "data",
-    "data_scale_bits": "data_scale_bits",
-}
+# Options that replace a value of the scenario's reward; its key lacks the prefix `reward_`.
+_REWARD_OPTIONS = ("beta", "zeta", "r_plus", "reward_form", "reward_data", "data_scale_bits")
 
 
 class _Progress(msgspec.Struct):
@@ -172,17 +165,16 @@ def _train(options: argparse.Namespace, command: str) -> int:
         print(f"{PROG}: stopped; {kept}", file=sys.stderr)
         return cli.INTERRUPTED
     finally:
-        _discard_empty(folder)
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # an empty one, which the next command would refuse
     best = policy.load(folder / progress.best)
     assert progress.score is not None, "the last episode is validated"
     text = (shipped, command, options.runs, progress.seconds, progress.score, progress.prefilled)
-    policy.save(
-        options.out,
-        best.config,
-        best.parameters,
-        lambda loaded: card(loaded, *text),
-        lambda loaded, made: _draw(made, loaded, shipped, training),
-    )
+
+    def draw(made: policy.Policy, partial: Path) -> None:
+        _draw(partial, made, shipped, training)
+
+    policy.save(options.out, best.config, best.parameters, lambda made: card(made, *text), draw)
     shutil.rmtree(folder)
     print(f"{options.out}: {progress.score:.1f} of {shipped.n_users} users brought home in validation")
     return 0
@@ -191,16 +183,14 @@ def _train(options: argparse.Namespace, command: str) -> int:
 def _population(config: PolicyConfig, name: str, n_runs: int) -> Population:
     """Runs that differ in their seeds only: `config.seed`, `config.seed + 1`, ..."""
     scenario = from_values(config.scenario, name)
-    runs = tuple(
-        Run(
-            seed=config.seed + i,
-            algorithm=config.algorithm,
-            aggregation=config.aggregation,
-            reward=scenario.reward,
-            hyperparameters=config.hyperparameters,
-        )
-        for i in range(n_runs)
+    first = Run(
+        seed=config.seed,
+        algorithm=config.algorithm,
+        aggregation=config.aggregation,
+        reward=scenario.reward,
+        hyperparameters=config.hyperparameters,
     )
+    runs = tuple(msgspec.structs.replace(first, seed=config.seed + i) for i in range(n_runs))
     return Population(scenario=scenario, observation=config.observation, hidden=config.hidden, runs=runs)
 
 
@@ -218,12 +208,6 @@ def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
     for best in folder.glob("episode_" + 6 * "[0-9]"):
         if int(best.name.removeprefix("episode_")) > n_flown:
             shutil.rmtree(best)
-
-
-def _discard_empty(folder: Path) -> None:
-    """Removes an empty folder, which the next command would refuse."""
-    with contextlib.suppress(OSError):
-        folder.rmdir()
 
 
 def _save_best(
@@ -255,9 +239,9 @@ def _draw(folder: Path, made: policy.Policy, scenario: Scenario, training: "Trai
 def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
     """The policy's config before training, from the options."""
     values: dict[str, Any] = msgspec.to_builtins(shipped)
-    for option, key in _REWARD_OPTIONS.items():
+    for option in _REWARD_OPTIONS:
         if option in options:
-            values["reward"][key] = getattr(options, option)
+            values["reward"][option.removeprefix("reward_")] = getattr(options, option)
     from_values(values, shipped.name)  # rejects an invalid value of an option
     try:
         return msgspec.convert(
@@ -296,9 +280,7 @@ def _device(name: str, n_threads: int) -> "torch.device":
     try:
         import torch
     except ModuleNotFoundError:
-        raise TrainingError(
-            'torch is not installed; expected it from: pip install "uav_dc_ros[train]"'
-        ) from None
+        raise TrainingError(f"torch {FROM_TRAIN}") from None
     from uav_dc_ros.experiments.train.training import prepare_torch
 
     prepare_torch(n_threads)

@@ -24,7 +24,7 @@ def card(
     n_runs: int,
     seconds: float,
     score: float,
-    prefilled: PrefilledReplay | None = None,
+    prefilled: PrefilledReplay | None,
 ) -> str:
     """Text of a policy's README.md.
 

@@ -4,15 +4,8 @@ import time
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+from rich import progress as bars
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.train.training import Training
@@ -23,9 +16,9 @@ _LATEST = 20  # episodes of each run
 class ProgressBar:
     """A bar with a text on a terminal, lines elsewhere; a context manager."""
 
-    def __init__(self, *columns: ProgressColumn, total: int, completed: int = 0) -> None:
+    def __init__(self, *columns: bars.ProgressColumn, total: int, completed: int = 0) -> None:
         self._console = Console(stderr=True)
-        self._bar = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
+        self._bar = bars.Progress(*columns, console=self._console, disable=not self._console.is_terminal)
         self._task = self._bar.add_task("", total=total, completed=completed, text="")
 
     def __enter__(self) -> Self:
@@ -50,10 +43,10 @@ class TrainingProgress(ProgressBar):
         self._started, self._first = time.monotonic(), training.n_flown
         super().__init__(
             # Together they fit into 80 columns.
-            MofNCompleteColumn(),
-            BarColumn(bar_width=8),
-            TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[text]}"),
+            bars.MofNCompleteColumn(),
+            bars.BarColumn(bar_width=8),
+            bars.TimeRemainingColumn(compact=True),
+            bars.TextColumn("{task.fields[text]}"),
             total=training.population.n_episodes,
             completed=self._first,
         )

@@ -33,11 +33,8 @@ def prefill_replay(training: "Training", bags: Sequence[Path]) -> PrefilledRepla
     """Puts every recorded transition into the replay buffer of every run, before the first episode.
 
     Observations and rewards are those of this training; bags hold neither. The bags are read in the order
-    given, and the namespaces of each in the order of their names.
-
-    Raises:
-        TrainingError: a bag holds no transition, or missions in another world; rewards of the runs differ.
-        BagError: a bag cannot be read.
+    given, and the namespaces of each in the order of their names. Raises TrainingError if a bag holds no
+    transition or missions in another world, or if rewards of the runs differ; BagError if one cannot be read.
     """
     from uav_dc_ros.bags.read import BagReader
     from uav_dc_ros.recordings import step_reader

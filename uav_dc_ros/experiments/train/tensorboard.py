@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.errors import FROM_TRAIN, TrainingError
 from uav_dc_ros.experiments.train.training import Training
 
 
@@ -20,10 +20,7 @@ class TensorBoardLog:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ModuleNotFoundError:
-            raise TrainingError(
-                "--tensorboard: tensorboard is not installed; expected it from: "
-                'pip install "uav_dc_ros[train]"'
-            ) from None
+            raise TrainingError(f"--tensorboard: tensorboard {FROM_TRAIN}") from None
         try:
             self._writers = [
                 # The purge removes scalars written after the checkpoint that the training resumes from.

@@ -36,23 +36,13 @@ def prepare_torch(n_threads: int) -> None:
 
 
 class Training:
-    """A population between two episodes.
-
-    Attributes:
-        population: the runs.
-        device: of the learner.
-        learner: the networks.
-        n_flown: episodes flown by each run.
-    """
+    """A population between two episodes."""
 
     def __init__(
-        self,
-        population: Population,
-        device: torch.device,
-        worlds_in: Literal["numpy", "torch"] | None = None,
+        self, population: Population, device: torch.device, worlds_in: Literal["numpy", "torch"] | None = None
     ) -> None:
         """Runs before their first episode; the worlds are in numpy on the CPU, else in torch, by default."""
-        self.population, self.device = population, device
+        self.population, self.device = population, device  # the runs, and where their learner computes
         self._on_host = (worlds_in or ("numpy" if device.type == "cpu" else "torch")) == "numpy"
         self._rngs = [
             np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(_TRAINING_STREAM,)))
@@ -69,7 +59,7 @@ class Training:
         self._curves = np.full(
             (population.n_episodes, len(CURVES), len(population.runs)), np.nan, dtype=np.float32
         )
-        self.n_flown = 0
+        self.n_flown = 0  # episodes, by each run
 
     @property
     def curves(self) -> dict[str, Array]:

@@ -29,13 +29,8 @@ def roll_out_greedily(training: Training, seeds: range) -> Missions:
         observation = torch.from_numpy(observe(population.observation, population.scenario, state))
         return learner.greedy(observation.to(training.device)).cpu().numpy()
 
-    return roll_out(
-        population.scenario,
-        act,
-        seeds,
-        layouts=fixed,
-        rewards=rewards(population.runs, lambda values: values[:, None]),
-    )
+    own = rewards(population.runs, lambda values: values[:, None])
+    return roll_out(population.scenario, act, seeds, layouts=fixed, rewards=own)
 
 
 class Validation(NamedTuple):
