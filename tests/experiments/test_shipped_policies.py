@@ -9,7 +9,7 @@ from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.experiments.evaluate.evaluation import COLUMNS, evaluate, rows
 from uav_dc_ros.experiments.train.cli import PROG, options_parser
-from uav_dc_ros.experiments.train.validation import VALIDATION_SEEDS
+from uav_dc_ros.experiments.train.training import VALIDATION_SEEDS
 
 NAMES = policy.names()
 

@@ -17,12 +17,11 @@ from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
-from uav_dc_ros.experiments.train import validation
+from uav_dc_ros.experiments.train import training as training_module
 from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
 from uav_dc_ros.experiments.train.population import architecture
 from uav_dc_ros.experiments.train.progress import latest_means
-from uav_dc_ros.experiments.train.training import Training
-from uav_dc_ros.experiments.train.validation import VALIDATION_SEEDS, roll_out_greedily, validate
+from uav_dc_ros.experiments.train.training import VALIDATION_SEEDS, Training, roll_out_greedily, validate
 
 CPU = torch.device("cpu")
 ENDS = ["at_time_limit", "on_arrival"]
@@ -430,7 +429,7 @@ def test_policies_are_chosen_for_users_and_for_battery(monkeypatch):
         reward=nothing,
         episode_return=nothing,
     )
-    monkeypatch.setattr(validation, "roll_out_greedily", lambda training, seeds: missions)
+    monkeypatch.setattr(training_module, "roll_out_greedily", lambda training, seeds: missions)
     found = validate(Training(population(scenario, *[run(scenario, i) for i in range(4)]), CPU))
     np.testing.assert_allclose(found.brought_home, [3.0, 3.01, 3.1, 0.0])
     assert np.argsort(-found.selection_score).tolist() == [2, 0, 1, 3]

@@ -94,8 +94,7 @@ def train_shard(
     import torch  # a process that only plans and collects does not need it
 
     from uav_dc_ros.experiments.train import checkpoint as checkpoints
-    from uav_dc_ros.experiments.train.training import Training, prepare_torch
-    from uav_dc_ros.experiments.train.validation import roll_out_greedily
+    from uav_dc_ros.experiments.train.training import Training, prepare_torch, roll_out_greedily
 
     prepare_torch(n_threads=1)
     training = Training(shard.population, torch.device("cpu"))

@@ -91,16 +91,14 @@ def options_parser() -> cli.Parser:
     for name, text in _LEARNING_OPTIONS.items():
         default = getattr(Hyperparameters(), name)
         learning.add_argument(_option(name), metavar="X", default=default, type=type(default), help=text)
-    reward = parser.add_argument_group("reward, instead of the scenario's own; kept in the policy's config")
-    instead: dict[str, Any] = {"default": argparse.SUPPRESS}
-    reward.add_argument("--beta", metavar="X", type=float, help="weight of the data", **instead)
-    reward.add_argument("--zeta", metavar="X", type=float, help="weight of R_plus", **instead)
-    reward.add_argument("--r-plus", choices=get_args(RPlus), help="shape of R_plus", **instead)
-    reward.add_argument("--reward-form", choices=get_args(RewardForm), help="reward of a step", **instead)
-    data = "data in r^t (eq. 7): of the step, or so far"
-    reward.add_argument("--reward-data", choices=get_args(RewardData), help=data, **instead)
-    scale = "data of a user that counts as 1 in r^t, bit"
-    reward.add_argument("--data-scale-bits", metavar="X", type=float, help=scale, **instead)
+    title = "reward, instead of the scenario's own; kept in the policy's config"
+    add = parser.add_argument_group(title, argument_default=argparse.SUPPRESS).add_argument
+    add("--beta", metavar="X", type=float, help="weight of the data")
+    add("--zeta", metavar="X", type=float, help="weight of R_plus")
+    add("--r-plus", choices=get_args(RPlus), help="shape of R_plus")
+    add("--reward-form", choices=get_args(RewardForm), help="reward of a step")
+    add("--reward-data", choices=get_args(RewardData), help="data in r^t (eq. 7): of the step, or so far")
+    add("--data-scale-bits", metavar="X", type=float, help="data of a user that counts as 1 in r^t, bit")
     return parser
 
 
@@ -112,8 +110,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     # These need torch, which _device() has found.
     from uav_dc_ros.experiments.train import checkpoint
     from uav_dc_ros.experiments.train.tensorboard import TensorBoardLog
-    from uav_dc_ros.experiments.train.training import Training
-    from uav_dc_ros.experiments.train.validation import validate
+    from uav_dc_ros.experiments.train.training import Training, validate
 
     folder = options.out.with_name(f"{options.out.name}.checkpoints")
     saved = folder / "training.safetensors"

@@ -1,4 +1,4 @@
-"""The training loop: N runs side by side, one episode at a time. Needs torch.
+"""The training loop: N runs side by side, one episode at a time; and their validation. Needs torch.
 
 Every random number of a run comes from the run's own numpy generator and is drawn for a whole episode at
 once. So a run learns the same alone and among others, it starts the same on every device, and a GPU does not
@@ -8,7 +8,7 @@ other device; they are the same functions.
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -16,16 +16,19 @@ from torch import Tensor
 
 from uav_dc_ros.agents.dqn import Learner, Member
 from uav_dc_ros.agents.replay import ReplayBuffer, TransitionBatch
-from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import Rewards
-from uav_dc_ros.core.world import BatchWorld
+from uav_dc_ros.core.world import BatchWorld, State, observe
+from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
 from uav_dc_ros.experiments.train.population import Population, Run, architecture, layout
 from uav_dc_ros.recordings.transitions import Transition
 
 # Separates a run's stream from that of the mission with the same seed.
 _TRAINING_STREAM = 1
+# Missions that select among runs and checkpoints; seeds 0 to 99 evaluate the selected one.
+VALIDATION_SEEDS = range(1_000_000, 1_000_100)
+_BATTERY_WEIGHT = 0.1  # of the whole battery, relative to all users
 
 
 def prepare_torch(n_threads: int) -> None:
@@ -168,7 +171,7 @@ class Training:
         state = in_worlds("world")
         # Checkpoints of version 0.1.0 lack it. Their data is that so far.
         state.setdefault("mission_reward", state["total_reward"])
-        self._worlds.state = world.State(**state)
+        self._worlds.state = State(**state)
         self._stats.restore(in_worlds("books"))
         self.n_flown = values["n_flown"]
         self._curves[: self.n_flown] = arrays["curves"].numpy()
@@ -189,3 +192,38 @@ def rewards(runs: Sequence[Run], array: Callable[[np.ndarray], Array]) -> Reward
         form=array(np.array([term.form == "episode" for term in terms])),
         data=array(np.array([term.data == "step" for term in terms])),
     )
+
+
+def roll_out_greedily(training: Training, seeds: range) -> Missions:
+    """Every run's greedy policy on the missions with these seeds, with the run's own reward, each `[N, S]`.
+
+    A run with an environment starts from its layout; the seed decides how the users walk.
+    """
+    population, learner = training.population, training.learner
+    shape = (population.scenario.n_users, 2)
+    fixed = [None if run.environment is None else layout(run.environment, shape) for run in population.runs]
+
+    def act(state: State) -> Array:
+        observation = torch.from_numpy(observe(population.observation, population.scenario, state))
+        return learner.greedy(observation.to(training.device)).cpu().numpy()
+
+    own = rewards(population.runs, lambda values: values[:, None])
+    return roll_out(population.scenario, act, seeds, layouts=fixed, rewards=own)
+
+
+class Validation(NamedTuple):
+    """Scores of each run's policy, `[N]` each."""
+
+    brought_home: np.ndarray  # mean number of users collected; 0 for a mission that does not land
+    # Selects the policy: the share of users brought home, less a tenth of the share of the battery spent on
+    # arrival. A hundredth of the users weighs as much as a tenth of the battery.
+    selection_score: np.ndarray
+
+
+def validate(training: Training) -> Validation:
+    """Flies the validation missions with every run's greedy policy."""
+    scenario, missions = training.population.scenario, roll_out_greedily(training, VALIDATION_SEEDS)
+    brought_home = np.where(missions.landed, missions.users_collected, 0).mean(axis=-1)
+    max_steps = scenario.mission.max_steps
+    spent = np.where(missions.landed, missions.arrival_step, max_steps).mean(axis=-1) / max_steps
+    return Validation(brought_home, brought_home / scenario.n_users - _BATTERY_WEIGHT * spent)
