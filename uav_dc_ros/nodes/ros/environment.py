@@ -21,18 +21,24 @@ RANGES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
 LOG_FOLDERS = (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"))  # rcl uses the first one that is set
 
 
-def prepare(*, local_only: bool) -> None:
+def prepare(*, local_only: bool, shared_memory: bool = False) -> None:
     """`check` the environment and set what it leaves open; to be called before ROS is imported.
 
     `local_only`: all participants run on this host, so discovery is limited to it.
     """
-    check()
+    check(shared_memory=shared_memory)
     os.environ.setdefault(RANGE, "LOCALHOST" if local_only else "SUBNET")
     os.environ.setdefault(LINES, LINE_OF_NODE)
 
 
-def check() -> None:
-    """Raise ParameterError if ROS cannot start in this environment, or nodes cannot find each other."""
+def check(*, shared_memory: bool = False) -> None:
+    """Raise ParameterError if ROS cannot start in this environment, or nodes cannot find each other.
+
+    The small messages of a mission travel over UDP: participants that start together on a busy machine were
+    seen to take each other's ports in shared memory for leftovers, and then to wait for each other forever.
+    `shared_memory`: for messages of any size, as the verbs of `bag` read and publish.
+    """
+    is_set = any(name in os.environ for name in (fastdds.TRANSPORTS, *fastdds.NAMES))
     check_import()
     _check_domain()
     _check_range()
@@ -40,8 +46,10 @@ def check() -> None:
     fastdds.use_profiles()
     fastdds.remove_leftovers()
     free_mb = fastdds.free_mb()
-    if free_mb < fastdds.RECOMMENDED_MB and fastdds.TRANSPORTS not in os.environ:
-        os.environ[fastdds.TRANSPORTS] = "UDPv4"
+    if is_set or (shared_memory and free_mb >= fastdds.RECOMMENDED_MB):
+        return
+    os.environ[fastdds.TRANSPORTS] = "UDPv4"
+    if shared_memory:
         _note(
             f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "
             "travel over UDP alone"
