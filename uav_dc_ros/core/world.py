@@ -152,8 +152,10 @@ def step(
         total_reward=total,
         mission_reward=reward.mission_reward(state.mission_reward, total, n_rewards, values.data),
     )
-    agents = reward.step_reward(total, state.total_reward, values.form)
-    return after, Outcome(reward=agents, terminated=terminated, truncated=truncated, landed=landed, link=link)
+    agent_reward = reward.step_reward(total, state.total_reward, values.form)
+    return after, Outcome(
+        reward=agent_reward, terminated=terminated, truncated=truncated, landed=landed, link=link
+    )
 
 
 def observe(kind: Observation, scenario: Scenario, state: State) -> Array:

@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -167,10 +168,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     best = policy.load(folder / progress.best)
     assert progress.score is not None, "the last episode is validated"
     text = (shipped, command, options.runs, progress.seconds, progress.score, progress.prefilled)
-
-    def draw(made: policy.Policy, partial: Path) -> None:
-        _draw(partial, made, shipped, training)
-
+    draw = partial(_draw, shipped, training)
     policy.save(options.out, best.config, best.parameters, lambda made: card(made, *text), draw)
     shutil.rmtree(folder)
     print(f"{options.out}: {progress.score:.1f} of {shipped.n_users} users brought home in validation")
@@ -219,7 +217,7 @@ def _save_best(
     return name
 
 
-def _draw(folder: Path, made: policy.Policy, scenario: Scenario, training: "Training") -> None:
+def _draw(scenario: Scenario, training: "Training", made: policy.Policy, folder: Path) -> None:
     """Draws the plots in a policy's folder: its learning curve, and a mission."""
     try:
         from uav_dc_ros.experiments.train.learning_curve import save_learning_curve  # needs matplotlib
