@@ -194,9 +194,8 @@ def _setting(text: str) -> tuple[str, str, str]:
     key, equals, value = text.partition("=")
     node, dot, name = key.partition(".")
     if not (equals and dot and node and name):
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; expected NODE.PARAMETER=VALUE, such as bridge.failsafe_action=land"
-        )
+        expected = "NODE.PARAMETER=VALUE, such as bridge.failsafe_action=land"
+        raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}")
     return node, name, value
 
 

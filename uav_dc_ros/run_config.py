@@ -67,16 +67,14 @@ class RunConfig:
                 raise ParameterError(f"pace: {self.pace!r}; expected {paces.LOCKSTEP!r} or a number above 0")
             paces.parse(repr(self.pace))
         if self.vehicle not in (SIMULATED, *VEHICLES):
-            raise ParameterError(
-                f"vehicle: {self.vehicle!r}; expected one of {', '.join((SIMULATED, *VEHICLES))}"
-            )
+            expected = ", ".join((SIMULATED, *VEHICLES))
+            raise ParameterError(f"vehicle: {self.vehicle!r}; expected one of {expected}")
         if not self.record and self.bag is not None:
             raise ParameterError(f"bag: {str(self.bag)!r}, with record = False; expected one or the other")
         for key in self.settings:
             if not all(str(key).partition(".")):
-                raise ParameterError(
-                    f"settings: {key!r}; expected NODE.PARAMETER, such as bridge.failsafe_action"
-                )
+                expected = "NODE.PARAMETER, such as bridge.failsafe_action"
+                raise ParameterError(f"settings: {key!r}; expected {expected}")
         try:
             object.__setattr__(self, "namespace", cli.namespace(self.namespace))
         except argparse.ArgumentTypeError as error:

@@ -45,8 +45,7 @@ def run(options: argparse.Namespace) -> int:
     if options.compare is None:
         page, summary = _report(options)
     else:
-        bags = [options.bag, *options.compare]
-        page, summary = compare.page(bags, options.mission, options.scenario, options.namespace)
+        page, summary = compare.page(options)
     content = page.content()
     files.write(out, content)
     # To standard error if the page goes to standard output.
@@ -84,8 +83,7 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
                 shown.append(total - 1)
         if not total:
             raise BagError(compare.no_step(options.bag, options.mission, recorded))
-        health.add_losses(recorded)
-        health.read()
+        health.read(recorded)
         start = datetime.fromtimestamp(reader.first_ns * 1e-9, UTC)
         overview = {
             "title": title,

@@ -55,9 +55,8 @@ def namespace(reader: BagReader, wanted: str | None = None) -> str:
     if wanted is not None:
         name = "/" + wanted.strip("/") if wanted.strip("/") else ""
         if name not in found:
-            raise BagError(
-                f"bag {reader.path}: no mission in namespace {wanted!r}; expected {listed or 'one'}"
-            )
+            expected = listed or "one"
+            raise BagError(f"bag {reader.path}: no mission in namespace {wanted!r}; expected {expected}")
         return name
     if not found:
         raise BagError(
@@ -127,9 +126,8 @@ class Steps:
         self.repeated: Counter[str] = Counter()  # repeated messages, by topic; poses are not counted
         self._reader = reader
         self._step_ns = step_ns
-        self._topics = {
-            f"{namespace}/{name}": name for name in STEP_TOPICS if f"{namespace}/{name}" in reader.topics
-        }
+        names = {f"{namespace}/{name}": name for name in STEP_TOPICS}
+        self._topics = {full: name for full, name in names.items() if full in reader.topics}
         for full, name in self._topics.items():
             _check_type(reader, reader.topics[full], topics.TOPICS[name].type)
         self._expected = [name for full, name in self._topics.items() if reader.topics[full].count]

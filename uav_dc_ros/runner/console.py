@@ -68,13 +68,9 @@ class MissionConsole(LiveDisplay):
         self._bar.update(self._task, description=status.phase.value)
         self.console.print(f"{status.state}: {status.reason}", markup=False)
 
-    def node_line(self, node: str, line: str) -> None:
-        """Print a node's line of output."""
-        self.console.print(f"{node}: {line}", markup=False)
-
-    def note(self, text: str) -> None:
-        """Print a note."""
-        self.console.print(f"note: {text}", markup=False)
+    def line(self, source: str, text: str) -> None:
+        """Print a node's line of output, or a `note`."""
+        self.console.print(f"{source}: {text}", markup=False)
 
     def error(self, text: str) -> None:
         """Print an error to standard error."""

@@ -115,7 +115,7 @@ class MissionRunner:
             namespace, parameters = network.node.get_namespace(), self._parameters(folder)
             network.node.trigger_configure()
             network.node.trigger_activate()  # discovery runs while the nodes start
-            on_line: Callable[[str, str], None] = lambda node, line: self.console.node_line(node, line)  # noqa: E731
+            on_line: Callable[[str, str], None] = lambda node, line: self.console.line(node, line)  # noqa: E731
             supervisor = Supervisor(namespace, parameters, self.composed, folder, on_line, self._note)
             stack.enter_context(supervisor)
             stack.enter_context(self.console)
@@ -134,8 +134,7 @@ class MissionRunner:
             exits = supervisor.stop(network.leave if is_complete else lambda: None)
             status = max(status, self._check_exits(exits))
             if not is_complete:
-                self._receive_last_messages(network.executor)
-                self._complete_summaries(network.node)
+                self._complete_summaries(network.node, network.executor)
         status = max(status, self._repair_bag(), int(self._aborted))
         self._write_summary()
         return cli.INTERRUPTED if self.interrupted else status
@@ -150,11 +149,9 @@ class MissionRunner:
     def _locks(self, node: MissionMonitor) -> AbstractContextManager[None]:
         """Locks of the nodes that publish exclusive topics."""
         exclusive = {topic.name for topic in TOPICS.values() if topic.exclusive}
-        publish = [name for name in self.nodes if exclusive & set(self.rows[name].publishes)]
         namespace = node.get_namespace().rstrip("/")
-        return node_locks.held(
-            node.context.get_domain_id(), [f"{namespace}/{name}" for name in publish], self.run_id
-        )
+        names = [f"{namespace}/{name}" for name in self.nodes if exclusive & set(self.rows[name].publishes)]
+        return node_locks.held(node.context.get_domain_id(), names, self.run_id)
 
     def _note_other_world(self) -> None:
         trained, flown = self.policy.scenario, self.scenario
@@ -205,16 +202,13 @@ class MissionRunner:
             self._error(f"node {name} ended with {code} when it was stopped")
         return int("recorder" in failed)
 
-    def _receive_last_messages(self, executor: DirectExecutor) -> None:
-        """Handle messages that the nodes published while they were stopped, such as the end of a mission."""
+    def _complete_summaries(self, node: MissionMonitor, executor: DirectExecutor) -> None:
+        """Report the end of the current mission; without one it was aborted."""
         deadline_s = time.monotonic() + FINAL_S
-        try:
+        try:  # the nodes may have published it while they were stopped
             executor.spin(lambda: time.monotonic() > deadline_s, FINAL_QUIET_S)
         except NodeError as error:
             self._error(str(error))
-
-    def _complete_summaries(self, node: MissionMonitor) -> None:
-        """Report the end of the current mission; without one it was aborted."""
         node.report_ends()
         index = len(self.summaries)
         if index >= self.config.missions:
@@ -295,7 +289,7 @@ class MissionRunner:
         self.interrupted = True
 
     def _note(self, text: str) -> None:
-        self.console.note(text)
+        self.console.line("note", text)
 
     def _error(self, text: str) -> None:
         self.errors.append(text)

@@ -149,11 +149,9 @@ class MissionMonitor(MissionNode):
     def on_mission(self, payload: messages.Mission) -> None:
         """Follow the vehicle."""
         payloads.check(payload, self.scenario)
-        if self.seed is not None and payload.seed != self.seed + payload.mission:
-            raise MessageError(
-                "seed",
-                f"mission {payload.mission} has seed {payload.seed}; expected {self.seed + payload.mission}",
-            )
+        seed = payload.seed if self.seed is None else self.seed + payload.mission
+        if payload.seed != seed:
+            raise MessageError("seed", f"mission {payload.mission} has seed {payload.seed}; expected {seed}")
         self._has_begun = True
         self._on_status(payload)
         is_reported = payload.mission <= self._last_reported or payload.mission in self._unreported

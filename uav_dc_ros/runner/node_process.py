@@ -128,8 +128,7 @@ class NodeProcess:
 
     def terminate(self) -> None:
         """Send SIGTERM: unlike SIGINT it ends a starting Python without a traceback."""
-        if not self.has_ended:
-            self.process.terminate()
+        self.process.terminate()
 
     def wait(self, deadline_s: float) -> int:
         """Wait for the end until a deadline of the monotonic clock, then kill; returns the exit status."""

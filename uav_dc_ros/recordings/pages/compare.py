@@ -5,6 +5,7 @@ a group. Groups with the same seeds are also compared seed by seed: their users 
 which leaves less chance in the difference.
 """
 
+import argparse
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -111,13 +112,9 @@ class Group:
         return {key: significant(values) for key, values in zip(("mean", "low", "high"), band, strict=True)}
 
 
-def page(
-    bags: list[Path], missions: list[int] | None, scenario: str | None, namespace: str | None
-) -> tuple[Page, str]:
-    """The page, and its content in a few words; of all missions, or of those with these indices.
-
-    Raises ParameterError for more than `GROUPS_MAX` groups.
-    """
+def page(options: argparse.Namespace) -> tuple[Page, str]:
+    """The page, and its content in a few words; raises ParameterError for more than `GROUPS_MAX` groups."""
+    bags: list[Path] = [options.bag, *options.compare]
     if len(bags) > GROUPS_MAX:
         raise ParameterError(f"--compare: {len(bags)} bags; expected at most {GROUPS_MAX}")
     labels = [printable(bag.absolute().name) for bag in bags]
@@ -125,7 +122,7 @@ def page(
         labels = [printable(str(bag)) for bag in bags]
     groups: list[Group] = []
     for bag, label in zip(bags, labels, strict=True):
-        groups += _groups(bag, label, missions, scenario, namespace, split=len(bags) == 1)
+        groups += _groups(bag, label, options, split=len(bags) == 1)
     first = groups[0]
     title = f"{first.scenario.name}: {len(groups)} {'bags' if len(bags) > 1 else 'missions'} side by side"
     axis = spread(max(int(curve["step"][-1]) for group in groups for curve in group.curves) + 1, POINTS_MAX)
@@ -146,14 +143,13 @@ def page(
     return made, f"{sum(len(group.summaries) for group in groups)} missions in {len(groups)} groups"
 
 
-def _groups(
-    bag: Path, label: str, missions: list[int] | None, wanted: str | None, namespace: str | None, split: bool
-) -> list[Group]:
+def _groups(bag: Path, label: str, options: argparse.Namespace, split: bool) -> list[Group]:
     """The group of a bag; or, with `split`, a group for each of its missions."""
     groups: list[Group] = []
+    missions: list[int] | None = options.mission
     with BagReader(bag) as reader:
-        name = step_reader.namespace(reader, namespace)
-        scenario = step_reader.scenario(reader, name, wanted)
+        name = step_reader.namespace(reader, options.namespace)
+        scenario = step_reader.scenario(reader, name, options.scenario)
         policy = reader.about.get("policy", "unknown policy")
         recorded = step_reader.Steps(reader, name, scenario.step_ns)
         for mission in read_missions(recorded, scenario, False):

@@ -207,16 +207,13 @@ class Health:
             if report.held:
                 self._fault(report.log_ns, name, f"step {step}: {report.reason}")
 
-    def add_losses(self, steps: Steps) -> None:
-        """Add messages that cannot be read, or came too late for their step."""
+    def read(self, steps: Steps) -> None:
+        """Read the bag once more, for message times and diagnostics; add messages that `steps` left out."""
         for (topic, reason), count in steps.rejected.items():
             why = steps.rejected.first_error(topic, reason)
             self._fault(self._reader.first_ns, topic, f"unreadable messages ({reason}): {count}: {why}")
         for topic, count in steps.orphans.items():
             self._fault(self._reader.first_ns, topic, f"messages too late for their step: {count}")
-
-    def read(self) -> None:
-        """Read the bag once more, for message times and diagnostics."""
         ours = {f"{self._namespace}/{name}" for name in topics.TOPICS}
         diagnostics = f"{self._namespace}/diagnostics"
         if diagnostics not in self._reader.topics:

@@ -286,18 +286,15 @@ class WorldCheck(Check):
                 for i, axis in enumerate(("x_m", "y_m", "z_m")):
                     found += self.compare(step, "pose", axis, float(pose.position_m[i]), float(centre_m[i]))
         if step.users is not None:
-            users_m = self._users_m(max(first, 0) + step.mission, step.step)
+            seed = max(first, 0) + step.mission
+            if self._users is None or self._users_seed != seed or self._users.step > step.step:
+                self._users, self._users_seed = WalkingUsers(scenario, seed), seed
+            self._users.walk(step.step - self._users.step)
+            users_m = self._users.positions_m
             users = payloads.users(scenario, users_m, mission=step.mission, step=step.step, time_ns=time_ns)
             for name in (*(() if self._real else ("stamp_ns",)), "cluster", "x_m", "y_m"):
                 found += self.compare(step, "users", name, getattr(step.users, name), getattr(users, name))
         return found
-
-    def _users_m(self, seed: int, step: int) -> Array:
-        """Users of the mission with a seed at a step, metres, `[U, 2]`."""
-        if self._users is None or self._users_seed != seed or self._users.step > step:
-            self._users, self._users_seed = WalkingUsers(self._scenario, seed), seed
-        self._users.walk(step - self._users.step)
-        return self._users.positions_m
 
     def lines(self) -> list[str]:
         """The result as text."""
