@@ -119,9 +119,8 @@ class Pose:
             data = _reencoded(data)
         self.body = data[HEADER_BYTES : HEADER_BYTES + _POSE.size]  # little endian, without encapsulation
         if len(self.body) < _POSE.size:
-            raise MessageError(
-                "malformed", f"{len(data)} bytes; expected a pose of {HEADER_BYTES + _POSE.size}"
-            )
+            expected = HEADER_BYTES + _POSE.size
+            raise MessageError("malformed", f"{len(data)} bytes; expected a pose of {expected}")
         sec, nanosec, _, x_m, y_m, z_m, *_ = _POSE.unpack(self.body)
         self.stamp_ns: int = sec * 10**9 + nanosec
         self.position_m: tuple[float, float, float] = (x_m, y_m, z_m)  # x, y, altitude

@@ -68,15 +68,9 @@ def parser(prog: str = PROG) -> cli.Parser:
         "the last flight, or coordinates; required with --arm (default: here)"
     )
     real("--datum", metavar="here|last|LAT,LON,ALT", help=datum)
-    real(
-        "--set",
-        dest="settings",
-        type=_setting,
-        action="append",
-        default=[],
-        metavar="NODE.PARAMETER=VALUE",
-        help="any parameter of a node, such as bridge.failsafe_action=land; repeatable",
-    )
+    setting = "any parameter of a node, such as bridge.failsafe_action=land; repeatable"
+    form = "NODE.PARAMETER=VALUE"
+    real("--set", dest="settings", type=_setting, action="append", default=[], metavar=form, help=setting)
     recording = options.add_mutually_exclusive_group().add_argument
     recording("--bag", type=Path, metavar="DIR", help="folder of the new bag (default: a dated one in bags/)")
     recording("--no-record", action="store_true", help="fly without a bag")

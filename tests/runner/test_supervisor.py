@@ -32,7 +32,7 @@ def process() -> Process:
 def turn(process: Process) -> Callable[..., str | None]:
     """A turn of run_all, after the node has reported this."""
     node = SupervisedNode("policy", {})
-    node.attach(process)  # type: ignore[arg-type]
+    node.process = process  # type: ignore[assignment]
 
     def turn(*report: str, may_activate: bool = True) -> str | None:
         if report:
@@ -112,7 +112,7 @@ def test_a_rank_is_terminated_when_the_one_above_is_finalized(tmp_path: Path) ->
     container = Stopping("container", 3, log)
     processes = {"visualizer": Stopping("visualizer", 2, log), "recorder": Stopping("recorder", 1, log)}
     for node in supervisor.nodes:
-        node.attach(processes.get(node.row.name, container))  # type: ignore[arg-type]
+        node.process = processes.get(node.row.name, container)  # type: ignore[assignment]
     assert supervisor.stop(lambda: log.append("meanwhile")) == dict.fromkeys((*processes, "container"), 0)
     assert log[:6] == [
         *("container terminated", "container finalized", "visualizer terminated", "visualizer finalized"),

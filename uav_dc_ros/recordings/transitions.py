@@ -91,12 +91,6 @@ class RecordedTransitions:
     def _transition(self, before: _State, after: _State, action: Action) -> Transition:
         step, form = np.asarray(after.source[2]), self._scenario.reward.form
         terminated, truncated, _ = world.end_of_mission(self._scenario, step, after.cell)
-        return Transition(
-            *before.source,
-            observation=before.observation,
-            action=int(action),
-            reward=float(core_reward.step_reward(after.total_reward, before.total_reward, form)),
-            next_observation=after.observation,
-            terminated=bool(terminated),
-            truncated=bool(truncated),
-        )
+        reward = float(core_reward.step_reward(after.total_reward, before.total_reward, form))
+        end = bool(terminated), bool(truncated)
+        return Transition(*before.source, before.observation, int(action), reward, after.observation, *end)
