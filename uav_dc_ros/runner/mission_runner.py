@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 STEP_TIMEOUT_S = 30.0  # for the discovery of the nodes, and for a due step
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be restarting
 FINAL_S, FINAL_QUIET_S = 2.0, 0.2  # longest wait for the nodes' last messages, and for the next one
+RESEND_S = 1.0  # for lost messages from other hosts, which are sent again ten times a second
 TICK_S = 0.02  # period of checks of the nodes
 BRING_UP_TICK_S = 0.004  # until all are active: each transition takes a check
 SHUTDOWN_S = 3.0  # for the middleware
@@ -131,6 +132,8 @@ class MissionRunner:
                     self.summaries.clear()
                     network.node.mission = self._status = None
             is_complete = len(self.summaries) >= self.config.missions
+            if is_complete and self._elsewhere():
+                time.sleep(RESEND_S)  # what the monitor has received, the recorder may not yet have
             exits = supervisor.stop(network.leave if is_complete else lambda: None)
             status = max(status, self._check_exits(exits))
             if not is_complete:
@@ -189,7 +192,7 @@ class MissionRunner:
             return
         if node.mission is not None:
             raise NodeError(f"no step came within {timeout_s:.0f} s")
-        elsewhere = [name for name in self._peers() if name not in (*self.nodes, "mission_monitor")]
+        elsewhere = self._elsewhere()
         if not elsewhere:
             raise NodeError(f"the nodes did not find each other within {timeout_s:.0f} s")
         self._note(f"still waiting for {', '.join(elsewhere)} of another run of run_all")
@@ -236,6 +239,10 @@ class MissionRunner:
             return 1
         self._note(f"the recorder did not close its bag: {repaired}")
         return 0
+
+    def _elsewhere(self) -> list[str]:
+        """Peers that are started elsewhere."""
+        return [name for name in self._peers() if name not in (*self.nodes, "mission_monitor")]
 
     def _peers(self) -> list[str]:
         """Nodes that a mission requires, on any host."""
