@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from uav_dc_ros.nodes.ros import convert, qos
+from uav_dc_ros.nodes.ros import convert, fastdds, qos
 from uav_dc_ros.topics import TOPICS
 
 SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of it
@@ -26,7 +26,8 @@ SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of 
 def main() -> None:
     rclpy.init()
     named = [argument.removeprefix("name=") for argument in sys.argv[1:] if argument.startswith("name=")]
-    node = rclpy.create_node(*named or ["probe"])
+    with fastdds.one_participant_at_a_time():
+        node = rclpy.create_node(*named or ["probe"])
     for name in [argument for argument in sys.argv[1:] if not argument.startswith("name=")]:
         topic = TOPICS[name.rsplit("/", 1)[-1]]
 

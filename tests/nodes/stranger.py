@@ -26,7 +26,7 @@ from std_msgs.msg import Int32, String
 from tests.nodes.garbage import JSON_TOPICS, TOPICS, garbage, oversized
 from uav_dc_ros import scenarios
 from uav_dc_ros.nodes.framework.node_table import NODES
-from uav_dc_ros.nodes.ros import qos
+from uav_dc_ros.nodes.ros import fastdds, qos
 from uav_dc_ros.topics import TOPICS as ROWS
 
 BURST = 500
@@ -107,7 +107,8 @@ def wait_until(node: Node, condition: object) -> None:
 def main() -> None:
     scenario, seed, per_topic, n_oversized, mission, peers = sys.argv[1:]
     rclpy.init()
-    stranger = Stranger(peers.split(","))
+    with fastdds.one_participant_at_a_time():
+        stranger = Stranger(peers.split(","))
     wait_until(stranger, lambda: stranger.mission >= int(mission))
     stranger.destroy_subscription(stranger.listening)  # it would hear itself
     stranger.enter()

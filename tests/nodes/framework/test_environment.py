@@ -100,27 +100,9 @@ def test_a_small_shared_memory_is_not_used(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(fastdds, "free_mb", lambda: 4.0)
-    environment.prepare(local_only=True, shared_memory=True)
+    environment.prepare(local_only=True)
     assert os.environ[fastdds.TRANSPORTS] == "UDPv4"
     assert "4.0 MB free; expected 16: messages travel over UDP alone" in capsys.readouterr().err
-
-
-def test_missions_use_udp_and_the_bag_verbs_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fastdds, "free_mb", lambda: 400.0)
-    environment.prepare(local_only=True, shared_memory=True)
-    assert fastdds.TRANSPORTS not in os.environ
-    for name in fastdds.NAMES:
-        monkeypatch.delenv(name)
-    environment.prepare(local_only=True)
-    assert os.environ[fastdds.TRANSPORTS] == "UDPv4"
-
-
-@pytest.mark.parametrize("name", [fastdds.TRANSPORTS, fastdds.NAMES[0]])
-def test_transports_of_the_user_stay(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setenv(name, "mine")
-    environment.prepare(local_only=True)
-    assert os.environ[name] == "mine"
-    assert os.environ.get(fastdds.TRANSPORTS) in (None, "mine")
 
 
 def test_leftovers_go_and_what_the_living_have_stays(clean: Path) -> None:
@@ -218,3 +200,33 @@ def test_shared_memory_is_as_before_after_missions_and_kills(ros: Ros, missions:
     process = ros.start_command(*private, mount, "-", sys.executable, "-c", MISSIONS, missions, kills)
     status, output = finish(process, 60.0 + 60.0 * (missions + kills))
     assert (status, output.splitlines()[-1:]) == (0, ["equal"]), output
+
+
+def test_participants_are_created_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not for ever: a process that hangs meanwhile, or is killed, stops no other."""
+    name = f"\0uav_dc_ros/participant_of_{os.getpid()}"
+    monkeypatch.setattr(fastdds, "CREATION_LOCK", name)
+    code = f"""
+from uav_dc_ros.nodes.ros import fastdds
+fastdds.CREATION_LOCK = {name!r}
+with fastdds.one_participant_at_a_time():
+    print("created", flush=True)
+    input()
+"""
+    command = [sys.executable, "-c", code]
+    holder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == "created\n"
+    monkeypatch.setattr(fastdds, "CREATION_MAX_S", 0.3)
+    begun_s = time.monotonic()
+    with fastdds.one_participant_at_a_time():
+        assert time.monotonic() - begun_s >= 0.3
+    holder.kill()
+    holder.communicate()
+    monkeypatch.setattr(fastdds, "CREATION_MAX_S", 600.0)
+    with fastdds.one_participant_at_a_time():
+        pass
+    with fastdds.one_participant_at_a_time():
+        pass

@@ -30,7 +30,8 @@ def main() -> None:
     spec = json.loads(sys.argv[1])
     fastdds.use_profiles()
     rclpy.init()
-    node = rclpy.create_node(spec.get("name", "listener"))
+    with fastdds.one_participant_at_a_time():
+        node = rclpy.create_node(spec.get("name", "listener"))
     received: list[tuple[str, bytes, int, int]] = []
     each_s = spec.get("each_s", 0.0)
 

@@ -17,6 +17,8 @@ import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
+from uav_dc_ros.nodes.ros import fastdds
+
 published: Counter[str] = Counter()
 
 
@@ -52,7 +54,8 @@ def talk(node: Any, row: dict[str, Any]) -> None:
 
 def main() -> None:
     rclpy.init()
-    node = rclpy.create_node("talker")
+    with fastdds.one_participant_at_a_time():
+        node = rclpy.create_node("talker")
     rows = json.loads(sys.argv[1])
     threads = [threading.Thread(target=talk, args=(node, row)) for row in rows]
     for thread in threads:

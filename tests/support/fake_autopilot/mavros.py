@@ -35,7 +35,7 @@ from tests.support.fake_autopilot.autopilot import (
     Copter,
     emit,
 )
-from uav_dc_ros.nodes.ros import convert
+from uav_dc_ros.nodes.ros import convert, fastdds
 from uav_dc_ros.offboard.frames import Enu, Geodetic, Ned, to_enu, to_ned
 
 POSE_S = 1 / 30
@@ -58,7 +58,8 @@ class FakeMavros:
         self.beats, self.setpoints, self.last, self.heard_s = 0, 0, None, -math.inf
         self.times: list[float] = []
         self.began_ns = self.stamp_ns = time.time_ns()
-        self.node = node = rclpy.create_node("fake_mavros")
+        with fastdds.one_participant_at_a_time():
+            self.node = node = rclpy.create_node("fake_mavros")
         pose_qos = 10 if options.reliable else qos_profile_sensor_data
         self.pose = node.create_publisher(PoseStamped, "mavros/local_position/pose", pose_qos)
         self.battery = node.create_publisher(BatteryState, "mavros/battery", qos_profile_sensor_data)

@@ -65,6 +65,6 @@ def run(options: argparse.Namespace) -> int:
     names = ("resume", "topics", "split_bytes", "compression", "min_free_bytes")
     values = {name: getattr(options, name) for name in names}
     values |= {"bag": str(options.out), "split_s": p.SPLIT_S.value(options.split_s)}
-    environment.prepare(local_only=False, shared_memory=True)  # publishers may be on any host
+    environment.prepare(local_only=False)  # publishers may be on any host
     remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
     node_main.main(lambda: BagRecorder(values), arguments=remapped)

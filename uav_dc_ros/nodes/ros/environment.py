@@ -21,24 +21,18 @@ RANGES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
 LOG_FOLDERS = (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"))  # rcl uses the first one that is set
 
 
-def prepare(*, local_only: bool, shared_memory: bool = False) -> None:
+def prepare(*, local_only: bool) -> None:
     """`check` the environment and set what it leaves open; to be called before ROS is imported.
 
     `local_only`: all participants run on this host, so discovery is limited to it.
     """
-    check(shared_memory=shared_memory)
+    check()
     os.environ.setdefault(RANGE, "LOCALHOST" if local_only else "SUBNET")
     os.environ.setdefault(LINES, LINE_OF_NODE)
 
 
-def check(*, shared_memory: bool = False) -> None:
-    """Raise ParameterError if ROS cannot start in this environment, or nodes cannot find each other.
-
-    The small messages of a mission travel over UDP: participants that start together on a busy machine were
-    seen to take each other's ports in shared memory for leftovers, and then to wait for each other forever.
-    `shared_memory`: for messages of any size, as the verbs of `bag` read and publish.
-    """
-    is_set = any(name in os.environ for name in (fastdds.TRANSPORTS, *fastdds.NAMES))
+def check() -> None:
+    """Raise ParameterError if ROS cannot start in this environment, or nodes cannot find each other."""
     check_import()
     _check_domain()
     _check_range()
@@ -46,10 +40,8 @@ def check(*, shared_memory: bool = False) -> None:
     fastdds.use_profiles()
     fastdds.remove_leftovers()
     free_mb = fastdds.free_mb()
-    if is_set or (shared_memory and free_mb >= fastdds.RECOMMENDED_MB):
-        return
-    os.environ[fastdds.TRANSPORTS] = "UDPv4"
-    if shared_memory:
+    if free_mb < fastdds.RECOMMENDED_MB and fastdds.TRANSPORTS not in os.environ:
+        os.environ[fastdds.TRANSPORTS] = "UDPv4"
         _note(
             f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "
             "travel over UDP alone"

@@ -10,7 +10,9 @@ import fcntl
 import math
 import os
 import re
+import socket
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 # Jazzy's Fast DDS reads the first name, later ones the second.
@@ -22,6 +24,29 @@ MIN_MB = 0.1  # LTTng's pages, which rclpy's libraries touch when they are loade
 OWNED = re.compile(r"(?P<owned>(?:fastrtps|fastdds)_(?:port\d{1,5}|[0-9a-f]{16}))(?P<lock>_el|_sl)?")
 # A file is locked a moment after it is created, and a test of the lock locks it. Younger ones are skipped.
 YOUNG_S = 2.0
+CREATION_LOCK = (
+    "\0uav_dc_ros/participant"  # an abstract Unix socket: the kernel frees it when its process ends
+)
+CREATION_MAX_S = 5.0  # longest wait for the lock: a process that hangs while it holds it stops no other
+
+
+@contextlib.contextmanager
+def one_participant_at_a_time() -> Iterator[None]:
+    """Hold a lock of this host while a node creates its participant.
+
+    Fast DDS locks a port a moment after it creates it. A participant that is created in this moment takes the
+    port for a leftover and replaces it, and the owner of the first one receives nothing any more: on a busy
+    machine, nodes that start together were seen to wait for each other forever.
+    """
+    deadline_s = time.monotonic() + CREATION_MAX_S
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
+        while time.monotonic() < deadline_s:
+            try:
+                lock.bind(CREATION_LOCK)
+                break
+            except OSError:
+                time.sleep(0.002)
+        yield
 
 
 def use_profiles() -> None:
