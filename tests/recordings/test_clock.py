@@ -90,7 +90,10 @@ def test_what_waited_when_the_recorder_was_stopped_lies_topic_by_topic(tmp_path:
 MILLISECONDS = st.integers(-9000, -20) | st.integers(20, 9000)
 
 
-@given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(1, 130), MILLISECONDS), max_size=3))
+@given(
+    st.integers(0, 2**32),
+    st.lists(st.tuples(st.integers(1, 130), MILLISECONDS), max_size=3, unique_by=itemgetter(0)),
+)
 @settings(max_examples=60, deadline=None)
 def test_any_setting_of_the_clock_and_any_delay_in_writing_give_the_same_steps(
     seed: int, settings_of_the_clock: list[tuple[int, int]]
