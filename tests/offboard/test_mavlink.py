@@ -194,7 +194,7 @@ def test_the_stream_ends_with_those_who_decide() -> None:
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 def test_the_first_heartbeat_goes_out_as_soon_as_somebody_can_hear_it(kind: str) -> None:
-    """The autopilot of a bridge that was killed waits for it: nobody has to set_setpoint first."""
+    """The autopilot of a bridge that was killed waits for it: no command is needed before its setpoints."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
         autopilot.settimeout(15.0)
         autopilot.bind(("127.0.0.1", 0))
