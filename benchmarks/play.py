@@ -45,7 +45,7 @@ from std_msgs.msg import String
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.nodes.ros import fastdds
 from uav_dc_ros.nodes.play.bag_play import PRIORITY
-fastdds.use_profiles()
+fastdds.select_transports(shared_memory=True)
 if sys.argv[2] == "sleeps":
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)

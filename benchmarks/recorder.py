@@ -42,7 +42,7 @@ from std_msgs.msg import String
 from uav_dc_ros.nodes.ros import fastdds
 from uav_dc_ros import cdr
 size, rate_hz, seconds = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
-fastdds.use_profiles()
+fastdds.select_transports(shared_memory=True)
 rclpy.init()
 node = rclpy.create_node("publisher")
 publisher = node.create_publisher(String, "t", 1000 if size < 1000 else 50)
@@ -67,7 +67,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from std_msgs.msg import String
 from uav_dc_ros.nodes.ros import fastdds
 from uav_dc_ros.nodes.ros.executor import DirectExecutor
-fastdds.use_profiles()
+fastdds.select_transports(shared_memory=True)
 rclpy.init()
 node = rclpy.create_node("counter")
 counted = 0

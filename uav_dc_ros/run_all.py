@@ -8,8 +8,6 @@ import argparse
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -96,16 +94,19 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
     def command() -> int:
         nonlocal has_flown
         config = _config(parser(prog).parse_args(arguments))
-        with _ros(config):
-            from uav_dc_ros.nodes.framework import node_main
-            from uav_dc_ros.runner.mission_runner import MissionRunner
+        from uav_dc_ros.nodes.ros import environment, fastdds
 
-            runner = MissionRunner(config)
-            signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the mission continues without its terminal
-            cli.on_stop(runner.interrupt)
-            node_main.use_batch_scheduling()
-            has_flown = True
-            return runner.run()
+        environment.prepare(local_only=config.nodes is None)
+        fastdds.select_transports()
+        from uav_dc_ros.nodes.framework import node_main
+        from uav_dc_ros.runner.mission_runner import MissionRunner
+
+        runner = MissionRunner(config)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the mission continues without its terminal
+        cli.on_stop(runner.interrupt)
+        node_main.use_batch_scheduling()
+        has_flown = True
+        return runner.run()
 
     try:
         cli.run(command, prog)
@@ -134,17 +135,20 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
     before = dict(os.environ)
     in_main = threading.current_thread() is threading.main_thread()
     try:
-        with _ros(config):
-            from uav_dc_ros.messages import Phase
-            from uav_dc_ros.runner.mission_runner import MissionRunner
+        from uav_dc_ros.nodes.ros import environment
 
-            runner = MissionRunner(config, show=show)
-            handler = signal.signal(signal.SIGINT, runner.interrupt) if in_main else None
-            try:
-                status = runner.run()
-            finally:
-                if in_main:
-                    signal.signal(signal.SIGINT, handler)
+        # The nodes select their transports themselves. In this process Fast DDS may have been loaded before.
+        environment.prepare(local_only=config.nodes is None)
+        from uav_dc_ros.messages import Phase
+        from uav_dc_ros.runner.mission_runner import MissionRunner
+
+        runner = MissionRunner(config, show=show)
+        handler = signal.signal(signal.SIGINT, runner.interrupt) if in_main else None
+        try:
+            status = runner.run()
+        finally:
+            if in_main:
+                signal.signal(signal.SIGINT, handler)
     finally:
         for name in os.environ.keys() - before.keys():
             del os.environ[name]
@@ -154,18 +158,6 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
     if status and all(summary.outcome is not Phase.ABORTED for summary in runner.summaries):
         raise NodeError("; ".join(runner.errors))
     return tuple(runner.summaries)
-
-
-@contextmanager
-def _ros(config: RunConfig) -> Iterator[None]:
-    """Prepare the environment before ROS is imported; at the end remove the shared memory of killed nodes."""
-    from uav_dc_ros.nodes.ros import environment, fastdds
-
-    environment.prepare(local_only=config.nodes is None)
-    try:
-        yield
-    finally:
-        fastdds.remove_leftovers()
 
 
 def _config(options: argparse.Namespace) -> RunConfig:

@@ -24,10 +24,10 @@ SETTLE_S = 0.3  # a publisher may know of a subscriber before that one knows of 
 
 
 def main() -> None:
+    fastdds.select_transports()
     rclpy.init()
     named = [argument.removeprefix("name=") for argument in sys.argv[1:] if argument.startswith("name=")]
-    with fastdds.one_participant_at_a_time():
-        node = rclpy.create_node(*named or ["probe"])
+    node = rclpy.create_node(*named or ["probe"])
     for name in [argument for argument in sys.argv[1:] if not argument.startswith("name=")]:
         topic = TOPICS[name.rsplit("/", 1)[-1]]
 

@@ -106,9 +106,9 @@ def wait_until(node: Node, condition: object) -> None:
 
 def main() -> None:
     scenario, seed, per_topic, n_oversized, mission, peers = sys.argv[1:]
+    fastdds.select_transports()
     rclpy.init()
-    with fastdds.one_participant_at_a_time():
-        stranger = Stranger(peers.split(","))
+    stranger = Stranger(peers.split(","))
     wait_until(stranger, lambda: stranger.mission >= int(mission))
     stranger.destroy_subscription(stranger.listening)  # it would hear itself
     stranger.enter()

@@ -17,6 +17,7 @@ from tests.nodes import garbage
 from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.framework.node_table import NODES
+from uav_dc_ros.nodes.ros import fastdds
 
 PEERS = ("world", "channel_monitor", "policy", "recorder", "mission_monitor")
 BY_HAND = ("world", "channel_monitor", "policy")
@@ -25,7 +26,7 @@ KEPT = 10_000
 # Then the first poses have left the monitor's memory: users of the past find none.
 FROM_MISSION = 9
 COMPARED = ("users", "rates", "mission", "move")
-EAGER = Path(__file__).with_name("eager.xml")
+LOCALHOST = Path(fastdds.__file__).with_name("fastdds_localhost.xml")
 
 
 class Running:
@@ -98,8 +99,12 @@ def flown(said: list[Any]) -> dict[tuple[int, int], Any]:
 
 def fly_under_fire(ros: Ros, scenario: Path, policy: Path, per_topic: int, oversized: int) -> dict[str, Any]:
     """Fly until all garbage has been fired and read; what the stranger tells, and what was flown."""
-    names = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-    ros.environment.update(dict.fromkeys(names, str(EAGER)))
+    # Bursts follow each other at once; what was lost is sent again before a node ends.
+    eager = ros.folder / "eager.xml"
+    eager.write_text(
+        re.sub(r"(<heartbeatPeriod>.*?<nanosec>)\d+", r"\g<1>5000000", LOCALHOST.read_text(), flags=re.S)
+    )
+    ros.environment.update(dict.fromkeys(fastdds.NAMES, str(eager)) | {fastdds.RANGE: "SUBNET"})
     world = ("-p", f"scenario:={scenario}")
     given = {
         "world": (*world, "-p", "missions:=1000000"),

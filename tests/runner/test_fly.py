@@ -24,7 +24,7 @@ assert before == (dict(os.environ), [signal.getsignal(number) for number in (2, 
 rclpy.spin_once(node, timeout_sec=0.01)
 assert rclpy.ok()
 rclpy.shutdown()
-print(json.dumps([(one.scenario, one.seed, one.outcome, one.steps, one.bag) for one in flown]))
+print(json.dumps([(one.scenario, one.seed, one.outcome, one.steps, one.bag, one.reason) for one in flown]))
 """
 FOR_EVER = """
 from uav_dc_ros import RunConfig, fly
@@ -49,9 +49,9 @@ def test_missions_beside_a_caller_s_own_ros(ros: Ros) -> None:
     status, output = finish(ros.start_command(sys.executable, "-c", IN_A_THREAD))
     assert status == 0, output
     assert json.loads(output) == [
-        ["five_clusters", 0, "landed", 60, str(ros.folder / "bag")],
-        ["three_clusters", 4, "landed", 45, None],
-        ["three_clusters", 5, "landed", 45, None],
+        ["five_clusters", 0, "landed", 60, str(ros.folder / "bag"), ""],
+        ["three_clusters", 4, "landed", 45, None, ""],
+        ["three_clusters", 5, "landed", 45, None, ""],
     ]
     assert (ros.folder / "bag" / "metadata.yaml").is_file()
 

@@ -28,10 +28,9 @@ QUIET_S = 0.4
 
 def main() -> None:
     spec = json.loads(sys.argv[1])
-    fastdds.use_profiles()
+    fastdds.select_transports()
     rclpy.init()
-    with fastdds.one_participant_at_a_time():
-        node = rclpy.create_node(spec.get("name", "listener"))
+    node = rclpy.create_node(spec.get("name", "listener"))
     received: list[tuple[str, bytes, int, int]] = []
     each_s = spec.get("each_s", 0.0)
 

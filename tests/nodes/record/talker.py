@@ -53,9 +53,9 @@ def talk(node: Any, row: dict[str, Any]) -> None:
 
 
 def main() -> None:
+    fastdds.select_transports()
     rclpy.init()
-    with fastdds.one_participant_at_a_time():
-        node = rclpy.create_node("talker")
+    node = rclpy.create_node("talker")
     rows = json.loads(sys.argv[1])
     threads = [threading.Thread(target=talk, args=(node, row)) for row in rows]
     for thread in threads:

@@ -58,8 +58,7 @@ class FakeMavros:
         self.beats, self.setpoints, self.last, self.heard_s = 0, 0, None, -math.inf
         self.times: list[float] = []
         self.began_ns = self.stamp_ns = time.time_ns()
-        with fastdds.one_participant_at_a_time():
-            self.node = node = rclpy.create_node("fake_mavros")
+        self.node = node = rclpy.create_node("fake_mavros")
         pose_qos = 10 if options.reliable else qos_profile_sensor_data
         self.pose = node.create_publisher(PoseStamped, "mavros/local_position/pose", pose_qos)
         self.battery = node.create_publisher(BatteryState, "mavros/battery", qos_profile_sensor_data)
@@ -186,6 +185,7 @@ def main() -> None:
     parser.add_argument("--beat-s", type=float, default=0.2)  # a real one: once a second
     parser.add_argument("--reliable", action="store_true")  # poses: as those of other drivers may be
     options, ros = parser.parse_known_args()
+    fastdds.select_transports()
     rclpy.init(args=["fake_mavros", *ros])
     fake = FakeMavros(options)
     executor = SingleThreadedExecutor()

@@ -247,10 +247,9 @@ class Px4:
 
 
 def main() -> None:
-    fastdds.use_profiles()
+    fastdds.select_transports()
     rclpy.init(args=[])
-    with fastdds.one_participant_at_a_time():
-        node = rclpy.create_node("fake_px4", namespace=sys.argv[3])
+    node = rclpy.create_node("fake_px4", namespace=sys.argv[3])
     vehicle = Px4(node)
     executor = DirectExecutor()
     executor.add_node(node)

@@ -15,7 +15,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from uav_dc_ros.errors import ParameterError, UavDcError
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.framework.parameters import COMMON, Parameter
-from uav_dc_ros.nodes.ros import fastdds, rclpy_private
+from uav_dc_ros.nodes.ros import rclpy_private
 
 
 class ManagedNode(LifecycleNode):
@@ -29,8 +29,7 @@ class ManagedNode(LifecycleNode):
         self, name: str, overrides: Sequence[rclpy.Parameter] = (), context: Context | None = None
     ) -> None:
         try:
-            with fastdds.one_participant_at_a_time():
-                super().__init__(name, parameter_overrides=list(overrides), context=context)
+            super().__init__(name, parameter_overrides=list(overrides), context=context)
         except InvalidParameterTypeException as error:  # of a parameter that rclpy declares itself
             raise ParameterError(str(error)) from None
         self.row = NODES[name]

@@ -183,7 +183,7 @@ def main(
     status = _run(makes, arguments)
     gc.unfreeze()
     shut_down(rclpy.get_default_context(), EXIT_TIMEOUT_S)
-    os._exit(status)  # all is logged and written; a hanging middleware costs a leftover in shared memory
+    os._exit(status)  # all is logged and written; the middleware may hang when it is shut down
 
 
 def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> int:
@@ -193,7 +193,7 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> in
     try:
         if SUPERVISED not in os.environ:
             environment.check()
-        fastdds.use_profiles()
+        fastdds.select_transports()
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
             nodes = [make() for make in makes]

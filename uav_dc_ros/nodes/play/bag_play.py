@@ -16,7 +16,7 @@ from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.nodes.play.clock import CLOCK_TOPIC, RATE_MAX, RATE_MIN
-from uav_dc_ros.nodes.ros import environment, fastdds
+from uav_dc_ros.nodes.ros import environment
 
 if TYPE_CHECKING:
     from uav_dc_ros.nodes.play.player import PlaybackOptions
@@ -96,6 +96,7 @@ def run(options: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A bag with moves and poses must not reach a vehicle on the network by accident.
     environment.prepare(local_only=True)
+    environment.select_shared_memory()
     with BagReader(options.bag) as reader:
         _play(reader, _playback_options(reader, options))
     return 0
@@ -178,8 +179,7 @@ def _play(reader: BagReader, options: "PlaybackOptions") -> None:
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         with PlaybackDisplay(options.start_s, end_s) as display:
-            with fastdds.one_participant_at_a_time():
-                node = Node("player", start_parameter_services=False, enable_rosout=False)
+            node = Node("player", start_parameter_services=False, enable_rosout=False)
             player = Player(node, options, display, reader)
             display.info(
                 f"playing {reader.path}: {len(player.publishers)} topics, {end_s - options.start_s:.3f} s, "

@@ -66,5 +66,6 @@ def run(options: argparse.Namespace) -> int:
     values = {name: getattr(options, name) for name in names}
     values |= {"bag": str(options.out), "split_s": p.SPLIT_S.value(options.split_s)}
     environment.prepare(local_only=False)  # publishers may be on any host
+    environment.select_shared_memory()
     remapped = ["--ros-args", "-r", f"__ns:={options.namespace}"]
     node_main.main(lambda: BagRecorder(values), arguments=remapped)

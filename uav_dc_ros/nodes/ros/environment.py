@@ -16,7 +16,6 @@ LINE_OF_NODE = "{severity}: {message}"  # run_all adds the node's name
 LINE_OF_ONE_OF_MANY = "{severity}: {name}: {message}"
 DOMAIN_MAX = 232  # the ports of higher ones do not exist
 NUMBER = re.compile(r"(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*")  # as C's strtoul reads it, and so rcl
-RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 RANGES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
 LOG_FOLDERS = (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"))  # rcl uses the first one that is set
 
@@ -27,8 +26,19 @@ def prepare(*, local_only: bool) -> None:
     `local_only`: all participants run on this host, so discovery is limited to it.
     """
     check()
-    os.environ.setdefault(RANGE, "LOCALHOST" if local_only else "SUBNET")
+    os.environ.setdefault(fastdds.RANGE, "LOCALHOST" if local_only else "SUBNET")
     os.environ.setdefault(LINES, LINE_OF_NODE)
+
+
+def select_shared_memory() -> None:
+    """Use shared memory for large messages, unless little of it is free."""
+    free_mb = fastdds.free_mb()
+    if is_small := free_mb < fastdds.RECOMMENDED_MB:
+        _note(
+            f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "
+            "travel over UDP alone"
+        )
+    fastdds.select_transports(shared_memory=not is_small)
 
 
 def check() -> None:
@@ -37,15 +47,6 @@ def check() -> None:
     _check_domain()
     _check_range()
     _check_log_folder()
-    fastdds.use_profiles()
-    fastdds.remove_leftovers()
-    free_mb = fastdds.free_mb()
-    if free_mb < fastdds.RECOMMENDED_MB and fastdds.TRANSPORTS not in os.environ:
-        os.environ[fastdds.TRANSPORTS] = "UDPv4"
-        _note(
-            f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "
-            "travel over UDP alone"
-        )
 
 
 def check_import() -> None:
@@ -53,21 +54,19 @@ def check_import() -> None:
 
     The import of rclpy would end the process, by SIGBUS or with status 102.
     """
-    if fastdds.free_mb() < fastdds.MIN_MB:
-        fastdds.remove_leftovers()
-        if (free_mb := fastdds.free_mb()) < fastdds.MIN_MB:
-            raise ParameterError(
-                f"{fastdds.SHARED_MEMORY} is full ({free_mb:.2f} MB free), and ROS does not start; expected "
-                f"{fastdds.RECOMMENDED_MB} MB"
-            )
-    name = os.environ.get("RMW_IMPLEMENTATION")
+    if (free_mb := fastdds.free_mb()) < fastdds.MIN_MB:
+        raise ParameterError(
+            f"{fastdds.SHARED_MEMORY} is full ({free_mb:.2f} MB free), and ROS does not start; expected "
+            f"{fastdds.MIN_MB} MB"
+        )
+    name = os.environ.get(fastdds.RMW)
     if not name:
         return
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     is_package = any(Path(prefix, "share", name).is_dir() for prefix in prefixes if prefix)
     if not (name.isascii() and name.isidentifier() and (importlib.util.find_spec(name) or is_package)):
         raise ParameterError(
-            f"RMW_IMPLEMENTATION is {name!r}, which is not installed; expected one that is, such as "
+            f"{fastdds.RMW} is {name!r}, which is not installed; expected one that is, such as "
             "rmw_fastrtps_cpp, or the variable unset"
         )
 
@@ -83,12 +82,12 @@ def _check_domain() -> None:
 
 
 def _check_range() -> None:
-    value = os.environ.get(RANGE)
+    value = os.environ.get(fastdds.RANGE)
     if not value:
-        os.environ.pop(RANGE, None)
+        os.environ.pop(fastdds.RANGE, None)
     elif value not in RANGES:
         off = ": nodes do not find each other" if value == "OFF" else ""
-        raise ParameterError(f"{RANGE} is {value!r}{off}; expected {' or '.join(RANGES)}")
+        raise ParameterError(f"{fastdds.RANGE} is {value!r}{off}; expected {' or '.join(RANGES)}")
 
 
 def _check_log_folder() -> None:
