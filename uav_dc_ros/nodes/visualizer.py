@@ -31,7 +31,7 @@ class _UsersHeader(msgspec.Struct):
 class VisualizerNode(MissionNode):
     """Draws what changed, at most `rate` times a second."""
 
-    drains = True  # it draws the end of a mission, too
+    drain_quiet_s = 0.1  # it draws the end of a mission, too
     pause_s = 0.05  # no node waits for it
 
     def __init__(self) -> None:

@@ -41,7 +41,7 @@ class MissionNode(ManagedNode):
     another node adopts that of the only publisher that it receives from.
     """
 
-    drains = False  # whether it handles the messages that have arrived before it stops
+    drain_quiet_s = 0.0  # before it stops it handles messages until none came for so long
     pause_s = 0.0  # of its executor, see `DirectExecutor`
 
     def __init__(

@@ -31,7 +31,6 @@ from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 
 ROS_ARGUMENTS = "--ros-args"
 DRAIN_S = 2.0
-DRAIN_QUIET_S = 0.2  # a lost message is sent again within a tenth of a second
 EXIT_TIMEOUT_S = 3.0  # for the middleware to close
 BACKGROUND_NICENESS = 5  # of a node that no other waits for
 # Exit statuses. Python's own 1 remains for unexpected errors: only after those a restart may help.
@@ -235,9 +234,10 @@ def _spin(
             executor.spin(lambda: stop.is_pending)
             while stop.commands and not stop.requested:
                 reporter.execute(stop.commands.popleft())
-        if any(node.drains and node.state == "active" for node in nodes):
+        quiet_s = max(node.drain_quiet_s if node.state == "active" else 0.0 for node in nodes)
+        if quiet_s:
             deadline_s = time.monotonic() + DRAIN_S
-            executor.spin(lambda: time.monotonic() > deadline_s, DRAIN_QUIET_S)
+            executor.spin(lambda: time.monotonic() > deadline_s, quiet_s)
     finally:
         for node in reversed(nodes):
             if node.state != "finalized":

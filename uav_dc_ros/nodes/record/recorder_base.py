@@ -33,7 +33,7 @@ HOUSEKEEPING = ("/parameter_events", "/rosout", "/transition_event")  # of ROS: 
 class RecorderBase(MissionNode):
     """Records the topics of its row, and other topics that it discovers."""
 
-    drains = True
+    drain_quiet_s = 0.2  # a lost message is sent again within a tenth of a second
     pause_s = 0.005  # no node waits for the recorder
     delays_new_topics = False  # whether a topic is recorded only from the second scan on
 
