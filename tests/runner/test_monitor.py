@@ -16,7 +16,14 @@ from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import other_publishers
 from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.runner import monitor
-from uav_dc_ros.runner.monitor import ALONE_S, IDENTIFY_S, STARTED_S, MissionMonitor, MonitoredMission
+from uav_dc_ros.runner.monitor import (
+    ALONE_S,
+    CHECK_S,
+    IDENTIFY_S,
+    STARTED_S,
+    MissionMonitor,
+    MonitoredMission,
+)
 
 STEPS = 3
 MBIT = 1e6
@@ -134,7 +141,7 @@ def test_nodes_that_start_slowly_are_waited_for(bench: Bench) -> None:
     assert not node.is_alone
     bench.checks(node, STARTED_S / 2)
     assert not node.is_alone
-    bench.checks(node, STARTED_S)
+    bench.checks(node, STARTED_S + CHECK_S)
     assert node.is_alone
 
 

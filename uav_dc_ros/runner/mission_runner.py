@@ -56,9 +56,9 @@ class Network:
         if not self._has_left:
             self._has_left = True
             self.node.trigger_shutdown()
-            self.node.destroy_node()
+            nodes = [self.node]
             del self.node, self.executor
-            shut_down(self._context, SHUTDOWN_S)
+            shut_down(self._context, SHUTDOWN_S, nodes)
 
 
 class MissionRunner:

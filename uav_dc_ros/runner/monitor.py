@@ -20,7 +20,7 @@ from uav_dc_ros.recordings.recorded_step import MissionTotals
 
 # A mission begins after this time without another one (participants announce themselves every 0.2 s), ...
 ALONE_S = 0.5  # ... from the activation of the monitor on, and ...
-STARTED_S = 0.1  # ... from the start of all nodes of this run_all on: a busy machine delays it like discovery.
+STARTED_S = 0.1  # ... from the start of all nodes of this run_all on: a busy machine delays both.
 CHECK_S = 0.1  # period of checks for other publishers before the mission begins
 CHECK_BEGUN_S = 1.0  # and afterwards
 IDENTIFY_S = 3.0  # longest wait for both the nodes and the run of another mission

@@ -179,23 +179,23 @@ def main(
         arguments = ros_arguments(makes[0].__doc__ or "")
     if batch_scheduling:
         use_batch_scheduling()
-    status = _run(makes, arguments)
+    nodes: list[MissionNode] = []
+    status = _run(makes, arguments, nodes)
     gc.unfreeze()
-    shut_down(rclpy.get_default_context(), EXIT_TIMEOUT_S)
+    shut_down(rclpy.get_default_context(), EXIT_TIMEOUT_S, nodes)
     os._exit(status)  # all is logged and written; the middleware may hang when it is shut down
 
 
-def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> int:
-    """Run nodes from start to stop; returns the exit status. Keeps no reference to any of them."""
+def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str], nodes: list[MissionNode]) -> int:
+    """Run nodes, which are added to the list, from start to stop; returns the exit status."""
     status = EXIT_NOT_STARTED
-    nodes: list[MissionNode] = []
     try:
         if SUPERVISED not in os.environ:
             environment.check()
         fastdds.select_transports()
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-            nodes = [make() for make in makes]
+            nodes += [make() for make in makes]
         except rclpy_private.INIT_ERRORS as error:
             raise ParameterError(f"{error}; expected ROS arguments after --ros-args") from None
         pause_s = min(node.pause_s for node in nodes)
@@ -220,8 +220,6 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str]) -> in
         stop.close()
     except UavDcError as error:
         cli.print_error(f"error: {error}")
-    for node in nodes:
-        node.destroy_node()
     return status
 
 

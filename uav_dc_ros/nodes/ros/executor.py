@@ -172,10 +172,15 @@ def _complete(client: Any) -> None:
     future.set_result(response)
 
 
-def shut_down(context: Context, timeout_s: float) -> None:
-    """Shut a context down in a thread: the middleware was seen to hang while several participants leave."""
+def shut_down(context: Context, timeout_s: float, nodes: list[Any] | None = None) -> None:
+    """Destroy nodes, which are removed from the list, and shut their context down.
+
+    It happens in a thread: the middleware was seen to hang while several participants leave.
+    """
 
     def leave() -> None:
+        while nodes:
+            nodes.pop(0).destroy_node()
         gc.collect()  # the middleware's part of a node ends with the last reference to it
         context.try_shutdown()
         context.destroy()
