@@ -12,7 +12,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TextIO, cast
 
 from uav_dc_ros import __version__
@@ -77,11 +77,13 @@ def number(minimum: float, maximum: float, expected: str) -> Callable[[str], flo
     return parse
 
 
-def names(expected: str, start: str = "") -> Callable[[str], tuple[str, ...]]:
+def names(expected: str, start: str = "", among: Sequence[str] = ()) -> Callable[[str], tuple[str, ...]]:
     """The type of an option that lists names, separated by commas, each once and with the same start."""
 
     def parse(text: str) -> tuple[str, ...]:
         found = tuple(name.strip() for name in text.split(","))
+        if among and (unknown := [name for name in found if name not in among]):
+            raise argparse.ArgumentTypeError(f"{unknown[0]!r}; expected some of {', '.join(among)}")
         if not all(name and name.startswith(start) for name in found) or len(set(found)) < len(found):
             raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}, each once, with ',' between")
         return found

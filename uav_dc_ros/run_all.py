@@ -163,7 +163,7 @@ def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summar
 def _config(options: argparse.Namespace) -> RunConfig:
     """The run of a command line."""
     given = vars(options)
-    settings = {f"{node}.{name}": value for node, name, value in given.pop("settings")}
+    settings = dict(given.pop("settings"))
     pace = paces.LOCKSTEP if options.pace is None else options.pace
     record = not given.pop("no_record")
     return RunConfig(**given | {"settings": settings, "pace": pace, "record": record})
@@ -176,13 +176,12 @@ def _pace(text: str) -> float | None:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def _setting(text: str) -> tuple[str, str, str]:
+def _setting(text: str) -> tuple[str, str]:
     key, equals, value = text.partition("=")
-    node, dot, name = key.partition(".")
-    if not (equals and dot and node and name):
+    if not (equals and all(key.partition("."))):
         expected = "NODE.PARAMETER=VALUE, such as bridge.failsafe_action=land"
         raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}")
-    return node, name, value
+    return key, value
 
 
 if __name__ == "__main__":

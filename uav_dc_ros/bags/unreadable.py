@@ -11,19 +11,15 @@ class Unreadable(Counter[tuple[str, str]]):
 
     def __init__(self) -> None:
         super().__init__()
-        self._first: dict[tuple[str, str], str] = {}
+        self.first: dict[tuple[str, str], str] = {}  # text of the first error of each kind
 
     def add(self, topic: str, error: MessageError) -> None:
         """Count a message."""
         kind = topic, error.reason
         self[kind] += 1
-        self._first.setdefault(kind, str(error))
-
-    def first_error(self, topic: str, reason: str) -> str:
-        """The text of the first error of a kind."""
-        return self._first[topic, reason]
+        self.first.setdefault(kind, str(error))
 
     def lines(self) -> Iterator[str]:
         """A line for each kind: the count and the first error."""
         for (topic, reason), n in sorted(self.items()):
-            yield f"{n:,} messages of {topic} cannot be read: {reason}: {self._first[topic, reason]}"
+            yield f"{n:,} messages of {topic} cannot be read: {reason}: {self.first[topic, reason]}"

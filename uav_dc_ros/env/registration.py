@@ -1,8 +1,6 @@
-"""Registers `uav_dc_ros/DataCollection-v0` and its vector form with Gymnasium, which finds no
-plug-ins itself.
+"""Registers `uav_dc_ros/DataCollection-v0` and its vector form with Gymnasium, which finds no plug-ins.
 
-Any of these works: `import gymnasium, uav_dc_ros`, an import of this module, or
-`gymnasium.make("uav_dc_ros:uav_dc_ros/DataCollection-v0")`.
+`import gymnasium, uav_dc_ros` imports it, and `gymnasium.make("uav_dc_ros:uav_dc_ros/DataCollection-v0")`.
 """
 
 import gymnasium

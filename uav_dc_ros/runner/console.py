@@ -4,7 +4,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from rich.console import JustifyMethod
 from rich.progress import TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -29,8 +28,7 @@ class MissionConsole(LiveDisplay):
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
         )
-        self.scenario = scenario
-        self.missions = missions
+        self.scenario, self.missions = scenario, missions
         self._working_directory = Path.cwd()  # may be deleted during the run
         self.console.quiet = self.errors.quiet = not show
         self._line_steps = max(1, scenario.mission.max_steps // PLAIN_LINES)
@@ -48,10 +46,8 @@ class MissionConsole(LiveDisplay):
         assert now.cell is not None
         assert now.rates is not None
         dock_m = float(world.dock_distance_m(self.scenario, np.asarray(now.cell), like=np.zeros(1)))
-        text = (
-            f"{now.collected}/{self.scenario.n_users} users, "
-            f"{now.rates.sum_rate_bps / 1e6:.2f} Mbit/s, {dock_m:.0f} m to the dock"
-        )
+        users, sum_rate_mbps = f"{now.collected}/{self.scenario.n_users} users", now.rates.sum_rate_bps / 1e6
+        text = f"{users}, {sum_rate_mbps:.2f} Mbit/s, {dock_m:.0f} m to the dock"
         if self._bar.disable:
             self.console.print(f"{title}: step {now.steps}/{self.scenario.mission.max_steps}: {text}")
         else:
@@ -80,8 +76,8 @@ class MissionConsole(LiveDisplay):
         """Print the missions as a table, and the bag's folder; wait until everything is written."""
         table = Table(box=None, pad_edge=False, header_style="bold")
         for name in ("seed", "outcome", "steps", "users", "data", "sum-rate", "flown", "reward"):
-            justify: JustifyMethod = "left" if name == "outcome" else "right"
-            table.add_column(name, justify=justify, no_wrap=True, overflow="fold")
+            table.add_column(name, justify="right", no_wrap=True, overflow="fold")
+        table.columns[1].justify = "left"
         for mission in summaries:
             missed = f" ({mission.steps_not_reached} not reached)" if mission.steps_not_reached else ""
             table.add_row(

@@ -114,9 +114,8 @@ class MissionMonitor(MissionNode):
         # The graph shows killed nodes for a while.
         restarted = self.rows if begun else [name for name, n in self.restarts_of.items() if n]
         absent = () if self.is_alone and self._other_run is None else self._local_nodes
-        found = other_publishers.find(
-            other_publishers.publishers(self), self.get_namespace(), self.rows, restarted, absent
-        )
+        publishers = other_publishers.publishers(self)
+        found = other_publishers.find(publishers, self.get_namespace(), self.rows, restarted, absent)
         if not begun and (found or self._other_run is not None):
             self._found_s = self._found_s or now_s
             if (found and self._other_run is not None) or now_s - self._found_s >= IDENTIFY_S:

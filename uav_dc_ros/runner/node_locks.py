@@ -35,8 +35,7 @@ def held(domain: int, nodes: Sequence[str], run: str) -> Iterator[None]:
                 of_run = f" (run {run})" if run else ""
                 raise AnotherMissionError(f"another mission is being flown here by {node}{of_run}")
             stack.enter_context(lock)
-            shown = _bound(f"{name}?run={run}") if run else None
-            if shown is not None:
+            if run and (shown := _bound(f"{name}?run={run}")) is not None:
                 stack.enter_context(shown)
         yield
 

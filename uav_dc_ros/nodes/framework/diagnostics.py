@@ -34,8 +34,8 @@ class MessageStatistics:
 
     def __init__(self) -> None:
         self.rejected: Counter[tuple[str, str]] = Counter()  # since the start, by topic and reason
+        self.published: Counter[str] = Counter()  # in this period, by topic
         self._received: Counter[str] = Counter()
-        self._published: Counter[str] = Counter()
         self._latencies_ns: dict[str, deque[tuple[int, int]]] = {}  # in the order of LATENCIES
         self._since_s = time.monotonic()
         self._cpu_s = time.process_time()
@@ -50,17 +50,13 @@ class MessageStatistics:
         latencies_ns = info["received_timestamp"] - published_ns, time.time_ns() - published_ns
         self._latencies_ns[topic].append(latencies_ns)
 
-    def count_published(self, topic: str) -> None:
-        """Count a message that was published."""
-        self._published[topic] += 1
-
     def report(self) -> tuple[bool, dict[str, str]]:
         """Whether messages were rejected since the last report, and the values. Begins a new period."""
         now_s, cpu_s = time.monotonic(), time.process_time()
         period_s = max(now_s - self._since_s, 1e-9)
         # Nodes that share a process report the same values for it.
         values = {"process id": str(os.getpid()), "cpu [%]": f"{100 * (cpu_s - self._cpu_s) / period_s:.1f}"}
-        for topic, count in self._published.items():
+        for topic, count in self.published.items():
             values[f"{topic} published [Hz]"] = f"{count / period_s:.1f}"
         for topic, count in self._received.items():
             values[f"{topic} received [Hz]"] = f"{count / period_s:.1f}"
@@ -75,7 +71,7 @@ class MessageStatistics:
         rejected = self.rejected.total()
         has_rejected, self._rejected_before = rejected > self._rejected_before, rejected
         self._since_s, self._cpu_s = now_s, cpu_s
-        for counts in (self._received, self._published):
+        for counts in (self._received, self.published):
             for topic in counts:
                 counts[topic] = 0
         return has_rejected, values

@@ -194,7 +194,7 @@ class MissionNode(ManagedNode):
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish a message, or its serialised form, on any topic."""
-        self.statistics.count_published(topic)
+        self.statistics.published[topic] += 1
         self.publishers_of[topic].publish(message)
 
     def reject(self, topic: str, error: MessageError) -> None:

@@ -32,8 +32,7 @@ def prepare(*, local_only: bool) -> None:
 
 def select_shared_memory() -> None:
     """Use shared memory for large messages, unless little of it is free."""
-    free_mb = fastdds.free_mb()
-    if is_small := free_mb < fastdds.RECOMMENDED_MB:
+    if is_small := (free_mb := fastdds.free_mb()) < fastdds.RECOMMENDED_MB:
         _note(
             f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "
             "travel over UDP alone"

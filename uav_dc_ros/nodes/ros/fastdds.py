@@ -12,8 +12,7 @@ from pathlib import Path
 # Jazzy's Fast DDS reads the first name, later ones the second.
 NAMES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
-RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-PEERS = "ROS_STATIC_PEERS"
+RANGE, PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
 RMW, DEFAULT_RMW = "RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"
 SHARED_MEMORY = Path("/dev/shm")
 RECOMMENDED_MB = 16  # for a dozen participants with their ports; SIGBUS ends a process once it is full

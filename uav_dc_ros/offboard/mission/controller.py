@@ -23,7 +23,7 @@ from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, Landing
 from uav_dc_ros.offboard.mission.preflight import Preflight, other_controller
 from uav_dc_ros.offboard.mission.progress import Cell, Checkpoint, MissionProgress
 from uav_dc_ros.offboard.mission.steps import StepControl
-from uav_dc_ros.offboard.mission.timers import CommandRetry, FaultTimer, Instant, PolicyTimeout
+from uav_dc_ros.offboard.mission.timeouts_and_retries import CommandRetry, FaultTimer, Instant, PolicyTimeout
 from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
 from uav_dc_ros.phases import FLYING, GROUND, OFFBOARD, POLICY_CONTROLLED, transition_error
 

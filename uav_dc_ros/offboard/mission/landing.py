@@ -7,7 +7,7 @@ from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
 from uav_dc_ros.offboard.mission.progress import MissionProgress
-from uav_dc_ros.offboard.mission.timers import ProgressTimer
+from uav_dc_ros.offboard.mission.timeouts_and_retries import ProgressTimer
 from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
 
 LANDING_MODES = (Mode.LAND, Mode.RETURN)

@@ -14,7 +14,7 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from uav_dc_ros import __version__, files
+from uav_dc_ros import __version__, cli, files
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.observations import Observation
@@ -57,21 +57,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
     add("--out", type=Path, required=True, metavar="DIR|FILE", help="new folder; for transitions a .npz file")
     add("--format", choices=get_args(Format), help="of tables (default: parquet, which needs pyarrow)")
-    add("--tables", type=_tables, metavar="NAME,...", help="which tables (default: all)")
+    add("--tables", type=cli.names("tables", among=ALL), metavar="NAME,...", help="default: all")
     add("--transitions", action="store_true", help="write transitions (s, a, r, s', terminated), no tables")
     add("--observation", choices=get_args(Observation), help="of transitions (default: mission)")
     add("--reward-form", choices=get_args(RewardForm), help="reward form instead of the scenario's")
     add("--reward-data", choices=get_args(RewardData), help="data in r^t instead of the scenario's")
     add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the mission, for a bag with several")
-
-
-def _tables(text: str) -> list[str]:
-    names = text.split(",")
-    for name in names:
-        if name not in ALL:
-            raise argparse.ArgumentTypeError(f"{name!r}; expected some of {', '.join(ALL)}")
-    return names
 
 
 def run(options: argparse.Namespace) -> int:

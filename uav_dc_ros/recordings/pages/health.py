@@ -210,8 +210,8 @@ class Health:
     def read(self, steps: Steps) -> None:
         """Read the bag once more, for message times and diagnostics; add messages that `steps` left out."""
         for (topic, reason), count in steps.rejected.items():
-            why = steps.rejected.first_error(topic, reason)
-            self._fault(self._reader.first_ns, topic, f"unreadable messages ({reason}): {count}: {why}")
+            why = f"unreadable messages ({reason}): {count}: {steps.rejected.first[topic, reason]}"
+            self._fault(self._reader.first_ns, topic, why)
         for topic, count in steps.orphans.items():
             self._fault(self._reader.first_ns, topic, f"messages too late for their step: {count}")
         ours = {f"{self._namespace}/{name}" for name in topics.TOPICS}

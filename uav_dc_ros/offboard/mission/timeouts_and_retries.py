@@ -1,4 +1,4 @@
-"""Timers of faults, policy, commands and progress. None of them reads a clock."""
+"""Timeouts of faults, policy and progress, and retries of commands. None of them reads a clock."""
 
 from typing import Literal, NamedTuple
 
