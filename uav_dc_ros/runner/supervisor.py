@@ -16,7 +16,6 @@ RESTART_WINDOW_S = 60.0  # the limit on restarts counts exits within this time
 BACK_OFF_S = 0.2  # before the first restart; doubles with each further one
 STARTUP_S = 25.0  # longest time without a report until all nodes of a process are active
 PASSED_MAX_S = 0.5  # between two checks of reports: run_all itself was suspended for the rest
-STOP_S = 10.0  # timeout for a process to end after SIGTERM: the bridge waits for its vehicle
 STOP_POLL_S = 0.002
 UP = ("unconfigured", "inactive", "active")  # states, in order
 TRANSITIONS = {"unconfigured": CONFIGURE, "inactive": ACTIVATE}
@@ -177,7 +176,7 @@ class Supervisor:
         self._on_note(f"{reason}; the mission goes on without it")
         if node.process is not None:
             node.process.terminate()
-            node.process.wait(time.monotonic() + STOP_S)
+            node.process.wait(time.monotonic() + node.row.stop_timeout_s)
         self.nodes.remove(node)
 
     def stop(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, int]:
@@ -187,12 +186,12 @@ class Supervisor:
         messages. The processes then end in parallel; `meanwhile` is called before their ends are waited for.
         """
         deadlines_s: dict[NodeProcess, float] = {}
-        running = {node.row.name: node.process for node in self.nodes if node.process is not None}
-        for rank in sorted({NODES[name].rank for name in running}, reverse=True):
-            group = {process for name, process in running.items() if NODES[name].rank == rank}
-            for process in group - deadlines_s.keys():
+        running = [(node.row, node.process) for node in self.nodes if node.process is not None]
+        for rank in sorted({row.rank for row, _ in running}, reverse=True):
+            group = {process: row.stop_timeout_s for row, process in running if row.rank == rank}
+            for process in group.keys() - deadlines_s.keys():
                 process.terminate()
-                deadlines_s[process] = time.monotonic() + STOP_S
+                deadlines_s[process] = time.monotonic() + group[process]
             for process in group:
                 while not process.is_finalized:
                     if time.monotonic() > deadlines_s[process]:

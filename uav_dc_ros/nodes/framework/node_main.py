@@ -232,8 +232,7 @@ def _spin(
             executor.spin(lambda: stop.is_pending)
             while stop.commands and not stop.requested:
                 reporter.execute(stop.commands.popleft())
-        quiet_s = max(node.drain_quiet_s if node.state == "active" else 0.0 for node in nodes)
-        if quiet_s:
+        if quiet_s := max(node.drain_quiet_s if node.state == "active" else 0.0 for node in nodes):
             deadline_s = time.monotonic() + DRAIN_S
             executor.spin(lambda: time.monotonic() > deadline_s, quiet_s)
     finally:

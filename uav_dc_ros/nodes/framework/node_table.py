@@ -25,6 +25,7 @@ class NodeRow:
     max_restarts: int = 3
     # An active node without a report for so long is restarted: no callback takes it on a busy computer.
     hang_timeout_s: float = 5.0
+    stop_timeout_s: float = 10.0  # for its process to end after SIGTERM: the bridge waits for its vehicle
     needed: bool = True  # the mission cannot fly without it (the bridge: only with a real vehicle)
     on_request: bool = False  # it starts only if the user requests it
     restart_parameters: Mapping[str, object] = field(default_factory=dict)  # that a restart adds
@@ -73,7 +74,8 @@ NODES: dict[str, NodeRow] = {
             ),
             keeps_all=True,
             rank=0,
-            hang_timeout_s=10.0,  # a slow disk blocks its callbacks
+            hang_timeout_s=10.0,  # a slow disk blocks its callbacks, ...
+            stop_timeout_s=60.0,  # ... and the end of its bag
             restart_parameters={"resume": True},
         ),
         NodeRow(
