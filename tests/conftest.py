@@ -18,6 +18,7 @@ from typing import IO, Any
 import hypothesis
 import pytest
 
+from uav_dc_ros import files
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.offboard.mission.controller import MissionController
 
@@ -40,6 +41,13 @@ hypothesis.settings.load_profile("patient")
 
 # A shell without job control, such as that of a script, ignores Ctrl-C for what it starts in the background.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure() -> None:
+    """Put the tests' folders in memory if there is room: beside other programs a disk takes seconds."""
+    memory = files.memory_folder()
+    if memory is not None and shutil.disk_usage(memory).free > 4e9:
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", memory)
 
 
 # Where the longest tests are, in this order: at the end, short files are left for the workers to share.
