@@ -124,8 +124,7 @@ class Steps:
         self.rejected = Unreadable()  # messages that cannot be decoded, by topic and reason
         self.orphans: Counter[str] = Counter()  # messages that came too late for their step, by topic
         self.repeated: Counter[str] = Counter()  # repeated messages, by topic; poses are not counted
-        self._reader = reader
-        self._step_ns = step_ns
+        self._reader, self._step_ns = reader, step_ns
         names = {f"{namespace}/{name}": name for name in STEP_TOPICS}
         self._topics = {full: name for full, name in names.items() if full in reader.topics}
         for full, name in self._topics.items():

@@ -109,8 +109,8 @@ class MissionRunner:
     def run(self) -> int:
         """Fly, in a ROS context of its own and without signal handlers; returns the command's exit status."""
         status = 0
-        memory = files.memory_folder()  # for the journals: a rename waits for a disk while others write much
-        with tempfile.TemporaryDirectory("", "uav_dc_ros_", memory) as temporary, ExitStack() as stack:
+        journals = tempfile.TemporaryDirectory("", "uav_dc_ros_", files.memory_folder())
+        with journals as temporary, ExitStack() as stack:
             folder = Path(temporary)
             network = Network(self.config.namespace, self._create_monitor)
             stack.callback(network.leave)

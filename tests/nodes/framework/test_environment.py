@@ -164,16 +164,18 @@ def test_both_profiles_have_the_same_settings() -> None:
 
 
 MISSIONS = """
-import os, subprocess, sys
+import glob, os, subprocess, sys
 run_all = [sys.executable, "-m", "uav_dc_ros.run_all", "--scenario", "three_clusters", "--no-record"]
 run_all += ["--nodes", "world,channel_monitor,policy"] * (sys.argv[1] == "nodes")
 def shared(): return sorted(n for n in os.listdir("/dev/shm") if "fast" in n)
 subprocess.run([*run_all, "--pace", "lockstep"], check=True, stdout=subprocess.DEVNULL)
 assert not shared(), ("after a mission", shared())
+assert not glob.glob("/dev/shm/uav_dc_ros_*")
 mission = subprocess.Popen([*run_all, "--pace", "1"], stdout=subprocess.PIPE, text=True)
 while "step 0/" not in mission.stdout.readline():
     assert mission.poll() is None
 assert not shared(), ("during a mission", shared())
+assert glob.glob("/dev/shm/uav_dc_ros_*/world"), "a disk holds the journals"
 sockets = open("/proc/net/udp").read().splitlines()[1:]
 print("local" if all(line.split()[1].startswith("0100007F:") for line in sockets) else "every interface")
 mission.kill()
@@ -182,7 +184,7 @@ mission.wait()
 
 
 @pytest.mark.parametrize(("nodes", "reach"), [("all", "local"), ("nodes", "every interface")])
-def test_missions_use_no_shared_memory_and_the_interfaces_of_their_range(
+def test_missions_use_udp_on_the_interfaces_of_their_range_and_journals_in_memory(
     ros: Ros, nodes: str, reach: str
 ) -> None:
     """In mount and network namespaces of its own: other tests use /dev/shm and sockets, too."""
@@ -193,5 +195,6 @@ def test_missions_use_no_shared_memory_and_the_interfaces_of_their_range(
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("no namespaces can be made here: it takes root and iproute2")
     del ros.environment[fastdds.RANGE]
+    ros.environment.pop("XDG_RUNTIME_DIR", None)
     status, output = finish(ros.start_command(*private, mount, "-", sys.executable, "-c", MISSIONS, nodes))
     assert (status, output.splitlines()[-1:]) == (0, [reach]), output

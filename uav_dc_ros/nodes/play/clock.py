@@ -16,8 +16,7 @@ class PlaybackClock:
     ) -> None:
         self.paused = paused
         self.limit_ns = 0  # log time of the next message, upper bound of the bag's time
-        self._now = now
-        self._rate = rate
+        self._now, self._rate = now, rate
         self._reference_ns, self._reference_s = 0, now()
 
     @property

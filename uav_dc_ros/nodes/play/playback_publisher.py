@@ -119,8 +119,7 @@ class SubscriberMonitor:
     """Queries the ROS graph for the peers of playback publishers."""
 
     def __init__(self, node: Node, publishers: Collection[PlaybackPublisher]) -> None:
-        self._node = node
-        self._publishers = publishers
+        self._node, self._publishers = node, publishers
         self._reported: set[tuple[str, str]] = set()
 
     def counts(self) -> dict[str, int]:

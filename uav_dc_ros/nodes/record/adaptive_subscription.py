@@ -31,9 +31,7 @@ class AdaptiveSubscription:
     """Subscribes to a recorded topic; passes each serialized message and its info to the callback."""
 
     def __init__(self, node: Node, name: str, type: str, callback: Callback) -> None:
-        self.name = name
-        self.type = type
-        self.callback = callback
+        self.name, self.type, self.callback = name, type, callback
         self.publishers = 0  # at the last scan of the graph
         self._node = node
         self._losses: dict[Any, EventCount] = {}  # by subscription; two while a new one takes over

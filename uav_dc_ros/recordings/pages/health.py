@@ -178,8 +178,7 @@ class Health:
     """State of the recorded system in a namespace."""
 
     def __init__(self, reader: BagReader, namespace: str) -> None:
-        self._reader = reader
-        self._namespace = namespace
+        self._reader, self._namespace = reader, namespace
         self._chain = {pair: Samples() for pair in CHAIN}
         self._topics: dict[str, _Topic] = {}
         self._nodes: dict[str, NodeHistory] = {}

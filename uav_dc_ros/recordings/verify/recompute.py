@@ -318,8 +318,7 @@ class DecisionCheck(Check):
     def __init__(self, scenario: Scenario, policy: Policy) -> None:
         super().__init__()
         policy.check(scenario)
-        self.policy = policy
-        self._scenario = scenario
+        self.policy, self._scenario = policy, scenario
 
     def add(self, step: RecordedStep) -> Array | None:
         """Recompute the decision of a step; the Q-values `[A]` if it differs."""
