@@ -85,6 +85,7 @@ def test_a_checkpoint_of_version_0_1_0_goes_on(path, worlds_in):
     old = msgspec.to_builtins(population)
     for reward in (old["scenario"]["reward"], *(one["reward"] for one in old["runs"])):
         assert reward.pop("data") == "so_far"
+    assert old["scenario"]["radio"].pop("model") == "free_space"
     checkpoint.save(path, training, {})
     edit(path, {"population": old}, {"world.mission_reward": None})
     again = Training(population, CPU, worlds_in)

@@ -375,9 +375,10 @@ def more_data(payload):
 
 
 def test_a_bag_of_version_0_1_0_verifies(tmp_path, capsys):
-    """Its scenario has no reading of the data in the reward, and the same fingerprint."""
+    """Its scenario has no reading of the data in the reward, no channel model, and the same fingerprint."""
     old = msgspec.to_builtins(TINY)
     assert old["reward"].pop("data") == "so_far"
+    assert old["radio"].pop("model") == "free_space"
     values = {"scenario_values": json.dumps(old)}
     status, out = verify(capsys, write(tmp_path / "bag", flight(TINY), about(TINY, **values)))
     assert (status, out.count("9 of 9 steps recomputed, equal to the last bit")) == (0, 2), out

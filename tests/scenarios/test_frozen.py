@@ -31,7 +31,7 @@ OTHER = {
 def neighbours(*tables):
     """The shipped world with one value changed, for each value of the tables."""
     for table in tables:
-        for key in VALUES[table]:
+        for key in VALUES[table].keys() - {"model"}:  # another model has other keys: see test_channel
             values = copy.deepcopy(VALUES)
             values[table][key] = OTHER[key] if key in OTHER else values[table][key] + 1
             yield f"{table}.{key}", from_values(values, "test")

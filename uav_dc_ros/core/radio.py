@@ -25,6 +25,15 @@ def distance(uav_m: Array, users_m: Array) -> Array:
     return xp.sqrt(dx * dx + dy * dy + dz * dz)
 
 
+def ground_distance(uav_m: Array, users_m: Array) -> Array:
+    """Horizontal distance `[..., U]`; arguments as in `distance`."""
+    xp = array_namespace(uav_m, users_m)
+    uav_m, users_m = _floating(xp, uav_m), _floating(xp, users_m)
+    dx = uav_m[..., 0:1] - users_m[..., 0]
+    dy = uav_m[..., 1:2] - users_m[..., 1]
+    return xp.sqrt(dx * dx + dy * dy)
+
+
 def ground_reach_m(distance_m: float, altitude_m: float) -> float:
     """Radius of the circle on the ground within a 3D distance of the UAV (eq. 1), metres; 0: out of range."""
     return math.sqrt(max(distance_m * distance_m - altitude_m * altitude_m, 0.0))

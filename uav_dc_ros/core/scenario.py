@@ -20,9 +20,9 @@ import numpy as np
 from msgspec import Meta
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.channel import AERIAL, AERIAL_MAX_HEIGHT_M, AerialVehicle, FreeSpace, Radio
 from uav_dc_ros.core.grid import Grid
 from uav_dc_ros.core.pace import TIME_MAX_S
-from uav_dc_ros.core.radio import Interference
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.errors import ScenarioError
 
@@ -63,27 +63,6 @@ class MissionSettings(_Table, frozen=True):
     episode_end: EpisodeEnd
 
 
-class RadioSettings(_Table, frozen=True):
-    """The uplink."""
-
-    bandwidth_hz: Positive  # bandwidth B, hertz
-    tx_power_w: Positive  # transmit power p of a user, watts
-    noise_power_dbm: Annotated[float, Meta(ge=-300, le=100)]  # noise power alpha^2, dBm
-    ref_gain_db: Annotated[float, Meta(ge=-200, le=100)]  # channel power gain beta_0 at 1 m, dB
-    path_loss_exponent: Annotated[float, Meta(ge=1, le=10)]  # exponent of the path loss
-    interference: Interference  # transmitting users, see `radio.sinr`
-
-    @property
-    def noise_power_w(self) -> float:
-        """Noise power, watts."""
-        return 10.0 ** (self.noise_power_dbm / 10.0) * 1e-3
-
-    @property
-    def ref_gain(self) -> float:
-        """Channel power gain at 1 m, linear."""
-        return 10.0 ** (self.ref_gain_db / 10.0)
-
-
 class RewardSettings(_Table, frozen=True):
     """The trade-off game."""
 
@@ -104,7 +83,7 @@ class Scenario(_Table, frozen=True, dict=True):
     grid: Grid
     users: UserSettings
     mission: MissionSettings
-    radio: RadioSettings
+    radio: Radio  # the uplink; `radio.model` names the struct, see `channel`
     reward: RewardSettings
 
     @property
@@ -165,6 +144,8 @@ class Scenario(_Table, frozen=True, dict=True):
         """
         world = msgspec.to_builtins(self)
         del world["reward"]
+        if isinstance(self.radio, FreeSpace):
+            del world["radio"]["model"]  # which scenarios of version 0.2.0 lack
         return hashlib.sha256(msgspec.json.encode(world, order="sorted")).hexdigest()[:12]
 
 
@@ -183,6 +164,7 @@ def parse(text: str, source: str) -> Scenario:
 
 def from_values(values: dict[str, Any], source: str) -> Scenario:
     """A scenario from plain values, as TOML or JSON hold them; see `parse`."""
+    values = with_radio_model(values)
     _check_keys(values, Scenario, source)
     try:
         scenario = msgspec.convert(values, Scenario)
@@ -197,11 +179,18 @@ def from_values(values: dict[str, Any], source: str) -> Scenario:
     return scenario
 
 
+def with_radio_model(values: Any) -> Any:
+    """Plain values of a scenario with `radio.model`; those of version 0.2.0 lack it: free space."""
+    if isinstance(values, dict) and isinstance(radio := values.get("radio"), dict):
+        return values | {"radio": {"model": FreeSpace.__struct_config__.tag, **radio}}
+    return values
+
+
 def _check_keys(values: Any, struct: type, source: str, table: str = "") -> None:
     """Reject unknown keys before anything else: a typo is the likeliest mistake."""
     if not isinstance(values, dict):
         return
-    known = get_type_hints(struct)
+    known = _keys(struct)
     for key, value in values.items():
         # Quoted as in TOML when it is no bare key.
         name = table + (key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key))
@@ -209,12 +198,29 @@ def _check_keys(values: Any, struct: type, source: str, table: str = "") -> None
             close = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
             raise ScenarioError(f"{source}: unknown key {name} = {reprlib.repr(value)}; {hint}")
-        if _is_table(known[key]):
-            _check_keys(value, known[key], source, f"{key}.")
+        if (inner := _table(known[key], value)) is not None:
+            _check_keys(value, inner, source, f"{key}.")
 
 
-def _is_table(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+def _keys(struct: type) -> dict[str, Any]:
+    """Keys of a table and their types; `model` comes first, where there are several."""
+    tag_field = struct.__struct_config__.tag_field  # type: ignore[attr-defined]
+    return ({tag_field: str} if tag_field else {}) | get_type_hints(struct)
+
+
+def _tables(kind: Any) -> list[type[msgspec.Struct]]:
+    """The tables that a key of this type may hold."""
+    kinds = get_args(kind) or (kind,)
+    return [one for one in kinds if isinstance(one, type) and issubclass(one, msgspec.Struct)]
+
+
+def _table(kind: Any, values: Any) -> type[msgspec.Struct] | None:
+    """The table of these values; of several, that of their model. None: there is none."""
+    tables = _tables(kind)
+    if len(tables) > 1:
+        model = values.get("model") if isinstance(values, dict) else None
+        tables = [one for one in tables if one.__struct_config__.tag == model]
+    return tables[0] if tables else None
 
 
 def _explain(message: str, values: Any) -> str:
@@ -222,17 +228,22 @@ def _explain(message: str, values: Any) -> str:
     expected, _, path = message.partition(" - at `$.")
     path = path.removesuffix("`")
     kind: Any = Scenario
+    outer: Any = None
     for key in re.findall(r"\w+", path):
         if key.isdecimal():
             values = values[int(key)]
         else:
-            kind, values = get_type_hints(kind)[key], values[key]
+            table = _table(kind, values)
+            outer, kind, values = kind, _keys(table)[key] if table else str, values[key]
     if missing := re.fullmatch(r"Object missing required field `(.+)`", expected):
         key = f"{path}.{missing[1]}" if path else missing[1]
-        kind = get_type_hints(kind)[missing[1]]
-        return f"missing {'table' if _is_table(kind) else 'key'} {key}"
+        table = _table(kind, values)
+        is_table = table is not None and _tables(_keys(table)[missing[1]])
+        return f"missing {'table' if is_table else 'key'} {key}"
     if expected.startswith("Invalid enum value"):
         expected = f"one of {', '.join(get_args(kind))}"
+    elif expected.startswith("Invalid value"):  # the model
+        expected = f"one of {', '.join(str(one.__struct_config__.tag) for one in _tables(outer))}"
     elif "matching regex" in expected:
         expected = _NAME_IN_WORDS  # the only pattern of a scenario
     elif expected == "Number out of range":
@@ -292,6 +303,31 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
                 f"users.cluster_centres_m[{i}] = {list(centre_m)}: its disc is {distance_m:.1f} m from the "
                 f"nearest cell; expected at most mission.d_cons_m = {mission.d_cons_m:g}, or its users are "
                 "out of reach"
+            )
+    if isinstance(scenario.radio, AerialVehicle):
+        yield from _out_of_range(scenario, scenario.radio.environment, top_m)
+
+
+def _out_of_range(scenario: Scenario, environment: str, top_m: float) -> Iterator[str]:
+    """Errors of a grid outside the heights and distances of an environment of TR 36.777."""
+    grid, users = scenario.grid, scenario.users
+    aerial = AERIAL[environment]
+    if grid.altitude_min_m <= aerial.min_height_m or top_m > AERIAL_MAX_HEIGHT_M:
+        yield (
+            f"grid: altitudes {grid.altitude_min_m:g} to {top_m:g} m; expected above "
+            f"{aerial.min_height_m:g} and up to {AERIAL_MAX_HEIGHT_M:g} m, the range of "
+            f"radio.environment = {environment!r}"
+        )
+    corners_m = [
+        (x * (grid.n_x - 1) * grid.cell_m, y * (grid.n_y - 1) * grid.cell_m) for x in (0, 1) for y in (0, 1)
+    ]
+    for i, centre_m in enumerate(users.cluster_centres_m):
+        distance_m = max(math.dist(centre_m, corner_m) for corner_m in corners_m) + users.cluster_radius_m
+        if distance_m > aerial.max_ground_distance_m:
+            yield (
+                f"users.cluster_centres_m[{i}] = {list(centre_m)}: its disc reaches {distance_m:.0f} m from "
+                f"a corner of the grid; expected at most {aerial.max_ground_distance_m:g} m, the range of "
+                f"radio.environment = {environment!r}"
             )
 
 

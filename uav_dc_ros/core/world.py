@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import TypeAlias
 
-from uav_dc_ros.core import mission, mobility, observations, radio, reward
+from uav_dc_ros.core import channel, mission, mobility, observations, radio, reward
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import Rewards
@@ -76,7 +76,7 @@ def measure(scenario: Scenario, uav_m: Array, users_m: Array, collected: Array) 
     values = scenario.radio
     distance_m = radio.distance(uav_m, users_m)
     served = mission.served(distance_m, collected, scenario.mission.d_cons_m)
-    gain = radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent)
+    gain = channel.path_gain(values, uav_m, users_m, distance_m)
     sinr = radio.sinr(gain, values.tx_power_w, values.noise_power_w, values.interference, served)
     rate_bps = radio.rate_bps(sinr, values.bandwidth_hz)
     return Link(sinr=sinr, rate_bps=rate_bps, served=served, sum_rate_bps=mission.sum_rate(served, rate_bps))

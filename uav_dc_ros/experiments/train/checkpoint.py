@@ -8,7 +8,7 @@ import safetensors.torch
 from safetensors import SafetensorError, safe_open
 
 from uav_dc_ros import files
-from uav_dc_ros.core.scenario import leaves
+from uav_dc_ros.core.scenario import leaves, with_radio_model
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train.population import Population
 from uav_dc_ros.experiments.train.training import Training
@@ -48,6 +48,7 @@ def restore(path: Path, training: Training) -> dict[str, Any]:
         if values["format"] != _FORMAT:
             raise TrainingError(f"{path}: format is {values['format']}; expected {_FORMAT}")
         # Converted, it has the defaults of keys that it was saved without.
+        values["population"]["scenario"] = with_radio_model(values["population"]["scenario"])
         saved = dict(leaves(msgspec.to_builtins(msgspec.convert(values["population"], Population))))
         expected = dict(leaves(msgspec.to_builtins(training.population)))
         for key in expected | saved:
