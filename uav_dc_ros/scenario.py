@@ -59,11 +59,14 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _description(scenario: "Scenario") -> str:
+    from uav_dc_ros.core import channel
+
     grid, mission = scenario.grid, scenario.mission
     return (
         f"{scenario.n_users} users in {scenario.n_clusters} clusters, "
         f"{grid.n_x} x {grid.n_y} x {grid.n_z} cells of {grid.cell_m:g} m, "
-        f"{mission.max_steps} steps of {mission.step_s:g} s, fingerprint {scenario.fingerprint}"
+        f"{mission.max_steps} steps of {mission.step_s:g} s, channel {channel.title(scenario.radio)}, "
+        f"fingerprint {scenario.fingerprint}"
     )
 
 

@@ -1,6 +1,9 @@
 """The channel models against their sources: written a second time here, and numbers of the sources."""
 
 import math
+import re
+import tomllib
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -211,6 +214,17 @@ def test_the_two_means_differ_as_a_mean_of_logarithms_does():
         for one in ("mean_gain", "mean_loss_db")
     ]
     assert certain[0] == pytest.approx(certain[1], rel=1e-12)
+
+
+def test_the_manual_s_table_is_the_code_s():
+    text = (Path(__file__).parents[2] / "docs" / "channels.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.MULTILINE)
+    assert {name: tuple(map(float, numbers)) for name, *numbers in rows} == channel.ENVIRONMENTS
+    (example,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    values = msgspec.to_builtins(scenarios.load("three_clusters"))
+    scenario = from_values(values | tomllib.loads(example), "docs")
+    assert channel.title(scenario.radio) == "air_to_ground, urban, 2 GHz"
+    assert channel.title(scenarios.load("three_clusters").radio) == "free_space"
 
 
 # The world with them.

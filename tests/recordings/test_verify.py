@@ -18,6 +18,7 @@ from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, files, messages, payloads, scenarios
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import world
+from uav_dc_ros.core.scenario import from_values
 from uav_dc_ros.messages import Phase
 
 TINY = tiny()
@@ -382,6 +383,27 @@ def test_a_bag_of_version_0_1_0_verifies(tmp_path, capsys):
     values = {"scenario_values": json.dumps(old)}
     status, out = verify(capsys, write(tmp_path / "bag", flight(TINY), about(TINY, **values)))
     assert (status, out.count("9 of 9 steps recomputed, equal to the last bit")) == (0, 2), out
+
+
+def test_a_bag_holds_its_channel_model(tmp_path, capsys):
+    radio = {"carrier_hz": 2e9, "environment": "umi_av", "line_of_sight": "mean_gain"}
+    values = msgspec.to_builtins(TINY)
+    kept = {
+        key: values["radio"][key] for key in ("bandwidth_hz", "tx_power_w", "noise_power_dbm", "interference")
+    }
+    scenario = from_values(values | {"radio": kept | radio | {"model": "tr_36_777"}}, "aerial")
+    recorded = flight(scenario)
+    status, out = verify(capsys, write(tmp_path / "bag", recorded, about(scenario)))
+    assert (status, out.count("9 of 9 steps recomputed, equal to the last bit")) == (0, 2), out
+    other = json.dumps(
+        msgspec.to_builtins(
+            from_values(
+                values | {"radio": kept | radio | {"model": "air_to_ground", "environment": "urban"}}, "other"
+            )
+        )
+    )
+    status, out = verify(capsys, write(tmp_path / "other", recorded, about(scenario, scenario_values=other)))
+    assert (status, "step 0, user 0, sinr: recorded" in out) == (1, True), out
 
 
 def test_a_recording_that_begins_late_two_flights_and_an_abort(tmp_path, capsys):

@@ -129,6 +129,14 @@ class Sight(NamedTuple):
     nlos_db: Array  # path loss without
 
 
+def title(values: Radio) -> str:
+    """The channel in words: `free_space`, or `air_to_ground, urban, 2 GHz`."""
+    model = str(values.__struct_config__.tag)
+    if isinstance(values, FreeSpace):
+        return model
+    return f"{model}, {values.environment}, {values.carrier_hz / 1e9:g} GHz"
+
+
 def path_gain(values: Radio, uav_m: Array, users_m: Array, distance_m: Array) -> Array:
     """Channel power gain, linear, `[..., U]`.
 

@@ -312,7 +312,7 @@ open(async (page, data) => {
 
   function footer() {
     const about = Object.entries(data.about).map(([name, text]) => `${name} ${text}`).join(" · ");
-    return `${about ? `${about} · ` : ""}world ${world.fingerprint} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`;
+    return `${about ? `${about} · ` : ""}world ${world.fingerprint} · channel ${world.channel} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`;
   }
 
   await loadPlotly();

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from uav_dc_ros.core import radio, reward
+from uav_dc_ros.core import channel, radio, reward
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 
@@ -61,6 +61,7 @@ def world_data(scenario: Scenario) -> dict[str, Any]:
         "reward_words": reward.MISSION_REWARD[scenario.reward.data],
         "name": scenario.name,
         "fingerprint": scenario.fingerprint,
+        "channel": channel.title(scenario.radio),
         "users": scenario.n_users,
         "clusters": scenario.users.cluster_centres_m,
         "cluster_radius_m": scenario.users.cluster_radius_m,
