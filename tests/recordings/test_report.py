@@ -294,7 +294,8 @@ def test_a_comparison_pairs_equal_seeds(tmp_path, capsys):
     collected = [int(state.collected.sum()) for state in ends]
     interval = groups[0]["metrics"]["users_collected"]
     assert interval["mean"] == pytest.approx(np.mean(collected))
-    assert min(collected) <= interval["low"] <= interval["mean"] <= interval["high"] <= max(collected)
+    assert interval["low"] <= interval["mean"] <= interval["high"]
+    assert 0.0 <= groups[0]["metrics"]["landed"]["low"] <= groups[0]["metrics"]["landed"]["high"] <= 1.0
     curve = groups[0]["curves"]["n_collected"]
     assert len(curve["mean"]) == 21
     assert curve["mean"][-1] == pytest.approx(np.mean(collected), rel=1e-3)

@@ -119,7 +119,7 @@ def evaluate_act(
         seeds=(seeds[0], len(seeds)),
         users_total=scenario.n_users,
         reward_data=scenario.reward.data,
-        **{figure: _figure(of_missions) for figure, of_missions in values.items()},
+        **{figure: _figure(of_missions, _RANGES.get(figure)) for figure, of_missions in values.items()},
     )
     return EvaluatedMissions(evaluation=evaluation, values=values)
 
@@ -137,12 +137,18 @@ def compare(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> Compar
     )
 
 
-def _figure(values: Array) -> Figure:
+_RANGES = {"landing_rate": (0.0, 1.0)}  # of possible values; the interval ends there
+
+
+def _figure(values: Array, possible: tuple[float, float] | None = None) -> Figure:
     known = values[np.isfinite(values)]
     if not known.size:
         return Figure(n=0)
-    mean, low, high = interval(known) if known.size > 1 else (float(known[0]), None, None)
-    return Figure(n=known.size, mean=mean, low=low, high=high, min=float(known.min()), max=float(known.max()))
+    extremes = {"min": float(known.min()), "max": float(known.max())}
+    if known.size == 1:
+        return Figure(n=1, mean=float(known[0]), **extremes)
+    found = interval(known)
+    return Figure(n=known.size, **(found.within(*possible) if possible else found)._asdict(), **extremes)
 
 
 # Of each figure: title, what to divide by, decimals.

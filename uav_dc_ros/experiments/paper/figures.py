@@ -13,9 +13,8 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 
 from uav_dc_ros import files
-from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import MISSION_REWARD
-from uav_dc_ros.core.stats import interval
+from uav_dc_ros.core.stats import band, interval
 from uav_dc_ros.env.render import FAINT, INK, PAPER, PATH_COLOURS, picture
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
@@ -118,7 +117,7 @@ def _curves(axes: Axes, panel: Panel, evidence: Evidence) -> None:
     title, unit = _axis(panel.metric, panel, evidence)
     lines = panel.lines(evidence.scale)
     for line, look in zip(lines, _looks(lines, panel.vary), strict=True):
-        mean, low, high = _bands(smooth(evidence.curves(panel.metric, line)) / unit)
+        mean, low, high = band(smooth(evidence.curves(panel.metric, line)) / unit)
         axes.plot(episode, mean, **look | {"marker": ""})
         axes.fill_between(episode, low, high, color=look["color"], alpha=0.13, lw=0)
     axes.set_xlim(0, episode[-1])
@@ -131,7 +130,7 @@ def _ratios(axes: Axes, panel: Panel, evidence: Evidence) -> None:
     title, unit = _axis(metric, panel, evidence)
     ratios, lines = evidence.scale.ratios, panel.lines(evidence.scale)
     for i, (line, look) in enumerate(zip(lines, _looks(lines, panel.vary), strict=True)):
-        mean, low, high = _bands(evidence.of(metric, line, "ratio") / unit)
+        mean, low, high = band(evidence.of(metric, line, "ratio") / unit)
         # Side by side, so that no bar hides another.
         x = np.arange(len(ratios)) + 0.09 * (i - (len(lines) - 1) / 2)
         bars = np.stack([mean - low, high - mean])
@@ -285,9 +284,3 @@ def _facts(plan: FigurePlan, scale: Scale) -> str:
     if any(panel.kind != "curves" for panel in plan.panels):
         marks += "; levels: last fifth of the training"
     return marks
-
-
-def _bands(values: Array) -> tuple[Array, Array, Array]:
-    """Mean of each column of `[E, P]`, and its interval, each `[P]`."""
-    mean, low, high = np.array([interval(column) for column in values.T]).T
-    return mean, low, high

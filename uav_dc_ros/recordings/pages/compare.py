@@ -71,11 +71,19 @@ class Group:
             "users": self.scenario.n_users,
             "missions": len(self.summaries),
             "seeds": self._seeds(),
-            "metrics": {name: _interval([it[name] for it in self.summaries]) for name in METRICS},
+            "metrics": {name: self._metric(name) for name in METRICS},
             "paired": None if self is first else self._paired(first),
             "curves": {name: self._band(name, axis) for name in CURVES},
             "paths": self.paths,
         }
+
+    def _metric(self, name: str) -> dict[str, float | None]:
+        """Mean and 95% interval; None of one mission."""
+        values = np.asarray([it[name] for it in self.summaries], np.float64)
+        if len(values) < 2:
+            return {"mean": float(values.mean()), "low": None, "high": None}
+        found = stats.interval(values)
+        return (found.within(0.0, 1.0) if name == "landed" else found)._asdict()
 
     def _by_seed(self) -> dict[int, dict[str, Any]]:
         return {summary["seed"]: summary for summary in self.summaries if summary["seed"] is not None}
@@ -96,7 +104,7 @@ class Group:
         if len(common) < 2:
             return None
         differences = {
-            metric: _interval([mine[seed][metric] - theirs[seed][metric] for seed in common])
+            metric: stats.interval([mine[seed][metric] - theirs[seed][metric] for seed in common])._asdict()
             for metric in METRICS
         }
         return {"seeds": len(common), "differences": differences}
@@ -174,14 +182,6 @@ def no_step(bag: Path, missions: list[int] | None, recorded: step_reader.Steps) 
     wanted = "" if missions is None else f" {', '.join(map(str, missions))}"
     why = "; ".join(recorded.rejected.lines())
     return f"bag {bag} holds no step of a mission{wanted}{why and f': {why}'}"
-
-
-def _interval(values: list[float]) -> dict[str, float | None]:
-    """Mean and 95% interval; None of one value."""
-    array = np.asarray(values, np.float64)
-    if len(array) < 2:
-        return {"mean": float(array.mean()), "low": None, "high": None}
-    return stats.interval(array)._asdict()
 
 
 def _filled(values: list[float | None]) -> Array:
