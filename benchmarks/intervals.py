@@ -101,9 +101,7 @@ def bca(values: np.ndarray, statistic: Statistic) -> tuple[np.ndarray, np.ndarra
     ends = []
     for z in (bias - QUANTILE, bias + QUANTILE):
         levels = CDF(bias + z / (1 - acceleration * z))
-        ends.append(
-            np.array([np.quantile(one, level) for one, level in zip(found.T, levels, strict=True)])
-        )
+        ends.append(np.array([np.quantile(one, level) for one, level in zip(found.T, levels, strict=True)]))
     return ends[0], ends[1]
 
 

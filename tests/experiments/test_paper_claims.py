@@ -76,7 +76,7 @@ def rates(s, reward_of, tau_of, jitter_of):
 
 # What each setting reaches in a world in which the claim is true.
 TRUE = {
-    "C1": lambda s: {"greedy_users_collected": 39.0},
+    "C1": lambda s: {"greedy_users_collected": 37.0},
     "C2": lambda s: reward(s, 1 + 0.1 * exponential(s)) | {"tau": 20 if exponential(s) else 60},
     "C3": lambda s: reward(s, 1 + 0.1 * exponential(s), 1 + 0.1 * dueling(s)),
     "C4": lambda s: reward(s, 1 + 0.1 * episode(s)),
@@ -174,9 +174,9 @@ def test_every_claim_is_tried_both_ways():
 
 @pytest.mark.parametrize("claim", ["C1", "C4", "C9", "C12", "C13", "C15", "C17", "C18"])
 def test_environments_that_disagree_decide_nothing(claim):
-    """True in three environments, and its opposite in two by as much."""
+    """True in six environments, and its opposite in four by as much."""
     good, flat = sweep(TRUE[claim]), sweep()
-    turned = [i for i, run in enumerate(good.planned) if run.environment in (1, 3)]
+    turned = [i for i, run in enumerate(good.planned) if run.environment in (1, 3, 6, 8)]
     for name, values in good.curves.items():
         values[turned] = 2 * flat.curves[name][turned] - values[turned]
     for name, values in good.greedy.items():
@@ -239,7 +239,7 @@ def test_convergence_is_where_a_curve_gets_to_its_level_and_stays():
 def test_the_reward_with_the_binary_r_plus_is_found_from_throughput_and_landing():
     results = sweep(lambda s: {"throughput_bps": 3e5, "landing_rate": 0.5})
     setting = Setting(beta=2, zeta=1)
-    here = 1 + 0.02 * np.arange(5)
+    here = 1 + 0.02 * np.arange(10)
     rise = 0.2 + 0.8 * (1 - np.exp(-(results.episode[-8:] - results.episode[0]) / 40)).mean()
     expected = (2 * 3e-6 * 3e5 + 0.5) / 3 * here * rise
     np.testing.assert_allclose(Evidence(results).of("common_share", setting), expected, rtol=1e-5)

@@ -128,6 +128,7 @@ def _alive(group):
         (["--out", "/proc/nowhere"], "/proc/nowhere cannot be made: "),
         (["--out", "."], ". exists; expected a new folder, or --resume"),
         (["--workers", "0"], "'0'; expected a whole number of at least 1"),
+        (["--block", "100"], "argument --block: '100'; expected a block, 0 to 99"),
         (["--scale", "large"], "invalid choice: 'large'"),
         (["--ray", "127.0.0.1:1"], "--ray 127.0.0.1:1: no cluster answers: Connection refused"),
         (["--ray", "nonsense:port"], "expected HOST:PORT, ray://HOST:PORT or auto"),
@@ -160,14 +161,23 @@ def test_half_a_sweep_is_resumed_with_its_own_options_only(tmp_path, monkeypatch
         cli.main(["--scale", "smoke", "--only", "lr", "batch"])
     assert ended.value.code == 130
     capsys.readouterr()
+    with pytest.raises(SystemExit):
+        cli.main(["--scale", "smoke", "--block", "1", "--only", "lr", "batch", "--resume"])
+    assert 'is half of a sweep with {"scale":"smoke","block":0,' in capsys.readouterr().err
     with pytest.raises(SystemExit) as ended:
         cli.main(["--scale", "smoke", "--only", "lr", "--resume"])
     assert ended.value.code == 2
-    assert 'is half of a sweep with {"scale":"smoke","only":["batch","lr"]}' in capsys.readouterr().err
+    assert (
+        'is half of a sweep with {"scale":"smoke","block":0,"only":["batch","lr"]}' in capsys.readouterr().err
+    )
     assert kept.is_file()
 
 
 def test_results_of_other_runs_are_not_drawn_as_these(smoke, capsys):
     with pytest.raises(SystemExit):
         cli.main(["--scale", "full", "--only", "lr", "--out", str(smoke), "--resume"])
-    assert "has the scale 'smoke' and is finished; expected 'full'" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "has the scale 'smoke', block 0, and is finished; expected 'full', block 0" in error
+    with pytest.raises(SystemExit):
+        cli.main(["--scale", "smoke", "--block", "1", "--only", "lr", "--out", str(smoke), "--resume"])
+    assert "block 0, and is finished; expected 'smoke', block 1" in capsys.readouterr().err

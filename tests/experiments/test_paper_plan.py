@@ -12,12 +12,15 @@ from uav_dc_ros.experiments.paper.setting import (
     ALGORITHMS,
     FORMS,
     FULL,
+    MAX_BLOCK,
     R_PLUS,
     RATIOS,
     SCALES,
     SMOKE,
     Setting,
 )
+from uav_dc_ros.experiments.paper.sweep import make_shards
+from uav_dc_ros.experiments.train.training import VALIDATION_SEEDS
 
 EVERYTHING = list(product(("three_clusters", "five_clusters"), ALGORITHMS, R_PLUS, FORMS, RATIOS))
 
@@ -30,7 +33,7 @@ def test_no_run_is_trained_twice_and_the_order_is_always_the_same(scale):
     assert runs(scale, ["lr", "Traj"]) == runs(scale, ["Traj", "lr"])
 
 
-def test_the_full_sweep_has_every_combination_in_five_environments():
+def test_the_full_sweep_has_every_combination_in_ten_environments_once():
     planned = runs(FULL)
     assert len(EVERYTHING) == 112
     for scenario, algorithm, r_plus, form, (beta, zeta) in EVERYTHING:
@@ -38,7 +41,7 @@ def test_the_full_sweep_has_every_combination_in_five_environments():
             scenario=scenario, algorithm=algorithm, r_plus=r_plus, form=form, beta=beta, zeta=zeta
         )
         found = [(run.environment, run.repeat) for run in planned if run.setting == wanted]
-        assert found == list(product(range(5), range(FULL.repeats))), wanted
+        assert found == list(product(range(10), [0])), wanted
 
 
 def test_runs_of_one_environment_and_repeat_share_their_seed_and_no_others():
@@ -47,6 +50,25 @@ def test_runs_of_one_environment_and_repeat_share_their_seed_and_no_others():
         seeds.setdefault((run.environment, run.repeat), set()).add(run.run(FULL).seed)
     assert all(len(of_pair) == 1 for of_pair in seeds.values())
     assert len(set.union(*seeds.values())) == len(seeds)
+
+
+def test_blocks_have_environments_seeds_and_greedy_missions_of_their_own():
+    """And none of those that train, validate or evaluate policies."""
+    used = set(range(1000)) | set(VALIDATION_SEEDS)
+    missions = set(VALIDATION_SEEDS)
+    for block in (1, 2, MAX_BLOCK):
+        scale = FULL.in_block(block)
+        planned = runs(scale)
+        assert [run.setting for run in planned] == [run.setting for run in runs(FULL)]
+        assert scale.environments == tuple(10_000 * block + e for e in range(10))
+        own = {run.environment for run in planned} | {run.seed for run in planned}
+        assert not own & used
+        used |= own
+        (shard, _), *_ = make_shards(planned[:1], scale)
+        first, count = shard.greedy_seeds
+        assert not set(range(first, first + count)) & missions
+        missions |= set(range(first, first + count))
+    assert FULL.in_block(0) == FULL
 
 
 def test_a_run_is_what_its_setting_says():

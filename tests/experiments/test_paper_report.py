@@ -23,7 +23,8 @@ def test_it_says_where_it_comes_from(text):
     for fact in (
         "a test",
         f"{FULL.repeats} run(s)",
-        "0, 1, 2, 3, 4",
+        "block 0, ",
+        "environments 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, in each",
         f"{FULL.episodes} episodes",
         "fcb46aa8fbbf",
     ):
@@ -46,6 +47,35 @@ def test_it_names_the_reward_that_it_compares(data):
     titles = re.findall(r"^\*\*Reward .*\*\*$|(?<=\| )[^|]*\breward\b[^|]*(?= \|.*\n\|---)", text, re.M)
     assert len(titles) > 10
     assert all(words in title for title in titles), titles
+
+
+def test_it_shows_what_changes_with_the_papers_five_environments(tmp_path):
+    """C9 is true in the first five environments, and its opposite in the others by as much."""
+
+    def between(setting, environment):
+        return 0.1 * (setting.form == "episode") * (1 if environment < 5 else -1)
+
+    results = sweep(scale=msgspec.structs.replace(SMOKE, environments=tuple(range(10))), between=between)
+    write(results, [], tmp_path, only=["lr"])
+    text = (tmp_path / CLAIMS_FILE).read_text("utf-8")
+    assert re.search(r"^\| \[C9\].* \| \*\*undecided\*\* \| .* \| holds \|$", text, re.M)
+    assert re.search(
+        r"^In the first five environments alone, .* The verdicts on .*\bC9\b.* differ\.$", text, re.M
+    )
+    assert re.search(r"^\| episode above immediate; .* \| undecided \| 0\.\d.* share: holds \|$", text, re.M)
+    five = check(results.in_first(5))
+    assert all(one.of_five is None for one in five)
+    kept = msgspec.json.decode((tmp_path / VERDICTS_FILE).read_bytes())
+    assert [one["verdict_of_five"] for one in kept] == [one.verdict for one in five]
+    (part,) = kept[8]["parts"]
+    assert part["of_five"]["effect"] == five[8].criteria[0].effect._asdict()
+    assert "with the paper's five" not in claims_md(results.in_first(5), five, [])
+
+
+@pytest.mark.parametrize(("block", "words"), [(0, "had a part in choosing"), (1, "no choice has seen")])
+def test_it_names_the_block(block, words):
+    results = sweep(scale=SMOKE.in_block(block))
+    assert re.search(rf"; block {block}, .* {words}", claims_md(results, check(results), []))
 
 
 def test_every_claim_has_its_row_and_its_section(text):
@@ -100,4 +130,4 @@ def test_what_was_not_measured_is_not_judged():
     )
     written = claims_md(some, check(some), [])
     assert "16 were not tested." in written
-    assert re.search(r"^\| \[C1\]\(#c1\) .* \| \*\*not tested\*\* \| \|$", written, re.M)
+    assert re.search(r"^\| \[C1\]\(#c1\) .* \| \*\*not tested\*\* \|  \|$", written, re.M)

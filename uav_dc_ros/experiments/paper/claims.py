@@ -6,6 +6,7 @@ from uav_dc_ros.experiments.paper import claims_learning, claims_reward, claims_
 from uav_dc_ros.experiments.paper.criteria import Claim, Criterion, Verdict, joint
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.results import Results
+from uav_dc_ros.experiments.paper.setting import PAPER_ENVIRONMENTS
 
 CLAIMS = (*claims_reward.CLAIMS, *claims_throughput.CLAIMS, *claims_learning.CLAIMS)
 
@@ -16,6 +17,8 @@ class Finding(NamedTuple):
     claim: Claim
     verdict: Verdict
     criteria: tuple[Criterion, ...]
+    # In the first five environments alone, as many as the paper has; None without further ones.
+    of_five: "Finding | None" = None
 
     @property
     def decisive(self) -> Criterion | None:
@@ -26,7 +29,11 @@ class Finding(NamedTuple):
 def check(results: Results) -> list[Finding]:
     """Tests every claim against the results, in the order of `CLAIMS`."""
     evidence = Evidence(results)
-    return [finding(claim, evidence) for claim in CLAIMS]
+    findings = [finding(claim, evidence) for claim in CLAIMS]
+    if len(evidence.scale.environments) <= PAPER_ENVIRONMENTS:
+        return findings
+    five = Evidence(results.in_first(PAPER_ENVIRONMENTS))
+    return [one._replace(of_five=finding(one.claim, five)) for one in findings]
 
 
 def finding(claim: Claim, evidence: Evidence) -> Finding:

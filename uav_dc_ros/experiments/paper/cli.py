@@ -19,7 +19,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainin
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.errors import FROM_TRAIN, TrainingError
-from uav_dc_ros.experiments.paper.setting import SCALES, PlannedRun
+from uav_dc_ros.experiments.paper.setting import MAX_BLOCK, SCALES, PlannedRun, Scale
 from uav_dc_ros.experiments.paper.shards import Shard, result_file
 from uav_dc_ros.experiments.paper.workers import train_locally, train_on_ray
 from uav_dc_ros.experiments.train.progress import ProgressBar
@@ -44,6 +44,9 @@ def main(argv: list[str] | None = None) -> None:
     )
     add = parser.add_argument
     add("--scale", default="full", choices=list(SCALES), help="smoke checks in a minute that all of it runs")
+    block = cli.whole_number(0, MAX_BLOCK, f"a block, 0 to {MAX_BLOCK}")
+    text = "environments and seeds: 0 those of all choices so far, 1 and above fresh ones, to confirm"
+    add("--block", default=0, type=block, metavar="B", help=text)
     add("--only", nargs="+", metavar="FIGURE", help="these figures, and the claims that they can decide")
     add("--out", type=Path, metavar="DIR", default=Path("paper_results"), help="folder to make")
     add("--resume", action="store_true", help="resume the sweep in --out, or draw a finished one again")
@@ -60,17 +63,20 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         raise TrainingError(f"{error.name} {FROM_TRAIN}") from None
     if find_spec("torch") is None:  # the workers need it
         raise TrainingError(f"torch {FROM_TRAIN}")
-    scale, out = SCALES[options.scale], options.out
+    scale, out = _scale(options), options.out
     planned = plan.runs(scale, options.only)
     if out.exists() and not options.resume:
         raise TrainingError(f"{out} exists; expected a new folder, or --resume")
     if (out / RUNS_FILE).is_file():
         results = Results.load(out)
-        if results.metadata.scale != scale:
+        kept = results.metadata.scale
+        if (kept.name, kept.block) != (scale.name, scale.block):
             raise TrainingError(
-                f"{out} has the scale {results.metadata.scale.name!r} and is finished; "
-                f"expected {scale.name!r}, or another --out"
+                f"{out} has the scale {kept.name!r}, block {kept.block}, and is finished; "
+                f"expected {scale.name!r}, block {scale.block}, or another --out"
             )
+        # Results of another version may have another number of environments and runs.
+        scale, planned = kept, plan.runs(kept, options.only)
         if missing := set(planned) - set(results.planned):
             raise TrainingError(
                 f"{out} is finished, without {len(missing)} runs of this command; expected another --out"
@@ -89,6 +95,10 @@ def _paper(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
+def _scale(options: argparse.Namespace) -> Scale:
+    return SCALES[options.scale].in_block(options.block)
+
+
 def _train(
     planned: Sequence[PlannedRun], options: argparse.Namespace, command: str
 ) -> "tuple[Results, Networks]":
@@ -96,7 +106,7 @@ def _train(
     from uav_dc_ros.experiments.paper import sweep
     from uav_dc_ros.experiments.paper.results import Metadata, ScenarioFacts
 
-    scale, out = SCALES[options.scale], options.out
+    scale, out = _scale(options), options.out
     folder = out / "shards"
     resumed = _reserve(folder, options)
     started = time.monotonic()
@@ -132,7 +142,7 @@ def _train(
 def _reserve(folder: Path, options: argparse.Namespace) -> bool:
     """Makes the folder of the shards, if it is not of another sweep; returns whether it holds any."""
     only = None if options.only is None else sorted(set(options.only))
-    plan = msgspec.json.encode({"scale": options.scale, "only": only})
+    plan = msgspec.json.encode({"scale": options.scale, "block": options.block, "only": only})
     try:
         folder.mkdir(parents=True, exist_ok=True)
         saved = (folder / _PLAN_FILE).read_bytes() if (folder / _PLAN_FILE).is_file() else plan
@@ -141,7 +151,7 @@ def _reserve(folder: Path, options: argparse.Namespace) -> bool:
     if saved != plan:
         raise TrainingError(
             f"{folder.parent} is half of a sweep with {saved.decode()}; "
-            "expected the same --scale and --only, or another --out"
+            "expected the same --scale, --block and --only, or another --out"
         )
     files.write(folder / _PLAN_FILE, plan)
     return any(folder.glob("*.safetensors"))

@@ -15,7 +15,7 @@ Verdict: TypeAlias = Literal["holds", "does not hold", "undecided", "not tested"
 
 MARGIN = 0.05  # relative, of "similar" and "stable"
 
-# Fixed before any result of the sweep was seen.
+# Fixed before any result of the sweep was seen, but for the interval, which is that of `core.stats`.
 RULES = f"""\
 - **Performance** of a run is its mean over the last {FINAL:.0%} of its training episodes, exploration
   included, as in the paper's curves. *Reward* is that of a mission: r^t (eq. 7) at its end with the data so
@@ -25,7 +25,7 @@ RULES = f"""\
   start + {SETTLED:.0%} of (final - start), where start is the first point and final the performance. A run
   that does not rise, or does not stay there, gets the number of all episodes.
 - **Effects** are paired: both sides are taken in the same environment, with the same seed; repeats are
-  averaged there, and so are the ratios of a claim over beta/zeta. The interval is a 95% percentile bootstrap
+  averaged there, and so are the ratios of a claim over beta/zeta. The interval is a 95% studentised bootstrap
   over environments. "Best" compares with the best of all others, found anew in every resample.
 - **A direction** (better, faster, higher) holds when the interval lies above 0, does not hold when no part of
   it does, and is undecided otherwise: no takes as much evidence as yes, and a tie is not better.
@@ -36,8 +36,11 @@ RULES = f"""\
 - **A claim** holds when all its parts do, does not hold when one part does not, and is undecided otherwise.
 - Measures under "beside" never decide: they show what the claim's own measure hides.
 
-Five environments are few. A bootstrap of five values is too narrow (it covers nearer 85% than 95%), and among
-some fifty parts a few come out by chance: read the effect, not only the verdict."""
+Five or ten environments are few. In a simulation the interval covers the true value in 92% to 97% of normal,
+uniform and exponential samples, in 86% of five log-normal values, and a lead over the best of several equal
+options in 88% to 92%. The percentile bootstrap, with which the first sweep was reported before, covers 78% to
+91%, and a lead in 34% to 73%: it finds most equal options worse. It was replaced for that, whatever the
+verdicts. Among some fifty parts a few come out by chance: read the effect, not only the verdict."""
 
 
 class Criterion(NamedTuple):

@@ -278,7 +278,7 @@ def _lines(title: str, wide: float) -> list[str]:
 def _facts(plan: FigurePlan, scale: Scale) -> str:
     """The meaning of the marks."""
     runs = f"{scale.repeats} runs" if scale.repeats > 1 else "1 run"
-    marks = f"{len(scale.environments)} environments × {runs}: mean, 95% bootstrap interval"  # noqa: RUF001
+    marks = f"{len(scale.environments)} environments × {runs}: mean, 95% studentised bootstrap interval"  # noqa: RUF001
     if any(panel.kind == "curves" for panel in plan.panels):
         marks += f"; curves: moving average over {SMOOTHING * scale.episodes_per_point} episodes"
     if any(panel.kind != "curves" for panel in plan.panels):

@@ -1,7 +1,8 @@
 """The report of a sweep: figures, `claims.md` for people, `claims.json` for programs."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,12 @@ _VERDICTS: dict[Verdict, str] = {
     "undecided": "are undecided",
     "not tested": "were not tested",
 }
+# By whether the block is another than 0.
+_BLOCKS = (
+    "whose environments and seeds had a part in choosing worlds and rules",
+    "whose environments and seeds no choice has seen",
+)
+_SHARES = ("landing_rate", "greedy_landing_rate")  # measures from 0 to 1
 # Measure: title, divisor, decimals. The words of `MISSION_REWARD` replace r^t.
 _UNITS = {
     "reward": ("reward r^t", 1.0, 3),
@@ -61,8 +68,6 @@ def write(
 
 def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str]) -> str:
     """The text of `claims.md`; `drawn` are the figures beside it."""
-    n = Counter(finding.verdict for finding in findings)
-    counts = ", ".join(f"{n[verdict]} {words}" for verdict, words in _VERDICTS.items() if n[verdict])
     evidence, scale = Evidence(results), results.metadata.scale
     warning = (
         f"> **The scale is `{scale.name}`: {scale.episodes} episodes. These numbers mean nothing.** "
@@ -71,13 +76,15 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
     sections = [
         "# Findings on the paper's claims",
         *([] if scale.name == "full" else [warning]),
-        f"Of {len(findings)} claims {counts}.",
+        f"Of {len(findings)} claims {_counts(findings)}.",
+        *_of_five(findings),
         _summary(findings),
         "Effect and interval are those of the part that decides: where a claim fails, the part it fails by.",
         "## How it was made",
         _provenance(results),
         "## The rules",
-        "The settings were fixed before the sweep ran, and the rules before any of its results was seen.",
+        "The settings were fixed before the sweep ran, and the rules before any result was seen, but for the "
+        "interval (below).",
         RULES,
         "## The figures",
         *map(_figure, drawn),
@@ -85,6 +92,21 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
         *(section for finding in findings for section in _sections(finding, evidence, drawn)),
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _counts(findings: Sequence[Finding]) -> str:
+    n = Counter(finding.verdict for finding in findings)
+    return ", ".join(f"{n[verdict]} {words}" for verdict, words in _VERDICTS.items() if n[verdict])
+
+
+def _of_five(findings: Sequence[Finding]) -> list[str]:
+    """What would change with as many environments as the paper has; nothing if there are no more."""
+    fewer = [finding.of_five for finding in findings if finding.of_five]
+    if not fewer:
+        return []
+    other = [one.claim.id for one, five in zip(findings, fewer, strict=True) if one.verdict != five.verdict]
+    differ = f"The verdicts on {', '.join(other)} differ" if other else "No verdict differs"
+    return [f"In the first five environments alone, as many as the paper has, {_counts(fewer)}. {differ}."]
 
 
 def _provenance(results: Results) -> str:
@@ -99,8 +121,9 @@ def _provenance(results: Results) -> str:
 ```
 
 - uav_dc_ros {metadata.version}; {metadata.device}; {minutes}
-- {len(results.planned)} runs of {scale.episodes} episodes; environments {environments}, in each
-  {scale.repeats} run(s) of a setting; seeds {", ".join(map(str, seeds))}
+- {len(results.planned)} runs of {scale.episodes} episodes; block {scale.block}, {_BLOCKS[scale.block > 0]}
+- environments {environments}, in each {scale.repeats} run(s) of a setting;
+  seeds {", ".join(map(str, seeds))}
 - worlds and their fingerprints: {worlds}
 - data in r^t (eq. 7): {data}
 - data: `runs.parquet`, `curves.parquet` (means over {scale.episodes_per_point} episodes);
@@ -108,15 +131,15 @@ def _provenance(results: Results) -> str:
 
 
 def _summary(findings: Sequence[Finding]) -> str:
-    rows = ["| | setting | claim | verdict | effect [95% interval] |", "|---|---|---|---|---|"]
+    header = ["", "setting", "claim", "verdict", "effect [95% interval]"]
+    rows = []
     for finding in findings:
         claim, criterion = finding.claim, finding.decisive
-        effect = f" {_effect(criterion.effect, criterion.unit)}" if criterion else ""
-        rows.append(
-            f"| [{claim.id}](#{claim.id.lower()}) | {claim.setting} | {claim.text} | "
-            f"**{finding.verdict}** |{effect} |"
-        )
-    return "\n".join(rows)
+        effect = _effect(criterion.effect, criterion.unit) if criterion else ""
+        link = f"[{claim.id}](#{claim.id.lower()})"
+        row = [link, claim.setting, claim.text, f"**{finding.verdict}**", effect]
+        rows.append([*row, finding.of_five.verdict] if finding.of_five else row)
+    return _markdown([*header, "with the paper's five"][: len(rows[0])], rows)
 
 
 def _figure(name: str) -> str:
@@ -125,28 +148,37 @@ def _figure(name: str) -> str:
 
 
 def _sections(finding: Finding, evidence: Evidence, drawn: Sequence[str]) -> list[str]:
-    claim, verdict, criteria = finding
+    claim, verdict = finding.claim, finding.verdict
     figures = ", ".join(f"[{name}](#{name.lower()})" if name in drawn else name for name in claim.figures)
     sections = [
         f"### {claim.id}",
         f"*{claim.setting}:* {claim.text}. Figure {figures}. **{verdict[0].upper()}{verdict[1:]}.**",
     ]
     if verdict != "not tested":
-        sections.append(_criteria([one for one in criteria if one.decides], "verdict"))
-        if beside := [one for one in criteria if not one.decides]:
-            sections += ["Beside:", _criteria(beside, "verdict by itself")]
+        sections.append(_criteria(finding, True, "verdict"))
+        if not all(one.decides for one in finding.criteria):
+            sections += ["Beside:", _criteria(finding, False, "verdict by itself")]
         sections += [text for table in claim.tables for text in tables_md(evidence, table)]
     if claim.notes:
         sections.append("\n".join(f"- {note}" for note in claim.notes))
     return sections
 
 
-def _criteria(criteria: Sequence[Criterion], verdict_title: str) -> str:
+def _criteria(finding: Finding, decide: bool, verdict_title: str) -> str:
+    """A table of the criteria that decide the verdict, or of the others."""
     rows = []
-    for one in criteria:
-        detail = f" ({one.detail})" if one.detail else ""
-        rows.append((f"{one.text}; {one.rule}{detail}", _effect(one.effect, one.unit), one.verdict))
-    return _markdown(("part", "effect [95% interval]", verdict_title), rows)
+    for one, five in _with_five(finding):
+        if one.decides == decide:
+            detail = f" ({one.detail})" if one.detail else ""
+            row = [f"{one.text}; {one.rule}{detail}", _effect(one.effect, one.unit), one.verdict]
+            rows.append([*row, f"{_effect(five.effect, five.unit)}: {five.verdict}"] if five else row)
+    header = ("part", "effect [95% interval]", verdict_title, "with the paper's five")
+    return _markdown(header[: len(rows[0])], rows)
+
+
+def _with_five(finding: Finding) -> Iterator[tuple[Criterion, Criterion | None]]:
+    """Each criterion with the same of five environments, if there are more."""
+    return zip_longest(finding.criteria, finding.of_five.criteria if finding.of_five else ())
 
 
 def tables_md(evidence: Evidence, table: Table) -> list[str]:
@@ -187,6 +219,7 @@ def _rows(evidence: Evidence, table: Table, measures: Sequence[str], *axes: str)
 def _cell(effect: Interval, measure: str) -> str:
     """A mean with its interval in the unit of the measure's title."""
     _, unit, decimals = _UNITS[measure]
+    effect = effect.within(0.0, 1.0) if measure in _SHARES else effect
     mean, low, high = (f"{value / unit:.{decimals}f}" for value in effect)
     return f"{mean} [{low}, {high}]"
 
@@ -205,15 +238,22 @@ def _plain(finding: Finding) -> dict[str, Any]:
     """A finding as JSON can hold it."""
 
     def plain(decide: bool) -> list[dict[str, Any]]:
-        criteria = (one._asdict() | {"effect": one.effect._asdict()} for one in finding.criteria)
-        return [one for one in criteria if one.pop("decides") == decide]
+        made = []
+        for one, five in _with_five(finding):
+            values = one._asdict() | {"effect": one.effect._asdict()}
+            if five:
+                values["of_five"] = {"effect": five.effect._asdict(), "verdict": five.verdict}
+            if values.pop("decides") == decide:
+                made.append(values)
+        return made
 
-    claim, verdict, _ = finding
+    claim, five = finding.claim, finding.of_five
     return {
         "id": claim.id,
         "setting": claim.setting,
         "claim": claim.text,
-        "verdict": verdict,
+        "verdict": finding.verdict,
+        **({"verdict_of_five": five.verdict} if five else {}),
         "parts": plain(True),
         "beside": plain(False),
     }

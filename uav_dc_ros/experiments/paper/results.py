@@ -4,7 +4,7 @@ Two Parquet files: `runs.parquet`, a row for each run; `curves.parquet`, a row f
 curves. Each carries the metadata as JSON under the key `uav_dc_ros`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -121,6 +121,19 @@ class Results:
         """Indices of a setting's runs by environment, then repeat, integers `[n]`; empty without any."""
         runs = self._by_setting.get(setting, [])
         return np.array(sorted(runs, key=lambda i: self.planned[i][1:]), np.intp)
+
+    def in_first(self, n: int) -> "Results":
+        """The runs in the first n environments alone."""
+        metadata = self.metadata
+        scale = msgspec.structs.replace(metadata.scale, environments=metadata.scale.environments[:n])
+        kept = [i for i, run in enumerate(self.planned) if run.environment in scale.environments]
+        return replace(
+            self,
+            metadata=msgspec.structs.replace(metadata, scale=scale),
+            planned=tuple(self.planned[i] for i in kept),
+            curves={name: values[kept] for name, values in self.curves.items()},
+            greedy={name: values[kept] for name, values in self.greedy.items()},
+        )
 
     @cached_property
     def _by_setting(self) -> dict[Setting, list[int]]:

@@ -27,7 +27,9 @@ from uav_dc_ros.experiments.train.population import Population, architecture, la
 # Runs of a shard: enough to hide the overhead of an operation, few enough for a core's cache, and enough
 # shards to keep the workers busy to the end.
 _SHARD_RUNS = 128
-GREEDY_SEEDS = (2_000_000, 20)  # first seed and number; disjoint from training, validation and test
+# First seed and number in block 0; disjoint from training, validation and test.
+GREEDY_SEEDS = (2_000_000, 20)
+_GREEDY_BLOCK = 1_000  # greedy seeds from block to block
 
 RunResults: TypeAlias = dict[PlannedRun, tuple[ShardResult, int]]  # result of its shard, and its index there
 Networks: TypeAlias = dict[int, network.Parameters]  # trained ones of the figure `Traj`, by environment
@@ -46,8 +48,13 @@ def make_shards(planned: Sequence[PlannedRun], scale: Scale) -> list[tuple[Shard
         for part in np.array_split(np.arange(len(runs)), -(-len(runs) // _SHARD_RUNS)):
             own = [runs[i] for i in part]
             population = _population(scenario, own, scale)
-            made.append((Shard(population=population, greedy_seeds=GREEDY_SEEDS), own))
+            made.append((Shard(population=population, greedy_seeds=greedy_seeds(scale)), own))
     return sorted(made, key=lambda one: (-one[0].n_steps, one[0].name))
+
+
+def greedy_seeds(scale: Scale) -> tuple[int, int]:
+    """First seed of the greedy missions after training, and their number: others in each block."""
+    return GREEDY_SEEDS[0] + _GREEDY_BLOCK * scale.block, GREEDY_SEEDS[1]
 
 
 def load_results(shards: Iterable[tuple[Shard, list[PlannedRun]]], folder: Path) -> RunResults:
@@ -105,7 +112,8 @@ def roll_out_trajectories(networks: Networks, scale: Scale) -> list[Trajectory]:
             observation = observe(OBSERVATION, scenario, state)
             return network.q_values(sizes, networks[environment], observation).argmax(-1)
 
-        return roll_out_trajectory(scenario, act, GREEDY_SEEDS[0], layout(environment, (scenario.n_users, 2)))
+        users = layout(environment, (scenario.n_users, 2))
+        return roll_out_trajectory(scenario, act, greedy_seeds(scale)[0], users)
 
     return [trajectory(environment) for environment in sorted(networks)]
 
