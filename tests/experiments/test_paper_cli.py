@@ -16,8 +16,8 @@ from uav_dc_ros.experiments.paper.results import METRICS, Results
 COMMAND = [sys.executable, "-m", "uav_dc_ros.paper", "--scale", "smoke"]
 
 
-def paper(*options):
-    return subprocess.run([*COMMAND, *map(str, options)], capture_output=True, text=True, timeout=300)
+def paper(*options, **how):
+    return subprocess.run([*COMMAND, *map(str, options)], capture_output=True, text=True, timeout=300, **how)
 
 
 def assert_equal(one, other):
@@ -69,6 +69,21 @@ def test_the_same_seeds_give_the_same_curves(smoke, tmp_path):
     done = paper("--out", tmp_path / "again", "--workers", 1, *ONLY)
     assert done.returncode == 0, done.stderr
     assert_equal(Results.load(smoke), Results.load(tmp_path / "again"))
+
+
+@pytest.mark.long
+def test_the_same_command_writes_the_same_bytes(tmp_path):
+    """Of a block for confirmation."""
+    written = []
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        done = paper("--out", "results", "--block", 1, *ONLY, cwd=tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        written.append({path.name: path.read_bytes() for path in (tmp_path / name / "results").iterdir()})
+    assert written[0].keys() >= {"claims.md", "claims.json", "runs.parquet", "curves.parquet", "Traj.png"}
+    assert written[0] == written[1]
+    results = Results.load(tmp_path / "one" / "results")
+    assert (results.metadata.scale.block, {run.seed for run in results.planned}) == (1, {10_000, 10_001})
 
 
 def test_a_finished_sweep_is_drawn_again(smoke):

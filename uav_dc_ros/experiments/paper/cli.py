@@ -108,7 +108,7 @@ def _train(
 
     scale, out = _scale(options), options.out
     folder = out / "shards"
-    resumed = _reserve(folder, options)
+    _reserve(folder, options)
     started = time.monotonic()
     shards = sweep.make_shards(planned, scale)
     missing = [shard for shard, _ in shards if not result_file(folder, shard).is_file()]
@@ -119,6 +119,8 @@ def _train(
                     train_on_ray(missing, folder, options.ray, progress.show)
                 else:
                     train_locally(missing, folder, options.workers, progress.show)
+            minutes = (time.monotonic() - started) / 60
+            Console().print(f"trained {len(missing)} of {len(shards)} shards in {minutes:.1f} minutes")
         found = sweep.load_results(shards, folder)
     finally:
         _discard_empty(folder)
@@ -129,7 +131,6 @@ def _train(
         scale=scale,
         worlds={name: ScenarioFacts.of(scenarios.load(name)) for name in names},
         greedy_missions=sweep.GREEDY_SEEDS[1],
-        wall_time_s=None if resumed else time.monotonic() - started,
         device=f"Ray cluster {options.ray}" if options.ray is not None else local,
     )
     results = sweep.collect(planned, metadata, found)
@@ -139,8 +140,8 @@ def _train(
     return results, networks
 
 
-def _reserve(folder: Path, options: argparse.Namespace) -> bool:
-    """Makes the folder of the shards, if it is not of another sweep; returns whether it holds any."""
+def _reserve(folder: Path, options: argparse.Namespace) -> None:
+    """Makes the folder of the shards, if it is not of another sweep."""
     only = None if options.only is None else sorted(set(options.only))
     plan = msgspec.json.encode({"scale": options.scale, "block": options.block, "only": only})
     try:
@@ -154,7 +155,6 @@ def _reserve(folder: Path, options: argparse.Namespace) -> bool:
             "expected the same --scale, --block and --only, or another --out"
         )
     files.write(folder / _PLAN_FILE, plan)
-    return any(folder.glob("*.safetensors"))
 
 
 def _discard_empty(folder: Path) -> None:

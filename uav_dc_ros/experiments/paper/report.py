@@ -111,7 +111,7 @@ def _of_five(findings: Sequence[Finding]) -> list[str]:
 
 def _provenance(results: Results) -> str:
     metadata, scale = results.metadata, results.metadata.scale
-    minutes = f"{metadata.wall_time_s / 60:.1f} minutes" if metadata.wall_time_s else "interrupted, not timed"
+    minutes = f"; {metadata.wall_time_s / 60:.1f} minutes" if metadata.wall_time_s else ""
     worlds = ", ".join(f"`{name}` {world.fingerprint}" for name, world in metadata.worlds.items())
     data = ", ".join(f"`{name}` {DATA[world.reward_data]}" for name, world in metadata.worlds.items())
     environments = ", ".join(map(str, scale.environments))
@@ -120,7 +120,7 @@ def _provenance(results: Results) -> str:
 {metadata.command}
 ```
 
-- uav_dc_ros {metadata.version}; {metadata.device}; {minutes}
+- uav_dc_ros {metadata.version}; {metadata.device}{minutes}
 - {len(results.planned)} runs of {scale.episodes} episodes; block {scale.block}, {_BLOCKS[scale.block > 0]}
 - environments {environments}, in each {scale.repeats} run(s) of a setting;
   seeds {", ".join(map(str, seeds))}

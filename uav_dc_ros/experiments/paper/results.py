@@ -84,7 +84,9 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     scale: Scale
     worlds: dict[str, ScenarioFacts]  # by the names of the scenarios
     greedy_missions: int  # of each run
-    wall_time_s: float | None = None  # None for an interrupted sweep
+    wall_time_s: float | None = (
+        None  # of results of version 0.2.0 and before; later ones are equal byte for byte
+    )
     device: str = ""  # in words
     version: str = __version__
 
