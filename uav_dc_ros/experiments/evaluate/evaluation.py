@@ -27,8 +27,9 @@ class Figure(msgspec.Struct, frozen=True, kw_only=True):
 
     n: int  # missions that have the quantity
     mean: float | None = None  # over these missions
-    # low, high: ends of the 95% bootstrap interval of the mean, for two missions or more. It has no width
-    # where all missions are alike: 100 landings of 100 do not exclude a rare failure.
+    # low, high: ends of the 95% bootstrap interval of the mean, for two missions or more; of fewer than 50
+    # missions it may be wider than their range. It has no width where all missions are alike: 100 landings of
+    # 100 do not exclude a rare failure.
     low: float | None = None
     high: float | None = None
     # min, max: extremes
