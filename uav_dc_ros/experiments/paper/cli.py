@@ -27,6 +27,7 @@ from uav_dc_ros.experiments.train.progress import ProgressBar
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.paper.results import Results
     from uav_dc_ros.experiments.paper.sweep import Networks
+    from uav_dc_ros.experiments.paper.worlds.verdicts import Multiverse
 
 PROG = "python -m uav_dc_ros.paper"
 NETWORKS_FILE = "trajectories.safetensors"
@@ -48,6 +49,8 @@ def main(argv: list[str] | None = None) -> None:
     text = "environments and seeds: 0 those of all choices so far, 1 and above fresh ones, to confirm"
     add("--block", default=0, type=block, metavar="B", help=text)
     add("--only", nargs="+", metavar="FIGURE", help="these figures, and the claims that they can decide")
+    text = "instead of the sweep, weigh the claims in N worlds drawn over what the paper leaves open"
+    add("--worlds", type=cli.count, metavar="N", help=text)
     add("--out", type=Path, metavar="DIR", default=Path("paper_results"), help="folder to make")
     add("--resume", action="store_true", help="resume the sweep in --out, or draw a finished one again")
     add("--workers", default=_cores(), type=cli.count, metavar="N", help="processes, each on one core")
@@ -63,6 +66,8 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         raise TrainingError(f"{error.name} {FROM_TRAIN}") from None
     if find_spec("torch") is None:  # the workers need it
         raise TrainingError(f"torch {FROM_TRAIN}")
+    if options.worlds is not None:
+        return _weigh_worlds(options)
     scale, out = _scale(options), options.out
     planned = plan.runs(scale, options.only)
     if out.exists() and not options.resume:
@@ -86,9 +91,7 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         try:
             results, networks = _train(planned, options, command)
         except KeyboardInterrupt:
-            hint = "; --resume continues" if out.exists() else ""
-            print(f"{PROG}: stopped{hint}", file=sys.stderr)
-            return cli.INTERRUPTED
+            return _stopped(out)
     report.write(results, sweep.roll_out_trajectories(networks, scale), out, options.only)
     shutil.rmtree(out / "shards", ignore_errors=True)
     Console().print(f"{out}: {len(results.planned)} runs; read {out / report.CLAIMS_FILE}", soft_wrap=True)
@@ -97,6 +100,65 @@ def _paper(options: argparse.Namespace, command: str) -> int:
 
 def _scale(options: argparse.Namespace) -> Scale:
     return SCALES[options.scale].in_block(options.block)
+
+
+def _stopped(out: Path) -> int:
+    hint = "; --resume continues" if out.exists() else ""
+    print(f"{PROG}: stopped{hint}", file=sys.stderr)
+    return cli.INTERRUPTED
+
+
+def _weigh_worlds(options: argparse.Namespace) -> int:
+    """Weighs the claims in many worlds, and writes the verdicts and their page."""
+    from uav_dc_ros.experiments.paper.worlds import page, plan
+    from uav_dc_ros.experiments.paper.worlds.verdicts import VERDICTS_FILE, Multiverse
+
+    scale, out, n = plan.SCALES[options.scale], options.out, options.worlds
+    if options.only is not None:
+        raise TrainingError(
+            f"--only {' '.join(options.only)}: expected without --worlds, which draws no figure"
+        )
+    if out.exists() and not options.resume:
+        raise TrainingError(f"{out} exists; expected a new folder, or --resume")
+    if (out / VERDICTS_FILE).is_file():
+        multiverse = Multiverse.load(out)
+        kept = multiverse.metadata.scale.name, len(multiverse.worlds)
+        if kept != (scale.name, n):
+            raise TrainingError(
+                f"{out} has {kept[1]} worlds of the scale {kept[0]!r} and is finished; "
+                f"expected {n} of {scale.name!r}, or another --out"
+            )
+    else:
+        try:
+            multiverse = _train_worlds(options)
+        except KeyboardInterrupt:
+            return _stopped(out)
+    page.write(multiverse, out)
+    shutil.rmtree(out / "shards", ignore_errors=True)
+    Console().print(f"{out}: {n} worlds; read {out / page.PAGE_FILE}", soft_wrap=True)
+    return 0
+
+
+def _train_worlds(options: argparse.Namespace) -> "Multiverse":
+    """Trains the runs of all worlds, and saves the verdicts."""
+    from uav_dc_ros.experiments.paper import sweep
+    from uav_dc_ros.experiments.paper.worlds import draw, plan, verdicts
+
+    scale, folder = plan.SCALES[options.scale], options.out / "shards"
+    worlds, rejected = draw.worlds(options.worlds)
+    # The first worlds of any number are the same, and so are their shards.
+    _reserve(folder, {"worlds": "any number", "scale": options.scale})
+    shards = [plan.make_shards(world, scale) for world in worlds]
+    _train_missing([shard for of_world in shards for shard, _ in of_world], folder, options)
+    rows = [
+        row
+        for world, of_world in zip(worlds, shards, strict=True)
+        for row in verdicts.rows(world, plan.findings(world, scale, sweep.load_results(of_world, folder)))
+    ]
+    metadata = verdicts.Metadata(scale=scale, rejected=rejected)
+    multiverse = verdicts.Multiverse(metadata=metadata, worlds=tuple(worlds), rows=tuple(rows))
+    multiverse.save(options.out)
+    return multiverse
 
 
 def _train(
@@ -108,22 +170,11 @@ def _train(
 
     scale, out = _scale(options), options.out
     folder = out / "shards"
-    _reserve(folder, options)
-    started = time.monotonic()
+    only = None if options.only is None else sorted(set(options.only))
+    _reserve(folder, {"scale": options.scale, "block": options.block, "only": only})
     shards = sweep.make_shards(planned, scale)
-    missing = [shard for shard, _ in shards if not result_file(folder, shard).is_file()]
-    try:
-        if missing:
-            with _Progress(sum(shard.n_steps for shard, _ in shards), missing) as progress:
-                if options.ray is not None:
-                    train_on_ray(missing, folder, options.ray, progress.show)
-                else:
-                    train_locally(missing, folder, options.workers, progress.show)
-            minutes = (time.monotonic() - started) / 60
-            Console().print(f"trained {len(missing)} of {len(shards)} shards in {minutes:.1f} minutes")
-        found = sweep.load_results(shards, folder)
-    finally:
-        _discard_empty(folder)
+    _train_missing([shard for shard, _ in shards], folder, options)
+    found = sweep.load_results(shards, folder)
     local = f"{options.workers} processes on {_cores()} cores of {platform.machine()}"
     names = sorted({one.setting.scenario for one in planned})
     metadata = Metadata(
@@ -140,10 +191,26 @@ def _train(
     return results, networks
 
 
-def _reserve(folder: Path, options: argparse.Namespace) -> None:
-    """Makes the folder of the shards, if it is not of another sweep."""
-    only = None if options.only is None else sorted(set(options.only))
-    plan = msgspec.json.encode({"scale": options.scale, "block": options.block, "only": only})
+def _train_missing(shards: Sequence[Shard], folder: Path, options: argparse.Namespace) -> None:
+    """Trains the shards whose results are not in the folder."""
+    missing = [shard for shard in shards if not result_file(folder, shard).is_file()]
+    started = time.monotonic()
+    try:
+        if missing:
+            with _Progress(sum(shard.n_steps for shard in shards), missing) as progress:
+                if options.ray is not None:
+                    train_on_ray(missing, folder, options.ray, progress.show)
+                else:
+                    train_locally(missing, folder, options.workers, progress.show)
+            minutes = (time.monotonic() - started) / 60
+            Console().print(f"trained {len(missing)} of {len(shards)} shards in {minutes:.1f} minutes")
+    finally:
+        _discard_empty(folder)
+
+
+def _reserve(folder: Path, values: dict[str, object]) -> None:
+    """Makes the folder of the shards, if it is not of another plan."""
+    plan = msgspec.json.encode(values)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         saved = (folder / _PLAN_FILE).read_bytes() if (folder / _PLAN_FILE).is_file() else plan
@@ -152,7 +219,7 @@ def _reserve(folder: Path, options: argparse.Namespace) -> None:
     if saved != plan:
         raise TrainingError(
             f"{folder.parent} is half of a sweep with {saved.decode()}; "
-            "expected the same --scale, --block and --only, or another --out"
+            "expected the same options, or another --out"
         )
     files.write(folder / _PLAN_FILE, plan)
 

@@ -7,7 +7,7 @@ curves. Each carries the metadata as JSON under the key `uav_dc_ros`.
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -35,6 +35,7 @@ GREEDY = (
 )
 RUNS_FILE, CURVES_FILE = "runs.parquet", "curves.parquet"
 _KEY = b"uav_dc_ros"
+_Meta = TypeVar("_Meta", bound=msgspec.Struct)
 
 _TYPES = {str: pa.string(), int: pa.int32(), float: pa.float64()}
 _SETTING_TYPES = {f.name: _TYPES.get(f.type, pa.string()) for f in msgspec.structs.fields(Setting)}
@@ -58,10 +59,13 @@ class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     reward_data: RewardData = "so_far"  # data in r^t; results of version 0.1.0 lack it
 
     @classmethod
-    def of(cls, scenario: Scenario) -> "ScenarioFacts":
-        """Raises TrainingError if missions end on arrival: the throughput would not determine the data."""
+    def of(cls, scenario: Scenario, any_end: bool = False) -> "ScenarioFacts":
+        """Raises TrainingError if missions end on arrival: the throughput would not determine the data.
+
+        With `any_end` it does not; measures that need the data, `common_share` alone, are then wrong.
+        """
         mission, n_users = scenario.mission, scenario.n_users
-        if mission.episode_end != "at_time_limit":
+        if mission.episode_end != "at_time_limit" and not any_end:
             raise TrainingError(
                 f"{scenario.name}: mission.episode_end = {mission.episode_end!r}; expected 'at_time_limit', "
                 "or missions of different lengths would be compared"
@@ -158,15 +162,14 @@ class Results:
             "episode": np.tile(np.asarray(self.episode, np.int32), n_runs),
             **{name: np.asarray(self.curves[name], np.float32).ravel() for name in METRICS},
         }
-        metadata = {_KEY: msgspec.json.encode(self.metadata)}
-        _write(folder / CURVES_FILE, curves, _CURVES_SCHEMA.with_metadata(metadata))
-        _write(folder / RUNS_FILE, runs, _RUNS_SCHEMA.with_metadata(metadata))
+        write_table(folder / CURVES_FILE, curves, _CURVES_SCHEMA, self.metadata)
+        write_table(folder / RUNS_FILE, runs, _RUNS_SCHEMA, self.metadata)
 
     @classmethod
     def load(cls, folder: Path) -> "Results":
         """Reads what `save` wrote; raises TrainingError for missing, damaged or other files."""
-        runs, metadata = _read(folder / RUNS_FILE, _RUNS_SCHEMA)
-        curves, other = _read(folder / CURVES_FILE, _CURVES_SCHEMA)
+        runs, metadata = read_table(folder / RUNS_FILE, _RUNS_SCHEMA, Metadata)
+        curves, other = read_table(folder / CURVES_FILE, _CURVES_SCHEMA, Metadata)
         if metadata != other:
             raise TrainingError(f"{folder}: {RUNS_FILE} and {CURVES_FILE} are of different sweeps")
         planned = []
@@ -209,8 +212,9 @@ def _check_arrays(
             raise TrainingError(f"{what}: {name} holds a number that is not finite")
 
 
-def _write(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
-    table = pa.table(columns, schema=schema)
+def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema, metadata: msgspec.Struct) -> None:
+    """Writes a Parquet file with its metadata in one move; raises TrainingError if it cannot."""
+    table = pa.table(columns, schema=schema.with_metadata({_KEY: msgspec.json.encode(metadata)}))
     try:
         with files.replacing(path) as partial:
             parquet.write_table(table, partial, compression="zstd", write_page_checksum=True)
@@ -218,13 +222,14 @@ def _write(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
         raise TrainingError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
-def _read(path: Path, schema: pa.Schema) -> tuple[pa.Table, Metadata]:
+def read_table(path: Path, schema: pa.Schema, kind: type[_Meta]) -> tuple[pa.Table, _Meta]:
+    """Reads what `write_table` wrote; raises TrainingError for a missing, damaged or other file."""
     if not path.is_file():
         raise TrainingError(f"{path}: no such file")
     try:
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
-        metadata = msgspec.json.decode((table.schema.metadata or {})[_KEY], type=Metadata)
+        metadata = msgspec.json.decode((table.schema.metadata or {})[_KEY], type=kind)
     except KeyError:
         raise TrainingError(f"{path}: no metadata of a sweep; expected the key 'uav_dc_ros'") from None
     except (OSError, pa.ArrowException, msgspec.DecodeError, UnicodeDecodeError) as error:

@@ -1,7 +1,7 @@
 """The sweep: planned runs become shards, and their results become `Results`."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -32,10 +32,24 @@ GREEDY_SEEDS = (2_000_000, 20)
 _GREEDY_BLOCK = 1_000  # greedy seeds from block to block
 
 RunResults: TypeAlias = dict[PlannedRun, tuple[ShardResult, int]]  # result of its shard, and its index there
+# A population of planned runs of a scenario, given by its name.
+Populate: TypeAlias = Callable[[str, Sequence[PlannedRun], Scale], Population]
 Networks: TypeAlias = dict[int, network.Parameters]  # trained ones of the figure `Traj`, by environment
 
 
-def make_shards(planned: Sequence[PlannedRun], scale: Scale) -> list[tuple[Shard, list[PlannedRun]]]:
+def population(scenario: str, runs: Sequence[PlannedRun], scale: Scale) -> Population:
+    """The runs of a shipped scenario as a population."""
+    return Population(
+        scenario=scenarios.load(scenario),
+        observation=OBSERVATION,
+        hidden=HIDDEN,
+        runs=tuple(one.run(scale) for one in runs),
+    )
+
+
+def make_shards(
+    planned: Sequence[PlannedRun], scale: Scale, populate: Populate = population
+) -> list[tuple[Shard, list[PlannedRun]]]:
     """The runs as shards, each with its runs in order; longest first, so that none starts last."""
     groups: dict[tuple[str, int], list[PlannedRun]] = defaultdict(list)
     for one in planned:
@@ -47,8 +61,8 @@ def make_shards(planned: Sequence[PlannedRun], scale: Scale) -> list[tuple[Shard
         runs = sorted(runs, key=lambda one: one.setting.learning_rate)
         for part in np.array_split(np.arange(len(runs)), -(-len(runs) // _SHARD_RUNS)):
             own = [runs[i] for i in part]
-            population = _population(scenario, own, scale)
-            made.append((Shard(population=population, greedy_seeds=greedy_seeds(scale)), own))
+            shard = Shard(population=populate(scenario, own, scale), greedy_seeds=greedy_seeds(scale))
+            made.append((shard, own))
     return sorted(made, key=lambda one: (-one[0].n_steps, one[0].name))
 
 
@@ -148,14 +162,5 @@ def _trajectory_setting(scale: Scale) -> Setting:
 def _trajectory_network(scale: Scale) -> tuple[Scenario, network.Architecture]:
     """The scenario of the figure `Traj`, and the sizes of its networks."""
     setting = _trajectory_setting(scale)
-    population = _population(setting.scenario, [PlannedRun(setting, 0, 0)], scale)
-    return population.scenario, architecture(population, population.runs[0])
-
-
-def _population(scenario: str, runs: Sequence[PlannedRun], scale: Scale) -> Population:
-    return Population(
-        scenario=scenarios.load(scenario),
-        observation=OBSERVATION,
-        hidden=HIDDEN,
-        runs=tuple(one.run(scale) for one in runs),
-    )
+    made = population(setting.scenario, [PlannedRun(setting, 0, 0)], scale)
+    return made.scenario, architecture(made, made.runs[0])
