@@ -12,7 +12,7 @@ from uav_dc_ros.experiments.paper.claims import CLAIMS
 from uav_dc_ros.experiments.paper.worlds import plan
 from uav_dc_ros.experiments.paper.worlds.choices import CHOICES, FIXED, PLACES, REFERENCES
 from uav_dc_ros.experiments.paper.worlds.choose import implausibility, ranking
-from uav_dc_ros.experiments.paper.worlds.contradictions import CONTRADICTIONS, mark
+from uav_dc_ros.experiments.paper.contradictions import CONTRADICTIONS, mark
 from uav_dc_ros.experiments.paper.worlds.draw import World
 from uav_dc_ros.experiments.paper.worlds.figure import draw
 from uav_dc_ros.experiments.paper.worlds.shares import Decider, Share, Summary, summaries
@@ -45,9 +45,8 @@ def worlds_md(multiverse: Multiverse) -> str:
         "# The paper's claims in many worlds",
         *([] if scale.name == "full" else [warning]),
         f"The paper leaves {len(CHOICES) + len(PLACES)} values and readings open. {n} worlds were drawn "
-        "over all of them, and every claim was weighed in each by the [rules of the "
-        "sweep](claims.md#the-rules). A claim that holds in few worlds owes much to choices that the paper "
-        "does not state.",
+        "over all of them, and every claim was weighed in each by the rules of the sweep, as in `claims.md`. A "
+        "claim that holds in few worlds owes much to choices that the paper does not state.",
         f"![Claims by worlds]({FIGURE_FILE})",
         "## The claims",
         _claims(found, multiverse),
@@ -116,7 +115,7 @@ def _deciders(found: Sequence[Summary]) -> str:
     if not rows:
         return "No choice decides any claim by itself."
     text = (
-        "A layout is the length of its shortest tour over that of the direct way to the dock, the dock is its "
+        "A layout is the length of its shortest tour over that of the direct way to the dock, the dock its "
         "way from the start in widths of the field."
     )
     return f"{text}\n\n{_table(('', 'choice', 'share of worlds in which the claim holds'), rows)}"
@@ -191,11 +190,12 @@ python -m uav_dc_ros.paper --worlds {n}{option}
 - worlds: points of a scrambled Sobol sequence; world n is the n-th that can exist. Of {n + n_rejected} points
   {n_rejected} were rejected{f" ({reasons})" if reasons else ""}
 - {len(planned)} runs of {scale.episodes} episodes in each world: the settings that the claims read, in
-  {len(scale.environments)} environments ({", ".join(map(str, scale.environments))}), at the ratios {ratios}
+  {len(scale.environments)} environments from number {scale.environments[0]} on ({", ".join(plan.WIDE)}: in
+  twice as many), at the ratios {ratios}
 - under `on_arrival` an episode is T_cons iterations and may hold several missions
 {cut}
-- data: `{WORLDS_FILE}` (a row for each world), `{VERDICTS_FILE}` (a row for each world and claim: verdict, the
-  part that decides, its effect and interval)"""
+- data: `{WORLDS_FILE}` (a row for each world), `{VERDICTS_FILE}` (a row for each world and claim: verdict,
+  the part that decides, its effect and interval)"""
 
 
 def _share(one: Share) -> str:
