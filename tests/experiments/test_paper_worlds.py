@@ -15,12 +15,12 @@ from uav_dc_ros.core.scenario import parse
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper import cli
 from uav_dc_ros.experiments.paper.claims import CLAIMS
+from uav_dc_ros.experiments.paper.contradictions import CONTRADICTIONS
 from uav_dc_ros.experiments.paper.evidence import NotMeasured
 from uav_dc_ros.experiments.paper.setting import HIDDEN, Setting
 from uav_dc_ros.experiments.paper.shards import ShardResult, save_result, train_shard
 from uav_dc_ros.experiments.paper.worlds import choose, draw, figure, page, plan, shares, verdicts
 from uav_dc_ros.experiments.paper.worlds.choices import CHOICES, PLACES, Options, Span
-from uav_dc_ros.experiments.paper.contradictions import CONTRADICTIONS
 from uav_dc_ros.experiments.paper.worlds.verdicts import IDS, VERDICTS, Metadata, Multiverse, Row
 
 N = 24

@@ -11,8 +11,8 @@ class Contradiction(NamedTuple):
 
 
 _OPTIMUM = (
-    "Let D be the (discounted) data term and Z the trajectory term that an agent maximises with the weights b "
-    "and 1 - b, D' and Z' those with c and 1 - c, c > b. Each is the best for its own weights: "
+    "Let D be the (discounted) data term and Z the trajectory term that an agent maximises with the weights "
+    "b and 1 - b, D' and Z' those with c and 1 - c, c > b. Each is the best for its own weights: "
     "b D + (1 - b) Z >= b D' + (1 - b) Z' and c D' + (1 - c) Z' >= c D + (1 - c) Z. The sum is "
     "(c - b)((D' - D) - (Z' - Z)) >= 0, and with both of them D' >= D and Z' <= Z: more weight on the data "
     "never collects less, and never brings the UAV home sooner."

@@ -9,10 +9,10 @@ import numpy as np
 from uav_dc_ros import files
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.paper.claims import CLAIMS
+from uav_dc_ros.experiments.paper.contradictions import CONTRADICTIONS, mark
 from uav_dc_ros.experiments.paper.worlds import plan
 from uav_dc_ros.experiments.paper.worlds.choices import CHOICES, FIXED, PLACES, REFERENCES
 from uav_dc_ros.experiments.paper.worlds.choose import implausibility, ranking
-from uav_dc_ros.experiments.paper.contradictions import CONTRADICTIONS, mark
 from uav_dc_ros.experiments.paper.worlds.draw import World
 from uav_dc_ros.experiments.paper.worlds.figure import draw
 from uav_dc_ros.experiments.paper.worlds.shares import Decider, Share, Summary, summaries
@@ -45,8 +45,8 @@ def worlds_md(multiverse: Multiverse) -> str:
         "# The paper's claims in many worlds",
         *([] if scale.name == "full" else [warning]),
         f"The paper leaves {len(CHOICES) + len(PLACES)} values and readings open. {n} worlds were drawn "
-        "over all of them, and every claim was weighed in each by the rules of the sweep, as in `claims.md`. A "
-        "claim that holds in few worlds owes much to choices that the paper does not state.",
+        "over all of them, and every claim was weighed in each by the rules of the sweep, as in `claims.md`. "
+        "A claim that holds in few worlds owes much to choices that the paper does not state.",
         f"![Claims by worlds]({FIGURE_FILE})",
         "## The claims",
         _claims(found, multiverse),
