@@ -39,10 +39,10 @@ class Options(NamedTuple):
 
     def __str__(self) -> str:
         """The values in words."""
-        share = {value: self.values.count(value) for value in self.values}
+        words = [value if isinstance(value, str) else f"{value:g}" for value in self.values]
+        share = {word: f" ({words.count(word)}/{len(words)})" for word in words}
         equal = len(set(share.values())) == 1
-        n = len(self.values)
-        return ", ".join(f"{value}" if equal else f"{value} ({k}/{n})" for value, k in share.items())
+        return ", ".join(word if equal else word + of_all for word, of_all in share.items())
 
 
 class Choice(NamedTuple):
@@ -259,6 +259,8 @@ ALTITUDE_STEP_M = 50.0
 
 # Open too, but without a choice in this package.
 FIXED = (
+    "beta and zeta are those of the ratio as the paper writes it: 2:1 is 2 and 1",
+    "every mission of a run begins with the same layout of users; five layouts are the paper's environments",
     "the distance in the exponential R_plus (eq. 9) is in cells: in metres it is zero in floating point",
     "activation (ReLU), initialisation, and the input's scale (each index to 0 to 1)",
     "learning begins with the first transition, and theta' as a copy of theta",
