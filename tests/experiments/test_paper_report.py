@@ -130,4 +130,4 @@ def test_what_was_not_measured_is_not_judged():
     )
     written = claims_md(some, check(some), [])
     assert "16 were not tested." in written
-    assert re.search(r"^\| \[C1\]\(#c1\) .* \| \*\*not tested\*\* \|  \|$", written, re.M)
+    assert re.search(r"^\| \[C1\]\(#c1\) .* \| \*\*not tested\*\* \|  \|  \|$", written, re.M)

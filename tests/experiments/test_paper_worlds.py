@@ -399,7 +399,8 @@ def test_a_killed_command_goes_on_and_gives_the_same_bytes(tmp_path):
     ("options", "complaint"),
     [
         (["--worlds", "0"], "'0'; expected a whole number of at least 1"),
-        (["--worlds", "2", "--only", "lr"], "--only lr: expected without --worlds"),
+        (["--worlds", "2", "--only", "lr"], "--worlds with --only or --block; expected neither"),
+        (["--worlds", "2", "--block", "1"], "--worlds with --only or --block; expected neither"),
         (["--worlds", "2", "--out", "."], ". exists; expected a new folder, or --resume"),
     ],
 )

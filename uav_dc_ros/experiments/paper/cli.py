@@ -114,9 +114,9 @@ def _weigh_worlds(options: argparse.Namespace) -> int:
     from uav_dc_ros.experiments.paper.worlds.verdicts import VERDICTS_FILE, Multiverse
 
     scale, out, n = plan.SCALES[options.scale], options.out, options.worlds
-    if options.only is not None:
+    if options.only is not None or options.block:
         raise TrainingError(
-            f"--only {' '.join(options.only)}: expected without --worlds, which draws no figure"
+            "--worlds with --only or --block; expected neither: its runs are those of the claims"
         )
     if out.exists() and not options.resume:
         raise TrainingError(f"{out} exists; expected a new folder, or --resume")

@@ -13,6 +13,7 @@ from uav_dc_ros.core.reward import DATA, MISSION_REWARD
 from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.experiments.paper.claims import Finding, check
+from uav_dc_ros.experiments.paper.contradictions import mark
 from uav_dc_ros.experiments.paper.criteria import RULES, Criterion, Table, Verdict
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.figures import draw, drawable
@@ -131,13 +132,13 @@ def _provenance(results: Results) -> str:
 
 
 def _summary(findings: Sequence[Finding]) -> str:
-    header = ["", "setting", "claim", "verdict", "effect [95% interval]"]
+    header = ["", "setting", "claim", "verdict", "effect [95% interval]", "contradicted by"]
     rows = []
     for finding in findings:
         claim, criterion = finding.claim, finding.decisive
         effect = _effect(criterion.effect, criterion.unit) if criterion else ""
         link = f"[{claim.id}](#{claim.id.lower()})"
-        row = [link, claim.setting, claim.text, f"**{finding.verdict}**", effect]
+        row = [link, claim.setting, claim.text, f"**{finding.verdict}**", effect, mark(claim.id)]
         rows.append([*row, finding.of_five.verdict] if finding.of_five else row)
     return _markdown([*header, "with the paper's five"][: len(rows[0])], rows)
 
