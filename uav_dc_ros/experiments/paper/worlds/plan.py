@@ -1,7 +1,7 @@
 """The runs of a world: those that the claims read, at a scale that 64 worlds can afford.
 
-Budget: 64 worlds in 90 minutes on 2 cores are 10,800 core-seconds, 169 for each world. `FULL` takes about 60%
-of that on an idle machine, see docs/paper/README.md.
+Budget: 64 worlds in 90 minutes on 2 cores are 10,800 core-seconds, 169 for each world. `FULL` takes about 80%
+of that, see docs/paper/README.md.
 """
 
 from collections.abc import Iterable, Sequence
