@@ -56,7 +56,8 @@ def draw(multiverse: Multiverse, path: Path) -> None:
     below = axes(_BELOW, readings_high)
     _readings(below, multiverse, ordered)
     framed = "the chosen one is framed" if choose(multiverse) else "C1 holds in none"
-    title = f"{n_worlds} worlds, sorted by the number of claims that hold; {framed}"
+    worlds = "1 world" if n_worlds == 1 else f"{n_worlds} worlds"
+    title = f"{worlds}, sorted by the number of claims that hold; {framed}"
     below.set_xlabel(title, color=INK, size=9)
     _header(figure, multiverse, wide, high)
     try:
