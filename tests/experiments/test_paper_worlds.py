@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tests.conftest import ROOT
 from uav_dc_ros.core.scenario import parse
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper import cli
@@ -309,6 +310,14 @@ def test_the_page_has_every_claim_choice_and_contradiction(worlds, tmp_path):
     png = (tmp_path / page.FIGURE_FILE).read_bytes()
     page.write(made, tmp_path)
     assert (tmp_path / page.FIGURE_FILE).read_bytes() == png
+
+
+def test_the_kept_page_is_what_its_data_gives_in_the_worlds_as_they_are():
+    kept = ROOT / "docs" / "paper"
+    made = Multiverse.load(kept)
+    assert made.metadata.scale == plan.FULL
+    assert list(made.worlds) == draw.worlds(len(made.worlds))[0]
+    assert (kept / page.PAGE_FILE).read_text("utf-8") == page.worlds_md(made)
 
 
 def test_worlds_of_the_figure_are_sorted(worlds):
