@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Annotated, TypeAlias, TypeVar
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 from msgspec.structs import force_setattr
 
 from uav_dc_ros import files
@@ -53,7 +53,7 @@ class Phase(StrEnum):
     MOVING = "moving"  # flying to a cell
     LANDING = "landing"  # descending
     LANDED = "landed"  # over, at the dock
-    TIMEOUT = "timeout"  # over, out of steps elsewhere
+    TIMEOUT = "timeout"  # over, out of steps or battery elsewhere
     ABORTED = "aborted"  # over, stopped early
 
     @property
@@ -140,8 +140,8 @@ class Mission(Stepped, frozen=True, kw_only=True):
         Meta(
             description="idle, connecting, preflight, takeoff: before the first step; ready: waiting for the "
             "move of this step; moving: flying it; landing: descending; landed: over, at the dock; "
-            "timeout: over, out of steps elsewhere; aborted: stopped early. A simulated vehicle is "
-            "ready, or over"
+            "timeout: over, out of steps or battery elsewhere; aborted: stopped early. A simulated vehicle "
+            "is ready, or over"
         ),
     ]
     reason: Annotated[
@@ -163,6 +163,17 @@ class Mission(Stepped, frozen=True, kw_only=True):
         Index,
         Meta(description="flown steps whose cell was not reached within the tolerance; 0 in simulation"),
     ] = 0
+    energy_used_j: Annotated[
+        NotNegative | UnsetType,
+        Meta(
+            description="energy of the steps flown by the scenario's model, joules; absent in a scenario "
+            "without a battery"
+        ),
+    ] = UNSET
+    state_of_charge: Annotated[
+        Annotated[float, Meta(ge=0, le=1)] | UnsetType,
+        Meta(description="share of the battery that is left by the same model; absent likewise"),
+    ] = UNSET
     seed: Annotated[Seed, Meta(description="seed of this mission's users")]
     scenario: Annotated[Name, Meta(description="name of the scenario")]
     fingerprint: Annotated[

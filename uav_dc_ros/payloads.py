@@ -1,9 +1,12 @@
 """Conversion between payloads and the core's arrays, and checks of payloads against the scenario."""
 
+from typing import Any
+
 import numpy as np
+from msgspec import UNSET
 
 from uav_dc_ros import messages
-from uav_dc_ros.core import world
+from uav_dc_ros.core import energy, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Link
@@ -69,11 +72,24 @@ def total_reward(status: messages.Mission, payload: messages.Rates, scenario: Sc
     return float(world.total_reward(scenario, np.asarray(status.cell), counted_data(payload, scenario)))
 
 
+def battery(scenario: Scenario, energy_used_j: Array) -> dict[str, Any]:
+    """Fields of the battery in a mission's payload, after energy `[]`; none in a scenario without one."""
+    if scenario.energy is None:
+        return {}
+    charge = energy.state_of_charge(scenario.energy, energy_used_j)
+    return {"energy_used_j": float(energy_used_j), "state_of_charge": float(charge)}
+
+
+def energy_used_j(status: messages.Mission) -> Array:
+    """Energy used in a mission, joules, `[]`; 0 in a scenario without a battery."""
+    return np.asarray(0.0 if status.energy_used_j is UNSET else status.energy_used_j)
+
+
 def check(payload: messages.Payload, scenario: Scenario) -> None:
     """Raise MessageError for a payload of another world.
 
-    That is a mission with another fingerprint, a cell outside the grid, or more steps than the battery
-    allows; users, or rates of users, other than the scenario's.
+    That is a mission with another fingerprint, a cell outside the grid, more steps than the battery
+    allows, or no battery where the scenario has one; users, or rates of users, other than the scenario's.
     """
     match payload:
         case messages.Mission() if payload.fingerprint != scenario.fingerprint:
@@ -89,6 +105,11 @@ def check(payload: messages.Payload, scenario: Scenario) -> None:
                     "layout",
                     f"cell {payload.cell}, {payload.remaining_steps} remaining steps; expected a cell up to "
                     f"{scenario.grid.last_cell} and at most {scenario.mission.max_steps} steps",
+                )
+            if (payload.energy_used_j is UNSET) is not (scenario.energy is None):
+                given, expected = ("no ", "one") if scenario.energy else ("", "none")
+                raise MessageError(
+                    "layout", f"{given}energy_used_j; expected {expected} in scenario {scenario.name!r}"
                 )
         case messages.Users() if payload.cluster != scenario.user_cluster.tolist():
             raise MessageError(

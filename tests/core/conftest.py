@@ -36,7 +36,7 @@ def changed() -> Callable[..., Scenario]:
     def change(scenario: Scenario, **tables: dict[str, Any]) -> Scenario:
         values = msgspec.to_builtins(scenario)
         for table, entries in tables.items():
-            values[table] |= entries
+            values[table] = values.get(table, {}) | entries
         return from_values(values, "test")
 
     return change

@@ -232,7 +232,9 @@ def test_ends_tell_the_worlds_of_a_batch_apart(three, changed, array):
         "at_time_limit": ([0, 1, 1, 0], [0, 0, 0, 0], [0, 1, 0, 0]),
     }.items():
         scenario = changed(three, mission={"episode_end": episode_end})
-        for got, want in zip(world.end_of_mission(scenario, step, cell), expected, strict=True):
+        for got, want in zip(
+            world.end_of_mission(scenario, step, cell, array(np.zeros(4))), expected, strict=True
+        ):
             np.testing.assert_array_equal(got, np.array(want, dtype=bool))
 
 

@@ -103,7 +103,7 @@ def step_messages(
     """Messages of a step, topic and content."""
     step = int(state.step)
     stamp_ns = scenario.time_ns(mission, step)
-    _, _, landed = world.end_of_mission(scenario, state.step, state.cell)
+    _, _, landed = world.end_of_mission(scenario, state.step, state.cell, state.energy_used_j)
     over = messages.Phase.LANDED if landed else messages.Phase.TIMEOUT
     by_topic: dict[str, messages.Payload] = {
         "users": payloads.users(scenario, state.users_m, mission=mission, step=step, time_ns=stamp_ns),

@@ -254,7 +254,7 @@ def test_an_unknown_key_and_what_was_meant(refused, table, typo, meant):
 @pytest.mark.parametrize("table", ["", *TABLES])
 def test_an_unknown_key_like_no_other(refused, table):
     text = f"qqqq = 3\n{TEXT}" if not table else TEXT.replace(f"[{table}]", f"[{table}]\nqqqq = 3")
-    known = VALUES[table] if table else VALUES
+    known = VALUES[table] if table else [*VALUES, "energy"]
     if table == "radio":
         known = ["model", *known]
     name = f"{table}.qqqq" if table else "qqqq"

@@ -17,7 +17,7 @@ def changed(shipped: str, **tables: Any) -> Scenario:
     """A shipped scenario with other values: `changed("five_clusters", mission={"max_steps": 5})`."""
     values = msgspec.to_builtins(scenarios.load(shipped))
     for table, entries in tables.items():
-        values[table] = values[table] | entries if isinstance(entries, dict) else entries
+        values[table] = values.get(table, {}) | entries if isinstance(entries, dict) else entries
     return from_values(values, "test")
 
 

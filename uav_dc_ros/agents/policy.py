@@ -101,11 +101,24 @@ class Policy:
         return {name: np.asarray(values, np.float64) for name, values in self.parameters.items()}
 
     def observe(
-        self, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
+        self,
+        scenario: Scenario,
+        *,
+        cell: Array,
+        step: Array,
+        data_bits: Array,
+        collected: Array,
+        energy_used_j: Array | None = None,
     ) -> Array:
         """The policy's observation of a mission, float32 `[..., D]`; see `core.observations.encode`."""
         return observations.encode(
-            self.config.observation, scenario, cell=cell, step=step, data_bits=data_bits, collected=collected
+            self.config.observation,
+            scenario,
+            cell=cell,
+            step=step,
+            data_bits=data_bits,
+            collected=collected,
+            energy_used_j=energy_used_j,
         )
 
     def q_values(self, observation: Array) -> Array:
@@ -122,9 +135,12 @@ class Policy:
         """Reject a world in which the policy's observations have another meaning.
 
         Raises:
-            PolicyError: another grid or, unless it observes its position only, another number of clusters.
+            PolicyError: another grid or, unless it observes its position only, another number of clusters; or
+                no battery, which it observes.
         """
         own = self.scenario
+        if (problem := observations.problem(self.config.observation, scenario)) is not None:
+            raise PolicyError(f"policy {self.name!r} needs {problem}")
         facts: list[tuple[str, object, object]] = [
             ("the grid's number of cells east, north, up", own.grid.shape, scenario.grid.shape)
         ]
@@ -162,6 +178,8 @@ def load(name_or_path: str | Path) -> Policy:
     try:
         config = msgspec.json.decode(config_bytes, type=PolicyConfig)
         scenario = from_values(config.scenario, f"{path}: scenario")
+        if (problem := observations.problem(config.observation, scenario)) is not None:
+            raise PolicyError(f"{path}: {problem}")
     except msgspec.MsgspecError as error:
         raise PolicyError(f"{path}: {error}") from None
     except ScenarioError as error:

@@ -5,6 +5,7 @@ mission    position; remaining steps; for each cluster the share of users collec
            one-hot in each direction; for each cluster the UAV's closeness, and the closeness times the share
            of users collected: 4 + 4 M + n_x + n_y + n_z numbers
 map        mission, and the vector from the UAV to each cluster's centre and to the dock: 2 M + 2 more
+energy     mission, and the battery's state of charge: 1 more; only in a scenario with a table `energy`
 
 One-hot cells and closeness add no information. They spare a small network the work of deriving "this cell
 only" and "here, while users remain" from scaled indices. Closeness is a Gaussian of the horizontal distance
@@ -19,16 +20,25 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.energy import state_of_charge
 from uav_dc_ros.core.scenario import Scenario
 
-Observation: TypeAlias = Literal["position", "mission", "map"]
+Observation: TypeAlias = Literal["position", "mission", "map", "energy"]
+
+
+def problem(kind: Observation, scenario: Scenario) -> str | None:
+    """Why a scenario has no such observation; None: it has."""
+    if kind == "energy" and scenario.energy is None:
+        return f"the observation 'energy' in scenario {scenario.name!r}; expected a scenario with [energy]"
+    return None
 
 
 def size(kind: Observation, scenario: Scenario) -> int:
     """Length D of the encoding."""
     n_clusters = scenario.n_clusters
     mission = 4 + 4 * n_clusters + sum(scenario.grid.shape)
-    return {"position": 3, "mission": mission, "map": mission + 2 * n_clusters + 2}[kind]
+    sizes = {"position": 3, "mission": mission, "map": mission + 2 * n_clusters + 2, "energy": mission + 1}
+    return sizes[kind]
 
 
 def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
@@ -44,11 +54,19 @@ def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
 
 
 def encode(
-    kind: Observation, scenario: Scenario, *, cell: Array, step: Array, data_bits: Array, collected: Array
+    kind: Observation,
+    scenario: Scenario,
+    *,
+    cell: Array,
+    step: Array,
+    data_bits: Array,
+    collected: Array,
+    energy_used_j: Array | None = None,
 ) -> Array:
     """The observation of a mission, float32 `[..., D]` with D = `size(kind, scenario)`.
 
-    `cell` `[..., 3]`, `step` `[...]`, `data_bits` and `collected` `[..., U]` are those of `world.State`.
+    `cell` `[..., 3]`, `step` `[...]`, `data_bits` and `collected` `[..., U]` are those of `world.State`, as
+    is `energy_used_j` `[...]`, which only `energy` needs.
     """
     xp = array_namespace(cell)
     cell_f = xp.astype(cell, xp.float32)
@@ -68,6 +86,11 @@ def encode(
         to_clusters = to_goals_cells[..., :-1, :] / reach_cells
         closeness = xp.exp(-0.5 * (to_clusters * to_clusters).sum(axis=-1))
         parts += [done, data, one_hot, closeness, closeness * done]
+    if kind == "energy":
+        assert scenario.energy is not None, "checked by `problem`"
+        assert energy_used_j is not None, "needed by `energy`"
+        charge = state_of_charge(scenario.energy, energy_used_j)
+        parts.append(xp.astype(charge[..., None], xp.float32))
     if kind == "map":
         to_goals = to_goals_cells / span[:2]
         parts.append(to_goals.reshape((*cell.shape[:-1], -1)))

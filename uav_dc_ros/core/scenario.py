@@ -21,6 +21,7 @@ from msgspec import Meta
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.channel import AERIAL, AERIAL_MAX_HEIGHT_M, AerialVehicle, FreeSpace, Radio
+from uav_dc_ros.core.energy import EnergySettings, StepEnergies
 from uav_dc_ros.core.grid import Grid
 from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
@@ -76,7 +77,7 @@ class RewardSettings(_Table, frozen=True):
     data: RewardData = "so_far"
 
 
-class Scenario(_Table, frozen=True, dict=True):
+class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
     """Every value of a world. `U` below is the number of users, M K."""
 
     name: Annotated[str, Meta(pattern=_NAME)]
@@ -85,6 +86,8 @@ class Scenario(_Table, frozen=True, dict=True):
     mission: MissionSettings
     radio: Radio  # the uplink; `radio.model` names the struct, see `channel`
     reward: RewardSettings
+    # The battery. Without the table no energy is counted.
+    energy: EnergySettings | None = None
 
     @property
     def n_clusters(self) -> int:
@@ -135,6 +138,18 @@ class Scenario(_Table, frozen=True, dict=True):
         cell_m = self.grid.cell_m
         goals_m = (*self.users.cluster_centres_m, self.mission.dock_m)
         return tuple((x_m / cell_m, y_m / cell_m) for x_m, y_m in goals_m)
+
+    @property
+    def ends_at_any_step(self) -> bool:
+        """Whether a mission may end before its last step."""
+        by_battery = self.energy is not None and self.energy.ends != "steps"
+        return by_battery or self.mission.episode_end == "on_arrival"
+
+    @cached_property
+    def step_energies_j(self) -> StepEnergies:
+        """Energy of each kind of step, joules; only with a table `energy`."""
+        assert self.energy is not None, "checked by the caller"
+        return self.energy.step_energies_j(self.grid, self.mission.step_s)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -249,6 +264,7 @@ def _explain(message: str, values: Any) -> str:
     elif expected == "Number out of range":
         expected = "a finite number"
     expected = expected.replace("`", "").removeprefix("Expected ").replace("object", "table")
+    expected = expected.replace(" | null", "")  # what TOML does not have
     return f"{path or 'scenario'} = {reprlib.repr(values)}; expected {expected}"
 
 
@@ -304,6 +320,8 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
                 f"nearest cell; expected at most mission.d_cons_m = {mission.d_cons_m:g}, or its users are "
                 "out of reach"
             )
+    if scenario.energy is not None:
+        yield from scenario.energy.inconsistencies(grid, mission.step_s, mission.max_steps, moves)
     if isinstance(scenario.radio, AerialVehicle):
         yield from _out_of_range(scenario, scenario.radio.environment, top_m)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import TypeAlias
 
-from uav_dc_ros.core import channel, mission, mobility, observations, radio, reward
+from uav_dc_ros.core import channel, energy, mission, mobility, observations, radio, reward
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import Rewards
@@ -36,6 +36,7 @@ class State:
     collected: Array  # bool `[..., U]`
     total_reward: Array  # r^t (eq. 7), `[...]`
     mission_reward: Array  # reward of the mission so far, see `reward.mission_reward`, `[...]`
+    energy_used_j: Array  # energy of the steps flown, joules, `[...]`; 0 in a scenario without `energy`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +69,7 @@ def initial(scenario: Scenario, draws: Array) -> State:
         collected=zeros > 0.0,
         total_reward=zero,
         mission_reward=zero,
+        energy_used_j=zero,
     )
 
 
@@ -112,16 +114,41 @@ def dock_distance_m(scenario: Scenario, cell: Array, like: Array) -> Array:
     return mission.dock_distance_cells(cell, scenario.dock_cell, like) * scenario.grid.cell_m
 
 
-def end_of_mission(scenario: Scenario, step: Array, cell: Array) -> tuple[Array, Array, Array]:
+def energy_after(scenario: Scenario, before_j: Array, cell: Array, after: Array) -> Array:
+    """Energy used after a step from a cell to the next, both `[..., 3]`, joules, `[...]`.
+
+    `before_j` `[...]` is that before the step; it is also the result in a scenario without `energy`.
+    """
+    if scenario.energy is None:
+        return before_j
+    return before_j + energy.of_step(scenario.step_energies_j, cell, after, like=before_j)
+
+
+def end_of_mission(
+    scenario: Scenario, step: Array, cell: Array, energy_used_j: Array
+) -> tuple[Array, Array, Array]:
     """Whether the mission has terminated, was truncated, and has landed, bool `[...]` each.
 
     Under `at_time_limit` the last step is a termination: the value of a state behind it is zero, not unknown.
+
+    Where the battery may end a mission (`energy.ends`), the mission also terminates when the battery is
+    spent: the rest does not last for the step that needs least or, over the dock, for a hover. A UAV has not
+    landed if its battery was empty before the end of its last step.
     """
     docked = mission.at_dock(cell, scenario.dock_cell)
     out_of_steps = step >= scenario.mission.max_steps
-    if scenario.mission.episode_end == "on_arrival":
+    at_time_limit = scenario.mission.episode_end == "at_time_limit"
+    if scenario.energy is None or scenario.energy.ends == "steps":
+        if at_time_limit:
+            return out_of_steps, out_of_steps & ~out_of_steps, out_of_steps & docked
         return docked, out_of_steps & ~docked, docked
-    return out_of_steps, out_of_steps & ~out_of_steps, out_of_steps & docked
+    left_j = scenario.energy.battery_j - energy_used_j
+    spent = (left_j < min(scenario.step_energies_j)) | (docked & (left_j < scenario.step_energies_j.hover))
+    docked = docked & (left_j >= 0.0)
+    if at_time_limit:
+        over = out_of_steps | spent
+        return over, over & ~over, over & docked
+    return docked | spent, out_of_steps & ~docked & ~spent, docked
 
 
 def step(
@@ -142,7 +169,8 @@ def step(
     total = total_reward(scenario, cell, counted_bits, rewards)
     n_steps = state.step + 1
     n_rewards = array_namespace(total).astype(n_steps, total.dtype)
-    terminated, truncated, landed = end_of_mission(scenario, n_steps, cell)
+    used_j = energy_after(scenario, state.energy_used_j, state.cell, cell)
+    terminated, truncated, landed = end_of_mission(scenario, n_steps, cell, used_j)
     after = State(
         step=n_steps,
         cell=cell,
@@ -151,6 +179,7 @@ def step(
         collected=collected,
         total_reward=total,
         mission_reward=reward.mission_reward(state.mission_reward, total, n_rewards, values.data),
+        energy_used_j=used_j,
     )
     agent_reward = reward.step_reward(total, state.total_reward, values.form)
     return after, Outcome(
@@ -160,8 +189,15 @@ def step(
 
 def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
     """The observation of a state, float32 `[..., D]`; see `observations.encode`."""
-    cell, step, data_bits, collected = state.cell, state.step, state.data_bits, state.collected
-    return observations.encode(kind, scenario, cell=cell, step=step, data_bits=data_bits, collected=collected)
+    return observations.encode(
+        kind,
+        scenario,
+        cell=state.cell,
+        step=state.step,
+        data_bits=state.data_bits,
+        collected=state.collected,
+        energy_used_j=state.energy_used_j,
+    )
 
 
 def select(where: Array, chosen: State, other: State) -> State:

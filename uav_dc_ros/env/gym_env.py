@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core import observations, world
+from uav_dc_ros.core import energy, observations, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.observations import Observation
@@ -31,7 +31,8 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
     Observation:
         `Box`, float32. `observation="position"`: the UAV's cell, each index scaled to [0, 1].
         `"mission"` (default): also the remaining steps and the progress in each cluster. `"map"`: also the
-        vector to each cluster and to the dock. The exact layout is in `core.observations`.
+        vector to each cluster and to the dock. `"energy"`: `"mission"` and the battery's state of charge. The
+        exact layout is in `core.observations`.
 
     Reward:
         From r^t = beta * (data, mean over users, scaled) + zeta * R_plus (eq. 7), with the data delivered in
@@ -44,7 +45,8 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
 
     End:
         `episode_end = "at_time_limit"`: terminates after `max_steps`; it has landed if it is over the
-        dock then. `"on_arrival"`: terminates over the dock, truncates after `max_steps`.
+        dock then. `"on_arrival"`: terminates over the dock, truncates after `max_steps`. Both terminate when
+        the battery is spent, where `energy.ends` is `"battery"` or `"both"`.
 
     Randomness:
         `reset` draws `np_random.random((U, 2))`, and every `step` the same; nothing else draws.
@@ -52,16 +54,16 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
     Info:
         step, cell `[3]`, users_m `[U, 2]`, data_bits `[U]`, collected `[U]`, landed, dock_distance_m
         (horizontal), and of the last step (zero before the first): served `[U]`, sinr `[U]` linear,
-        rate_bps `[U]`, sum_rate_bps.
+        rate_bps `[U]`, sum_rate_bps. In a scenario with `energy` also energy_used_j and state_of_charge.
 
     Args:
         scenario: a shipped name, the path of a TOML file, or a Scenario.
-        observation: `position`, `mission` or `map`.
+        observation: `position`, `mission`, `map` or `energy`.
         render_mode: None, or `rgb_array`: a picture of the mission so far, `[H, W, 3]` uint8.
 
     Raises:
         ScenarioError: an invalid scenario.
-        ValueError: an unknown observation or render mode.
+        ValueError: an unknown observation or render mode, or an observation that the scenario does not have.
         InvalidAction, ResetNeeded: by `step`, for an action outside the space, or outside an episode.
     """
 
@@ -126,6 +128,8 @@ def prepare(
     if render_mode not in (None, *RENDER_MODES):
         raise ValueError(f"render_mode is {render_mode!r}; expected None or {', '.join(RENDER_MODES)}")
     loaded = scenario if isinstance(scenario, Scenario) else scenarios.load(scenario)
+    if (problem := observations.problem(observation, loaded)) is not None:
+        raise ValueError(problem)
     low, high = observations.bounds(observation, loaded)
     return loaded, spaces.Box(low, high, dtype=np.float32), spaces.Discrete(len(Action))
 
@@ -134,6 +138,10 @@ def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None =
     """The `info` of `reset` and `step`, with the batch dimensions of `state`."""
     zeros, no_users = np.zeros_like(state.data_bits), np.zeros_like(state.collected)
     link = outcome.link if outcome else None
+    battery = {}
+    if scenario.energy is not None:
+        charge = energy.state_of_charge(scenario.energy, state.energy_used_j)
+        battery = {"energy_used_j": state.energy_used_j, "state_of_charge": charge}
     return {
         "step": state.step,
         "cell": state.cell,
@@ -146,4 +154,5 @@ def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None =
         "sinr": link.sinr if link else zeros,
         "rate_bps": link.rate_bps if link else zeros,
         "sum_rate_bps": link.sum_rate_bps if link else zeros[..., 0],
+        **battery,
     }

@@ -12,7 +12,7 @@ from collections import Counter
 import msgspec
 import numpy as np
 
-from uav_dc_ros import cdr, messages, scenarios
+from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import MessageError, NodeError, UavDcError
 from uav_dc_ros.messages import Phase
@@ -263,6 +263,7 @@ class AutopilotBridge(MissionNode):
             cell=bridge.cell,
             remaining_steps=self.scenario.mission.max_steps - bridge.step,
             steps_not_reached=bridge.progress.steps_not_reached,
+            **payloads.battery(self.scenario, bridge.progress.energy_used_j),
             seed=self.values["seed"],
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,

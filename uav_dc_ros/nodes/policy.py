@@ -27,7 +27,8 @@ class PolicyNode(MissionNode):
         self.scenario = scenarios.load(scenario) if scenario else self.policy.scenario
         self.policy.check(self.scenario)
         cell, zeros = np.asarray(self.scenario.start_cell), np.zeros(self.scenario.n_users)
-        self._decide(cell, np.asarray(0), zeros, zeros > 0)  # the first call is the slowest
+        energy_used_j = np.asarray(0.0)
+        self._decide(cell, np.asarray(0), zeros, zeros > 0, energy_used_j)  # the first call is the slowest
 
     def activate(self) -> None:
         """Begin without a pending step."""
@@ -50,13 +51,23 @@ class PolicyNode(MissionNode):
         mission, rates = pair
         data_bits, collected = payloads.collection(rates, self.scenario)
         steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
-        action = self._decide(np.asarray(mission.cell), np.asarray(steps_flown), data_bits, collected)
+        energy_used_j = payloads.energy_used_j(mission)
+        action = self._decide(
+            np.asarray(mission.cell), np.asarray(steps_flown), data_bits, collected, energy_used_j
+        )
         move = messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label)
         self.publish_payload("move", move)
 
-    def _decide(self, cell: Array, step: Array, data_bits: Array, collected: Array) -> Action:
+    def _decide(
+        self, cell: Array, step: Array, data_bits: Array, collected: Array, energy_used_j: Array
+    ) -> Action:
         observation = self.policy.observe(
-            self.scenario, cell=cell, step=step, data_bits=data_bits, collected=collected
+            self.scenario,
+            cell=cell,
+            step=step,
+            data_bits=data_bits,
+            collected=collected,
+            energy_used_j=energy_used_j,
         )
         return Action(int(self.policy.act(observation)))
 

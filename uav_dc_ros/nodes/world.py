@@ -197,6 +197,7 @@ class WorldNode(MissionNode):
         self._mission, self._step = mission, 0
         self._users = WalkingUsers(self.scenario, self.values["seed"] + mission)
         self._cell = np.asarray(self.scenario.start_cell)
+        self._energy_used_j: Array = np.asarray(0.0)
         self._phase = Phase.READY
         self._action = None
 
@@ -271,11 +272,14 @@ class WorldNode(MissionNode):
 
     def _move(self, action: Action) -> None:
         """One step of the world."""
-        self._cell = self.scenario.grid.move(self._cell, np.asarray(int(action)))
+        before, self._cell = self._cell, self.scenario.grid.move(self._cell, np.asarray(int(action)))
+        self._energy_used_j = core.energy_after(self.scenario, self._energy_used_j, before, self._cell)
         self._users.walk()
         self._step += 1
         self._action = None
-        terminated, truncated, landed = core.end_of_mission(self.scenario, np.asarray(self._step), self._cell)
+        terminated, truncated, landed = core.end_of_mission(
+            self.scenario, np.asarray(self._step), self._cell, self._energy_used_j
+        )
         if terminated or truncated:
             self._phase = Phase.LANDED if landed else Phase.TIMEOUT
 
@@ -335,6 +339,7 @@ class WorldNode(MissionNode):
             reason=reason,
             cell=(east, north, up),
             remaining_steps=self.scenario.mission.max_steps - self._step,
+            **payloads.battery(self.scenario, self._energy_used_j),
             seed=self.values["seed"] + self._mission,
             scenario=self.scenario.name,
             fingerprint=self.scenario.fingerprint,

@@ -55,6 +55,9 @@ def _towards(scenario: Scenario, state: State, goal: Array) -> Array:
     to_dock = np.abs(state.cell[..., :2] - dock).sum(axis=-1)
     # One step of reserve: a hover or a descent may cost a move away from the dock.
     home = (scenario.mission.max_steps - state.step <= to_dock + 1) | _served(scenario, state).all(axis=-1)
+    if scenario.energy is not None and scenario.energy.ends != "steps":
+        left_j = scenario.energy.battery_j - state.energy_used_j
+        home = home | (left_j < to_dock * scenario.step_energies_j.level + 2 * max(scenario.step_energies_j))
     dx, dy = np.moveaxis(np.where(home[..., None], dock, goal) - state.cell[..., :2], -1, 0)
     # Down comes first, then the x axis.
     return np.select(

@@ -98,7 +98,8 @@ class RecordedStep:
         data_bits, collected = payloads.collection(self.rates, scenario)
         cell, left = np.asarray(self.status.cell), self.status.remaining_steps
         step = np.asarray(scenario.mission.max_steps - left)
-        return {"cell": cell, "step": step, "data_bits": data_bits, "collected": collected}
+        observed = {"cell": cell, "step": step, "data_bits": data_bits, "collected": collected}
+        return observed | {"energy_used_j": payloads.energy_used_j(self.status)}
 
     @property
     def phase_changes(self) -> list[PhaseReport]:

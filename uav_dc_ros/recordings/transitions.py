@@ -38,6 +38,7 @@ class Transition(NamedTuple):
 class _State(NamedTuple):
     source: tuple[int, int, int]  # flight, mission, step
     cell: Array
+    energy_used_j: Array
     observation: Array
     total_reward: float  # r^t (eq. 7)
 
@@ -76,7 +77,8 @@ class RecordedTransitions:
         total = 0.0
         if step.step and step.status and step.rates:  # whatever R_plus its start cell has, r is 0 there
             total = payloads.total_reward(step.status, step.rates, self._scenario)
-        return _State((step.flight, step.mission, step.step), observed["cell"], observation, total)
+        source = step.flight, step.mission, step.step
+        return _State(source, observed["cell"], observed["energy_used_j"], observation, total)
 
     def _action(self, cell: Array, after: Array, move: Action | None) -> Action | None:
         """The action between two cells: the recorded move if it leads there."""
@@ -90,7 +92,7 @@ class RecordedTransitions:
 
     def _transition(self, before: _State, after: _State, action: Action) -> Transition:
         step, form = np.asarray(after.source[2]), self._scenario.reward.form
-        terminated, truncated, _ = world.end_of_mission(self._scenario, step, after.cell)
+        terminated, truncated, _ = world.end_of_mission(self._scenario, step, after.cell, after.energy_used_j)
         reward = float(core_reward.step_reward(after.total_reward, before.total_reward, form))
         end = bool(terminated), bool(truncated)
         return Transition(*before.source, before.observation, int(action), reward, after.observation, *end)

@@ -13,6 +13,7 @@ _LIMITS = {
 It sees its cell and nothing else: it cannot know what it has collected or how much time is left, so its
 greedy mission is one fixed path, and where it stays for one step it stays for good.""",
     "mission": "It sees how far each cluster is collected, but not where single users are.",
+    "energy": "It sees how far each cluster is collected and how full the battery is, but not single users.",
     "map": "It sees where the clusters are, but it has met no other map than this one.",
 }
 

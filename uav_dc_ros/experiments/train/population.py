@@ -36,7 +36,9 @@ class Population(msgspec.Struct, frozen=True, kw_only=True):
     runs: tuple[Run, ...]
 
     def __post_init__(self) -> None:
-        """Raises TrainingError for no runs, or runs that cannot share a batch."""
+        """Raises TrainingError for no runs, runs that cannot share a batch, or no such observation."""
+        if (problem := observations.problem(self.observation, self.scenario)) is not None:
+            raise TrainingError(problem)
         if not self.runs:
             raise TrainingError("a population has 0 runs; expected at least 1")
         for name in ("episodes", "buffer_size", "target_every"):

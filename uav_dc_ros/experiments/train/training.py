@@ -89,12 +89,12 @@ class Training:
     def fly_episode(self) -> None:
         """T_cons iterations of every run, each one step and one gradient step (algorithms 1 and 2).
 
-        Under `on_arrival` an episode may hold several missions.
+        Under `on_arrival`, and where a battery ends missions, an episode may hold several missions.
         """
         scenario, worlds, kind = self.population.scenario, self._worlds, self.population.observation
-        n_steps, on_arrival = scenario.mission.max_steps, scenario.mission.episode_end == "on_arrival"
+        n_steps, at_any_step = scenario.mission.max_steps, scenario.ends_at_any_step
         walk, explore, choice, replay = self._draws(n_steps)
-        starts = self._layouts(n_steps if on_arrival else 1)
+        starts = self._layouts(n_steps if at_any_step else 1)
         loss = torch.zeros(len(self.population.runs), device=self.device)
         observation = self._tensor(worlds.observe(kind))
         for t in range(n_steps):
@@ -106,8 +106,8 @@ class Training:
             loss += self.learner.update(self._buffer.sample(replay[t]))
             self._stats.add_step(worlds.state, outcome)
             # Reading from the device which missions ended would make the host wait: under `at_time_limit`
-            # only the last step ends one, under `on_arrival` every step can.
-            if on_arrival or t == n_steps - 1:
+            # only the last step ends one, unless a battery does; under `on_arrival` every step can.
+            if at_any_step or t == n_steps - 1:
                 ended = outcome.terminated | outcome.truncated
                 self._stats.end_missions(ended, worlds.state, outcome)
                 worlds.restart(ended, starts[t - n_steps])
@@ -171,6 +171,7 @@ class Training:
         state = in_worlds("world")
         # Checkpoints of version 0.1.0 lack it. Their data is that so far.
         state.setdefault("mission_reward", state["total_reward"])
+        state.setdefault("energy_used_j", 0.0 * state["total_reward"])  # nor that: they have no battery
         self._worlds.state = State(**state)
         self._stats.restore(in_worlds("books"))
         self.n_flown = values["n_flown"]

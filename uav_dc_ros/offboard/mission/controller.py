@@ -121,6 +121,7 @@ class MissionController:
             cell=self.cell,
             goal=self.progress.goal if self._steps.resumes_move or self.phase is Phase.MOVING else None,
             steps_not_reached=self.progress.steps_not_reached,
+            energy_used_j=float(self.progress.energy_used_j),
             airborne=True,
             released=self._released or (self.is_over and not self._telemetry.armed),
             outcome=(self.phase if self.is_over else landing.outcome) if lands else None,

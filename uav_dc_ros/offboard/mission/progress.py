@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros.core import world as core
+from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
@@ -23,6 +24,7 @@ class Checkpoint(msgspec.Struct, frozen=True, kw_only=True):
     cell: Cell  # reached last
     goal: Cell | None = None  # of the move in progress, which the restarted bridge completes
     steps_not_reached: int = 0
+    energy_used_j: float = 0.0  # by the scenario's model
     airborne: bool = False  # the vehicle has left the ground, or may have
     released: bool = False  # to another controller, or it stands again: the bridge requests nothing any more
     allowed_mode: str | None = None  # see `Preflight`
@@ -45,6 +47,7 @@ class MissionProgress:
         self.step, self.cell = self.checkpoint.step, self.checkpoint.cell  # steps flown, cell reached last
         self.goal = self.checkpoint.goal or self.checkpoint.cell  # cell that the vehicle flies to, or is in
         self.steps_not_reached = self.checkpoint.steps_not_reached  # that ended away from their goal's centre
+        self.energy_used_j: Array = np.asarray(self.checkpoint.energy_used_j)  # by the model, joules
 
     @property
     def target(self) -> Enu:
@@ -75,24 +78,32 @@ class MissionProgress:
         offsets = (abs(p - t) / size for p, t, size in zip(position, self.target, sizes_m, strict=True))
         if max(offsets) > settings.max_offset_cells:
             return False
-        lands = bool(core.end_of_mission(self.scenario, np.asarray(self.step + 1), np.asarray(self.goal))[2])
+        lands = self._ends(self.step + 1, self.goal, self._energy_after())[2]
         return not lands or self.dock_distance_m(position) <= settings.landing_radius_m
 
     def complete_step(self, reached: bool = True) -> None:
         """End a step; `reached`: at its goal."""
+        self.energy_used_j = self._energy_after()
         self.step, self.cell = self.step + 1, self.goal
         self.steps_not_reached += not reached
 
     @property
     def is_done(self) -> bool:
         """Whether the last step is flown."""
-        terminated, truncated, _ = self._ends()
-        return self.step > 0 and bool(terminated or truncated)
+        terminated, truncated, _ = self._ends(self.step, self.cell, self.energy_used_j)
+        return self.step > 0 and (terminated or truncated)
 
     @property
     def is_at_dock(self) -> bool:
         """Whether the last step ended where the vehicle lands."""
-        return bool(self._ends()[2])
+        return self._ends(self.step, self.cell, self.energy_used_j)[2]
 
-    def _ends(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return core.end_of_mission(self.scenario, np.asarray(self.step), np.asarray(self.cell))
+    def _energy_after(self) -> Array:
+        """Energy used after a step from the cell to the goal."""
+        cell, goal = np.asarray(self.cell), np.asarray(self.goal)
+        return core.energy_after(self.scenario, self.energy_used_j, cell, goal)
+
+    def _ends(self, step: int, cell: Cell, energy_used_j: Array) -> tuple[bool, bool, bool]:
+        ends = core.end_of_mission(self.scenario, np.asarray(step), np.asarray(cell), energy_used_j)
+        terminated, truncated, landed = map(bool, ends)
+        return terminated, truncated, landed

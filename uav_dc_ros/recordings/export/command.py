@@ -148,6 +148,8 @@ def _write_tables(
 def _write_transitions(options: argparse.Namespace, recorded: Steps, scenario: Scenario) -> None:
     """Write transitions into a new .npz file, with one in memory."""
     observation: Observation = options.observation or "mission"
+    if (problem := observations.problem(observation, scenario)) is not None:
+        raise ParameterError(f"--observation: {problem}")
     transitions = RecordedTransitions(recorded, scenario, observation)
     n = 0
     with _new(options.out) as scratch:

@@ -247,8 +247,10 @@ class WorldCheck(Check):
         remaining = max(scenario.mission.max_steps - step.step, 0)
         found = self.compare(step, "mission", "fingerprint", status.fingerprint, scenario.fingerprint)
         found += self.compare(step, "mission", "remaining_steps", status.remaining_steps, remaining)
+        found += self._battery(step, status, before)
         number, at = np.asarray(step.step), np.asarray(status.cell)
-        terminated, truncated, landed = world.end_of_mission(scenario, number, at)
+        used_j = payloads.energy_used_j(status)
+        terminated, truncated, landed = world.end_of_mission(scenario, number, at, used_j)
         phase = Phase.READY
         if step.step and (terminated or truncated):
             phase = Phase.LANDED if landed else Phase.TIMEOUT
@@ -272,6 +274,21 @@ class WorldCheck(Check):
             self._hovered += 1
         hovers = not self._lockstep and list(before.status.cell) == cell  # as without a move in time
         return found + wrong, "" if before.move or hovers else "the move before it is not recorded"
+
+    def _battery(self, step: RecordedStep, status: Mission, before: RecordedStep | None) -> list[Difference]:
+        """Differences of the energy used from that of the recorded cells, and of the state of charge."""
+        scenario, used_j = self._scenario, payloads.energy_used_j(status)
+        if step.step == 0:
+            used_j = np.asarray(0.0)
+        elif before is not None and step.follows(before) and before.status is not None:
+            left, cell = np.asarray(before.status.cell), np.asarray(status.cell)
+            if np.abs(cell - left).sum() <= 1:  # otherwise the cell is the difference
+                used_j = world.energy_after(scenario, payloads.energy_used_j(before.status), left, cell)
+        return [
+            one
+            for name, recomputed in payloads.battery(scenario, used_j).items()
+            for one in self.compare(step, "mission", name, getattr(status, name), recomputed)
+        ]
 
     def _simulation(self, step: RecordedStep, status: Mission) -> list[Difference]:
         """Differences of seed, poses and users from those of the simulated world."""
