@@ -1,6 +1,7 @@
 """The result of a flown mission."""
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from uav_dc_ros.core.reward import RewardData
 from uav_dc_ros.messages import Phase
@@ -24,5 +25,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     # the data of the `step`, the mean of r^t over the steps with rates.
     reward: float
     reward_data: RewardData  # data in r^t, `so_far` or `step`
+    # Energy by the scenario's model, joules, and for each Mbit collected (null where none was); absent in a
+    # scenario without a battery
+    energy_used_j: float | UnsetType = UNSET
+    energy_per_mbit_j: float | UnsetType | None = UNSET
     reason: str  # end of a real vehicle's mission, or cause of an abort, in words; else empty
     bag: str | None  # folder of the bag, or null

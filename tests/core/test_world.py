@@ -288,6 +288,7 @@ def test_shapes_and_types(three, array, batch, dtype):
         "collected": ((users,), truth),
         "total_reward": ((), real),
         "mission_reward": ((), real),
+        "energy_used_j": ((), real),
     }
     of_outcome = {
         "reward": ((), real),

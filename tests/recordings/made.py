@@ -82,6 +82,7 @@ def flight(
                 phase=phase,
                 cell=tuple(state.cell.tolist()),
                 remaining_steps=max_steps - step,
+                **payloads.battery(scenario, state.energy_used_j),
                 seed=seed + mission,
                 scenario=scenario.name,
                 fingerprint=scenario.fingerprint,

@@ -173,6 +173,12 @@ def of_step(energies_j: StepEnergies, cell: Array, after: Array, like: Array) ->
     return xp.take(table, (kind + 2).reshape((-1,)), axis=0).reshape(kind.shape)
 
 
+def per_mbit_j(used_j: Array, data_bits: Array) -> Array:
+    """Energy for each megabit collected, joules, both `[...]`; NaN where nothing was collected."""
+    xp = array_namespace(used_j)
+    return used_j / xp.where(data_bits > 0.0, data_bits / 1e6, math.nan)
+
+
 def state_of_charge(settings: EnergySettings, used_j: Array) -> Array:
     """Share of the battery that is left, from 1 to 0, after `used_j` joules `[...]`; `[...]`."""
     left = 1.0 - used_j / settings.battery_j

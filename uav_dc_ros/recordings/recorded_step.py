@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from uav_dc_ros import messages, payloads
+from uav_dc_ros.core import energy
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import RewardData, mission_reward
 from uav_dc_ros.core.scenario import Scenario
@@ -135,6 +136,7 @@ class MissionTotals:
     data_bits: float | None = None  # from all users at the last rates
     reward: float | None = None  # of the mission, see `core.reward.mission_reward`
     n_rewards: int = 0  # steps with a known r^t: the end is the last of them, and the mean is over them
+    energy_used_j: float | None = None  # at the last status; None in a scenario without a battery, too
     seed: int | None = None
     scenario: str | None = None
     fingerprint: str | None = None
@@ -143,6 +145,13 @@ class MissionTotals:
     def is_over(self) -> bool:
         """Whether the bag holds the end of the mission."""
         return self.outcome != UNFINISHED
+
+    @property
+    def energy_per_mbit_j(self) -> float | None:
+        """Energy for each megabit collected, joules; None where unknown, or nothing was collected."""
+        if self.energy_used_j is None or not self.data_bits:
+            return None
+        return float(energy.per_mbit_j(np.asarray(self.energy_used_j), np.asarray(self.data_bits)))
 
     def add_reward(self, total: float, data: RewardData) -> None:
         """Add the r^t of the next step that has one."""
@@ -158,6 +167,7 @@ class MissionTotals:
         if status is not None:
             self.seed, self.scenario, self.fingerprint = status.seed, status.scenario, status.fingerprint
             self.reason, self.steps_not_reached = status.reason, status.steps_not_reached
+            self.energy_used_j = None if status.energy_used_j is msgspec.UNSET else status.energy_used_j
             if status.phase.is_over:
                 self.outcome = status.phase.value
 

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -55,7 +56,11 @@ class MonitoredMission(MissionTotals):
             reward_data=scenario.reward.data,
             reason=self.reason,
             bag=bag,
+            **({} if scenario.energy is None else self._battery()),
         )
+
+    def _battery(self) -> dict[str, Any]:
+        return {"energy_used_j": self.energy_used_j or 0.0, "energy_per_mbit_j": self.energy_per_mbit_j}
 
 
 class MissionMonitor(MissionNode):

@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
@@ -61,6 +62,9 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     # over its steps with the data of the `step`
     reward: Figure
     episode_return: Figure  # undiscounted sum of the agent's rewards
+    # Energy used in a mission, joules, and for each Mbit collected; absent in a scenario without a battery
+    energy_used_j: Figure | UnsetType = UNSET
+    energy_per_mbit_j: Figure | UnsetType = UNSET
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
@@ -109,7 +113,8 @@ def evaluate_act(
 ) -> EvaluatedMissions:
     """Fly one mission per seed with the actions of a policy or a planner."""
     missions = roll_out(scenario, act, seeds)
-    values = {f.name: np.asarray(getattr(missions, f.name), np.float64) for f in fields(Missions)}
+    of_missions = {f.name: getattr(missions, f.name) for f in fields(Missions)}
+    values = {name: np.asarray(v, np.float64) for name, v in of_missions.items() if v is not None}
     values["landing_rate"] = values.pop("landed")
     evaluation = Evaluation(
         policy=name,
@@ -120,7 +125,7 @@ def evaluate_act(
         seeds=(seeds[0], len(seeds)),
         users_total=scenario.n_users,
         reward_data=scenario.reward.data,
-        **{figure: _figure(of_missions, _RANGES.get(figure)) for figure, of_missions in values.items()},
+        **{name: _figure(each, _RANGES.get(name)) for name, each in values.items()},
     )
     return EvaluatedMissions(evaluation=evaluation, values=values)
 
@@ -134,7 +139,11 @@ def compare(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> Compar
         scenario=evaluation.scenario,
         fingerprint=evaluation.fingerprint,
         seeds=evaluation.seeds,
-        differences={name: _figure(evaluated.values[name] - baseline.values[name]) for name in TITLES},
+        differences={
+            name: _figure(evaluated.values[name] - baseline.values[name])
+            for name in TITLES
+            if name in evaluated.values
+        },
     )
 
 
@@ -162,6 +171,8 @@ _SHOWN = {
     "data_bits": ("data, Mbit", 1e6, 1),
     "reward": ("reward", 1.0, 3),  # with the words of `MISSION_REWARD` behind it
     "episode_return": ("return", 1.0, 3),
+    "energy_used_j": ("energy, kJ", 1e3, 2),
+    "energy_per_mbit_j": ("energy, J/Mbit", 1.0, 1),
 }
 TITLES = {name: title for name, (title, _, _) in _SHOWN.items()}
 COLUMNS = ("", "mean", "95% interval", "min", "max")
@@ -171,7 +182,9 @@ def rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
     """The texts of `COLUMNS` for every figure."""
     table: list[tuple[str, ...]] = []
     for name, title in TITLES.items():
-        figure: Figure = getattr(evaluation, name)
+        figure: Figure | UnsetType = getattr(evaluation, name)
+        if figure is UNSET:
+            continue
         if name == "reward":
             title = f"{title} {MISSION_REWARD[evaluation.reward_data]}"
         # Extremes of landings, which are 0 or 1, carry no information.

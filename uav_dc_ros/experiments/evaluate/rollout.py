@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from uav_dc_ros.core import mission, world
+from uav_dc_ros.core import energy, mission, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
@@ -33,6 +33,9 @@ class Missions:
     data_bits: Array  # collected from all users
     reward: Array  # of the mission, see `core.reward.mission_reward`
     episode_return: Array  # undiscounted sum of the agent's rewards
+    # Energy used, joules, and for each Mbit collected (NaN where none was); None without a battery
+    energy_used_j: Array | None = None
+    energy_per_mbit_j: Array | None = None
 
 
 def rollout_steps(
@@ -81,15 +84,21 @@ def roll_out(
         over = over | outcome.terminated | outcome.truncated
         if over.all():
             break
+    data_bits = np.sum(final.data_bits, axis=-1)
+    battery = {}
+    if scenario.energy is not None:
+        per_mbit_j = energy.per_mbit_j(final.energy_used_j, data_bits)
+        battery = {"energy_used_j": final.energy_used_j, "energy_per_mbit_j": per_mbit_j}
     return Missions(
         users_collected=np.sum(final.collected, axis=-1),
         landed=landed,
         steps=final.step,
         arrival_step=np.where(landed, arrival, np.nan),
         sum_rate_bps=rate_sum / final.step,
-        data_bits=np.sum(final.data_bits, axis=-1),
+        data_bits=data_bits,
         reward=final.mission_reward,
         episode_return=episode_return,
+        **battery,
     )
 
 

@@ -63,7 +63,8 @@ class ShardResult:
     def to_bytes(self) -> bytes:
         """One safetensors file."""
         arrays = {f"curves.{name}": values for name, values in self.curves.items()}
-        arrays |= {f"greedy.{f.name}": np.asarray(getattr(self.greedy, f.name)) for f in fields(Missions)}
+        greedy = {f.name: getattr(self.greedy, f.name) for f in fields(Missions)}
+        arrays |= {f"greedy.{name}": np.asarray(v) for name, v in greedy.items() if v is not None}
         for run, parameters in enumerate(self.parameters):
             arrays |= {f"parameters.{run}.{name}": values for name, values in parameters.items()}
         return safetensors.numpy.save({name: np.ascontiguousarray(v) for name, v in arrays.items()})
@@ -82,7 +83,7 @@ class ShardResult:
                 parts[part][name] = values
         return cls(
             curves=parts["curves"],
-            greedy=Missions(**{f.name: parts["greedy"][f.name] for f in fields(Missions)}),
+            greedy=Missions(**{f.name: parts["greedy"].get(f.name) for f in fields(Missions)}),
             parameters=[parameters[run] for run in range(len(parameters))],
         )
 

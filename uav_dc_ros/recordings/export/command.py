@@ -37,6 +37,8 @@ Tables go into a new folder, one file each, one observation a row:
   phases    real vehicles only: a row per phase report, with reason and time
 For a real vehicle, steps also hold the reason of the phase and the duration of the move that led there;
 missions hold the vehicle, the reason of the end, and the number of flown steps that did not reach their cell.
+With a battery in the scenario, steps also hold the energy used and the state of charge; missions hold the
+energy used, and the energy for each Mbit.
 Units are in the names of columns. Rewards are computed from recorded cells, rates and data. The reward of a
 mission depends on the data in r^t (reward_data): {_REWARDS}. Steps without a known r^t are
 left out.
@@ -116,7 +118,7 @@ def _write_tables(
     options: argparse.Namespace, recorded: Steps, scenario: Scenario, about: dict[str, str], vehicle: str
 ) -> None:
     """Write tables into a new folder, with one piece of each in memory."""
-    columns = table_columns(vehicle)
+    columns = table_columns(vehicle, scenario.energy is not None)
     names: list[str] = options.tables or list(columns)
     format: Format = options.format or "parquet"
     for name in names:

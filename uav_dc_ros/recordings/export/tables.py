@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from uav_dc_ros import payloads
 from uav_dc_ros.core import reward as core_reward
@@ -59,6 +60,11 @@ TABLES: dict[str, Columns] = {
         "reward_data": "text",  # data in r^t: step, so_far
     },
 }
+# Further columns of a scenario with a battery, by its model; those of a step are at its end.
+BATTERY: dict[str, Columns] = {
+    "steps": {"energy_used_j": "float", "state_of_charge": "float"},
+    "missions": {"energy_used_j": "float", "energy_per_mbit_j": "float"},
+}
 # Further columns of flights with a real vehicle.
 REAL: dict[str, Columns] = {
     "steps": {
@@ -75,11 +81,11 @@ REAL: dict[str, Columns] = {
 # fmt: on
 
 
-def table_columns(vehicle: str) -> dict[str, Columns]:
+def table_columns(vehicle: str, has_battery: bool = False) -> dict[str, Columns]:
     """Columns of each table for flights with this vehicle, as `step_reader.vehicle` names it."""
-    if vehicle == SIMULATED:
-        return TABLES
-    return {name: {**TABLES.get(name, {}), **REAL.get(name, {})} for name in (*TABLES, "phases")}
+    parts = [TABLES, *([BATTERY] if has_battery else []), *([REAL] if vehicle != SIMULATED else [])]
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: {k: v for part in parts for k, v in part.get(name, {}).items()} for name in names}
 
 
 class MissionRows:
@@ -125,6 +131,8 @@ class MissionRows:
             "phase": status and status.phase.value,
             "reason": status and status.reason,
             "remaining_steps": status and status.remaining_steps,
+            "energy_used_j": status and _known(status.energy_used_j),
+            "state_of_charge": status and _known(status.state_of_charge),
             "action": step.move and step.move.action,
             "sum_rate_bps": rates and rates.sum_rate_bps,
             "users_served": rates and sum(rates.served),
@@ -185,6 +193,8 @@ class MissionRows:
             "total_reward": self._total and self._total[1],
             "reward": totals.reward,
             "reward_data": self._scenario.reward.data,
+            "energy_used_j": totals.energy_used_j,
+            "energy_per_mbit_j": totals.energy_per_mbit_j,
             "vehicle": self._vehicle,
             "reason": totals.reason if known else None,
             "steps_not_reached": totals.steps_not_reached if known else None,
@@ -201,6 +211,10 @@ def _flown_s(before: RecordedStep | None, step: RecordedStep) -> float | None:
     if start is None or end is None or start.clock_resets != end.clock_resets:
         return None
     return (end.publish_ns - start.publish_ns) / 1e9
+
+
+def _known(value: float | UnsetType) -> float | None:
+    return None if value is UNSET else value
 
 
 def _phases(step: RecordedStep) -> Rows:
