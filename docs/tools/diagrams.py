@@ -28,7 +28,8 @@ CONTENT = {
     "pose": "the UAV's position and heading",
     "users": "step, time, and of every user the cluster, x and y",
     "rates": "sum-rate; of every user SINR, rate, data, served, collected",
-    "mission": "step that the vehicle is ready for, phase, reason, cell, remaining steps, steps not reached",
+    "mission": "step that the vehicle is ready for, phase, reason, cell, remaining steps, steps not reached, "
+    "energy used",
     "move": "the action for one step",
     "target": "the cell that the vehicle flies to",
     "ready": "a node has matched all its peers",

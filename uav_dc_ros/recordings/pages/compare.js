@@ -4,7 +4,7 @@
 const METRICS = (rewardWords) => [
   ["landed", "landed", "%", 0], ["users_collected", "users collected", "", 1], ["data_bits", "data", "bit", null],
   ["sum_rate_bps", "mean sum-rate", "bit/s", null], ["distance_m", "distance flown", "m", null], ["steps", "steps", "", 1],
-  ["reward", `reward ${rewardWords}`, "", 3],
+  ["reward", `reward ${rewardWords}`, "", 3], ["energy_used_j", "energy used", "J", null], ["energy_per_mbit_j", "energy for data", "J/Mbit", 1],
 ];
 // Okabe and Ito's colours without yellow, which is invisible on paper. Dashes distinguish groups without colour.
 const SHADES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c7853", "#7f7f9f"];
@@ -12,7 +12,7 @@ const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "5
 
 open(async (page, data) => {
   const { groups, world } = data;
-  const metrics = METRICS(data.reward_words);
+  const metrics = METRICS(data.reward_words).filter(([metric]) => groups.some((group) => group.metrics[metric]));
   const one = groups.every((group) => group.missions === 1);
   const policies = [...new Set(groups.map((group) => group.policy))];
   page.querySelector("header").prepend(make("div", {}, page.querySelector("h1"),
@@ -32,6 +32,7 @@ open(async (page, data) => {
 
   // A mean, and below it its interval in the same unit.
   function range(interval, unit, digits, sign = "") {
+    if (!interval) return NONE; // a world without a battery, or no data
     const [scale, prefix] = digits === null ? siScale(Math.abs(interval.mean)) : [unit === "%" ? 0.01 : 1, ""];
     const number = (value) => {
       const scaled = Math.abs(value / scale);
@@ -50,7 +51,7 @@ open(async (page, data) => {
       : { name: "missions", text: (row) => cell(String(row.missions), make("div", { class: "range" }, row.seeds && `seed ${row.seeds}`)), value: (row) => row.missions },
   ];
   const figures = metrics.map(([metric, words, unit, digits]) => ({
-    name: words, text: (row) => range(row.metrics[metric], unit, digits), value: (row) => row.metrics[metric].mean,
+    name: words, text: (row) => range(row.metrics[metric], unit, digits), value: (row) => row.metrics[metric]?.mean ?? null,
   }));
   const paired = groups.filter((group) => group.paired);
   page.append(
@@ -62,7 +63,7 @@ open(async (page, data) => {
           { name: "bag", text: (row) => name(groups.indexOf(row)), value: (row) => row.label },
           { name: "seeds in common", text: (row) => String(row.paired.seeds), value: (row) => row.paired.seeds },
           ...metrics.map(([metric, words, unit, digits]) => ({
-            name: words, text: (row) => range(row.paired.differences[metric], unit, digits, "+"), value: (row) => row.paired.differences[metric].mean,
+            name: words, text: (row) => range(row.paired.differences[metric], unit, digits, "+"), value: (row) => row.paired.differences[metric]?.mean ?? null,
           })),
         ], paired, { label: "Paired differences", caption: "Equal seeds give equal users at equal positions. An interval without zero is a significant difference." })) : null)),
     make("section", { "aria-labelledby": "flights" }, make("h2", { id: "flights" }, "Flights"),

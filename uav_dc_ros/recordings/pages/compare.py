@@ -21,7 +21,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.messages import Phase, printable
 from uav_dc_ros.recordings import step_reader
-from uav_dc_ros.recordings.pages.missions import MissionData, read_missions, significant
+from uav_dc_ros.recordings.pages.missions import BATTERY, MissionData, read_missions, significant
 from uav_dc_ros.recordings.pages.page import PAGE_MAX, Page, world_data
 from uav_dc_ros.recordings.recorded_step import mission_name
 from uav_dc_ros.recordings.thinning import spread
@@ -71,15 +71,20 @@ class Group:
             "users": self.scenario.n_users,
             "missions": len(self.summaries),
             "seeds": self._seeds(),
-            "metrics": {name: self._metric(name) for name in METRICS},
+            "metrics": {name: self._metric(name) for name in self._metrics()},
             "paired": None if self is first else self._paired(first),
             "curves": {name: self._band(name, axis) for name in CURVES},
             "paths": self.paths,
         }
 
-    def _metric(self, name: str) -> dict[str, float | None]:
-        """Mean and 95% interval; None of one mission."""
-        values = np.asarray([it[name] for it in self.summaries], np.float64)
+    def _metrics(self) -> tuple[str, ...]:
+        return (*METRICS, *BATTERY) if self.scenario.energy else METRICS
+
+    def _metric(self, name: str) -> dict[str, float | None] | None:
+        """Mean and 95% interval over the missions that have it; no interval of one, and None of none."""
+        values = np.asarray([it[name] for it in self.summaries if it[name] is not None], np.float64)
+        if not values.size:
+            return None
         if len(values) < 2:
             return {"mean": float(values.mean()), "low": None, "high": None}
         found = stats.interval(values)
@@ -103,9 +108,11 @@ class Group:
         common = sorted(set(mine) & set(theirs))
         if len(common) < 2:
             return None
+        pairs = [(mine[seed], theirs[seed]) for seed in common]
         differences = {
-            metric: stats.interval([mine[seed][metric] - theirs[seed][metric] for seed in common])._asdict()
-            for metric in METRICS
+            name: stats.interval(values)._asdict()
+            for name in self._metrics()
+            if len(values := [a[name] - b[name] for a, b in pairs if None not in (a[name], b[name])]) > 1
         }
         return {"seeds": len(common), "differences": differences}
 

@@ -247,6 +247,10 @@ open(async (page, data) => {
       ["steps", `${one.steps}`, `of ${world.max_steps}`],
       ...(one.steps_not_reached ? [["steps not reached", `${one.steps_not_reached}`, `of ${one.steps}`, "bad"]] : []),
       [`reward ${world.reward_words}`, fixed(one.reward, 3)],
+      ...("energy_used_j" in one ? [
+        ["energy used", ...si(one.energy_used_j, "J").split(" ")],
+        ["energy for data", one.energy_per_mbit_j === null ? NONE : fixed(one.energy_per_mbit_j, 1), "J/Mbit"],
+      ] : []),
     ]));
     at("why").hidden = !one.reason || landed;
     at("why").textContent = one.reason ? `${one.outcome}: ${one.reason}` : "";

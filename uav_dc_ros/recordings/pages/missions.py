@@ -25,6 +25,7 @@ from uav_dc_ros.recordings.thinning import EveryNth, spread
 STEPS_MAX = 400  # shown of a mission: the resolution of a slider
 VALUES_MAX = 60_000  # steps times users: the capacity of a page
 USERS_MAX = 2_000  # shown
+BATTERY = ("energy_used_j", "energy_per_mbit_j")  # in summaries of a scenario with a battery
 WAITING, SERVED, COLLECTED = "012"  # state of a user in the page data
 
 
@@ -104,6 +105,7 @@ class MissionData:
             "distance_m": self._distance_m,
             "reward": (math.nan if totals.steps else 0.0) if totals.reward is None else totals.reward,
             "reward_data": self.scenario.reward.data,
+            **({name: getattr(totals, name) for name in BATTERY} if self.scenario.energy else {}),
         }
 
     def _rewards(self) -> tuple[float, float, float]:
