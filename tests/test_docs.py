@@ -10,12 +10,14 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from ruamel.yaml import YAML
 
 from tests.conftest import ROOT
 from tests.doc_commands import blocks, commands, parameter, parsed
 from uav_dc_ros import bag, files, scenarios
+from uav_dc_ros.core.energy import EnergySettings
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import node_main
@@ -190,9 +192,11 @@ def test_the_diagrams_show_every_row_of_the_tables() -> None:
 
 
 def test_every_key_in_the_symbol_table_is_a_scenario_s() -> None:
-    scenario: Scenario = scenarios.load("five_clusters")
+    scenario: Scenario = msgspec.structs.replace(
+        scenarios.load("five_clusters"), energy=EnergySettings(battery_j=1e5)
+    )
     keys = re.findall(
-        r"`((?:grid|users|mission|radio|reward)\.\w+)`", (DOCS / "symbols.md").read_text("utf-8")
+        r"`((?:grid|users|mission|radio|reward|energy)\.\w+)`", (DOCS / "symbols.md").read_text("utf-8")
     )
     assert len(keys) >= 15
     for key in keys:

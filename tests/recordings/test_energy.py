@@ -14,10 +14,14 @@ from tests.support.worlds import changed, saved, tiny
 from uav_dc_ros import bag as command
 from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.env.vector_env import DataCollectionVectorEnv
 from uav_dc_ros.errors import MessageError, PolicyError
 from uav_dc_ros.offboard.mission.progress import Checkpoint, MissionProgress
+from uav_dc_ros.recordings.pages.compare import Group
+from uav_dc_ros.recordings.pages.missions import read_missions
+from uav_dc_ros.recordings.step_reader import Steps
 
 # Ten hovers of 10 s, about: each mission of at most 30 steps ends by the battery.
 BATTERY = "[energy]\nbattery_j = 17000.0\nends = 'both'\ncruise_mps = 18.3\n"
@@ -137,6 +141,22 @@ def test_export_holds_it(flown, tmp_path, capsys):
         )
         charge = [np.float32(info["state_of_charge"]) for infos in flown.simulated for info in infos[1:]]
         np.testing.assert_allclose(made["next_observation"][:, -1], charge, rtol=1e-6)
+
+
+def test_reports_hold_it(flown):
+    group = Group("bag", flown.scenario, "untrained", "bag")
+    with BagReader(flown.bag) as reader:
+        for mission in read_missions(Steps(reader, "", flown.scenario.step_ns), flown.scenario, False):
+            group.add(mission)
+    for name in ("energy_used_j", "energy_per_mbit_j"):
+        assert [one[name] for one in group.summaries] == [summary[name] for summary in flown.summaries]
+    metrics = group.data(group, np.arange(5))["metrics"]
+    assert metrics["energy_used_j"]["mean"] == pytest.approx(
+        np.mean([s["energy_used_j"] for s in flown.summaries])
+    )
+    for summary in group.summaries:
+        summary["energy_per_mbit_j"] = None  # as of missions that collect nothing
+    assert group.data(group, np.arange(5))["metrics"]["energy_per_mbit_j"] is None
 
 
 def test_a_world_without_a_battery_has_none_of_it(tmp_path, capsys):
