@@ -44,7 +44,7 @@ ADVICE_S = 30.0
 OFFBOARD_GAP_S, OFFBOARD_PROOF_S = 0.5, 1.0
 SO_TIMESTAMPNS = 35  # of Linux: when a datagram came, however late this process reads it
 # Wall: for a client that streams setpoints, for another one; simulated.
-PATIENCE_S, PATIENCE_BEFORE_S, LEAP_S = 0.6, 0.25, 0.4
+PATIENCE_S, PATIENCE_BEFORE_S, LEAP_S = 1.0, 0.25, 0.4
 AHEAD_S, AHEAD_OF_HEARTBEATS_S = 0.4, 1.2  # simulated: of a client that streams; of one that does not
 FLAGS, MADE_UP = 0x33F, 0x80
 HOME = (47.397742, 8.545594, 488.0)
@@ -591,7 +591,7 @@ def main() -> None:
     autopilot = Autopilot(copter, system=1)
     control, wire = Control(autopilot), Wire(options.tcp, options.udp)
     wall_s = heard_wall_s = time.monotonic()
-    heard_s, owed_s = 0.0, 0.0
+    heard_s, owed_s, setpoints, streamed_wall_s = 0.0, 0.0, 0, 0.0
     while not control.ended:
         select.select([*wire.files(), sys.stdin], [], [], 0.001 if wire.met else 0.05)
         control.read()
@@ -599,12 +599,16 @@ def main() -> None:
         is_dropped = now_s < control.dropped_until
         if wire.exchange(autopilot, is_dropped):
             heard_wall_s, heard_s = now_s, copter.t_s
+        if autopilot.setpoints != setpoints:
+            setpoints, streamed_wall_s = autopilot.setpoints, now_s
         passed_s, wall_s = now_s - wall_s, now_s
         autopilot.answer()
         streams = copter.t_s - copter.streamed_s < 2 * AHEAD_OF_HEARTBEATS_S
-        ahead_s = AHEAD_S if streams else AHEAD_OF_HEARTBEATS_S
-        patience_s = PATIENCE_S if streams else PATIENCE_BEFORE_S
-        waits = now_s - heard_wall_s < patience_s and copter.t_s - heard_s >= ahead_s
+        if streams:  # a setpoint, since other threads of the client send the rest
+            waits = now_s - streamed_wall_s < PATIENCE_S and copter.t_s - copter.streamed_s >= AHEAD_S
+        else:
+            is_patient = now_s - heard_wall_s < PATIENCE_BEFORE_S
+            waits = is_patient and copter.t_s - heard_s >= AHEAD_OF_HEARTBEATS_S
         if not wire.met or (waits and not is_dropped):
             continue
         owed_s = min(owed_s + passed_s * options.speed, LEAP_S)
