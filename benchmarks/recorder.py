@@ -195,7 +195,8 @@ def main() -> None:
         "recorder": recorded,
     }
     print(f"{os.cpu_count()} cores, medians of {rounds} rounds")
-    with tempfile.TemporaryDirectory(dir=Path.cwd()) as name:
+    # On the disk of the working directory; git ignores the name, since a killed benchmark leaves the folder.
+    with tempfile.TemporaryDirectory("_cache", ".recorder_", Path.cwd()) as name:
         folder = Path(name)
         for size in FIRST_HZ:
             rates: dict[str, list[float]] = {"bare mcap writer": [], **{trial: [] for trial in trials}}
