@@ -13,6 +13,7 @@ from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.acknowledgements import AcknowledgementWindow
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 
@@ -42,6 +43,7 @@ class ChannelMonitorNode(MissionNode):
         self._poses: deque[tuple[cdr.Pose, int]] = deque(maxlen=WAITING_MAX)  # and its publication time
         self._users: deque[tuple[messages.Users, Array, int]] = deque(maxlen=WAITING_MAX)
         self._measured_ns = 0  # publication time of the last users that were measured
+        self._unacknowledged = AcknowledgementWindow([self.publishers_of["rates"]])
 
     def deactivate(self) -> None:
         """Close the journal."""
@@ -142,6 +144,7 @@ class ChannelMonitorNode(MissionNode):
         self._last, self._data_bits, self._collected = rates, data_bits, collected
         write = self.journal.append if users.step else self.journal.begin
         write(text)  # before it is published: published data are never lost
+        self._unacknowledged.step()
         self.publish_encoded("rates", text)
 
 

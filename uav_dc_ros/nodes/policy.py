@@ -10,6 +10,7 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.acknowledgements import AcknowledgementWindow
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.step_synchronizer import StepSynchronizer
 
@@ -33,6 +34,7 @@ class PolicyNode(MissionNode):
     def activate(self) -> None:
         """Begin without a pending step."""
         self._steps = StepSynchronizer()
+        self._unacknowledged = AcknowledgementWindow([self.publishers_of["move"]])
 
     def on_mission(self, payload: messages.Mission) -> None:
         """Receive a step that the vehicle is ready for."""
@@ -56,6 +58,7 @@ class PolicyNode(MissionNode):
             np.asarray(mission.cell), np.asarray(steps_flown), data_bits, collected, energy_used_j
         )
         move = messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label)
+        self._unacknowledged.step()
         self.publish_payload("move", move)
 
     def _decide(

@@ -17,7 +17,6 @@ from collections import deque
 
 import msgspec
 import numpy as np
-from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 
 from uav_dc_ros import cdr, messages, payloads, scenarios
@@ -30,6 +29,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.framework.acknowledgements import AcknowledgementWindow
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
@@ -37,8 +37,6 @@ from uav_dc_ros.nodes.framework.parameters import EXTERNAL
 from uav_dc_ros.nodes.ros import convert
 
 STALL_S = 1.0  # a lockstep without a step for so long publishes its last messages again
-ACKNOWLEDGE_S = 1.0  # longest wait for acknowledgements in lockstep
-UNACKNOWLEDGED_S = 0.02  # the same, while a subscriber does not acknowledge: it may have been killed
 CLOCK_PERIOD_S = 0.05
 POSE_AGE_MAX_S = 10.0  # of an external vehicle; an older pose was recorded
 USER_BYTES = 40  # of `users`, for each of them
@@ -129,10 +127,8 @@ class WorldNode(MissionNode):
         self._step_at_tick: tuple[int, int] | None = None
         self._next_users: tuple[int, int, bytes] | None = None  # mission, step, encoded payload
         self._hovered = 0  # steps without a move in time
-        self._unacknowledged = 0  # steps since the last wait for acknowledgements
-        self._all_acknowledged = True  # at the last wait
         reliable = [self.publishers_of[name] for name in ("users", "mission") if name in self.publishers_of]
-        self._unacknowledged_max = min(publisher.qos_profile.depth for publisher in reliable) // 2
+        self._unacknowledged = AcknowledgementWindow(reliable)
         self._overruns, self._overruns_reported = 0, 0
         self._lateness_s: deque[float] = deque(maxlen=1000)
         if self.external is None:
@@ -257,18 +253,10 @@ class WorldNode(MissionNode):
         self._move(action)
         self._step_began_s = time.monotonic()
         if self.pace is None:
-            self._wait_for_acknowledgements()
+            self._unacknowledged.step()
         self._publish_step()
         if self._phase is not Phase.READY and self._mission + 1 < self.values["missions"]:
             self._begin(self._mission + 1)
-
-    def _wait_for_acknowledgements(self) -> None:
-        """Wait before unacknowledged steps exceed what publishers keep: lockstep does not wait by itself."""
-        self._unacknowledged += 1
-        if self._unacknowledged > self._unacknowledged_max:
-            timeout = Duration(seconds=ACKNOWLEDGE_S if self._all_acknowledged else UNACKNOWLEDGED_S)
-            self._all_acknowledged = self.publishers_of["mission"].wait_for_all_acked(timeout)
-            self._unacknowledged = 0
 
     def _move(self, action: Action) -> None:
         """One step of the world."""
