@@ -7,7 +7,7 @@ import pytest
 
 from uav_dc_ros import scenarios
 from uav_dc_ros.experiments.paper import report
-from uav_dc_ros.experiments.paper.claims import check
+from uav_dc_ros.experiments.paper.claims.findings import check
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import FULL

@@ -8,8 +8,7 @@ import pytest
 
 from tests.experiments.paper_sweeps import SHORT, of_the_data_of_the_step, realistic, sweep
 from uav_dc_ros.core.stats import Interval
-from uav_dc_ros.experiments.paper.claims import CLAIMS, check, finding
-from uav_dc_ros.experiments.paper.criteria import (
+from uav_dc_ros.experiments.paper.claims.criteria import (
     RULES,
     Criterion,
     all_within,
@@ -20,6 +19,7 @@ from uav_dc_ros.experiments.paper.criteria import (
     lead,
     within,
 )
+from uav_dc_ros.experiments.paper.claims.findings import CLAIMS, check, finding
 from uav_dc_ros.experiments.paper.evidence import Evidence, settling
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.report import tables_md

@@ -6,7 +6,7 @@ import pytest
 
 from uav_dc_ros import scenarios
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.paper.claims import CLAIMS
+from uav_dc_ros.experiments.paper.claims.findings import CLAIMS
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.setting import (
     ALGORITHMS,

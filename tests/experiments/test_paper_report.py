@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from tests.experiments.paper_sweeps import of_the_data_of_the_step, realistic, sweep
-from uav_dc_ros.experiments.paper.claims import CLAIMS, check
+from uav_dc_ros.experiments.paper.claims.findings import CLAIMS, check
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.report import CLAIMS_FILE, VERDICTS_FILE, claims_md, write
 from uav_dc_ros.experiments.paper.setting import FULL, SMOKE

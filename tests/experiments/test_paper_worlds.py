@@ -15,8 +15,8 @@ from tests.conftest import ROOT
 from uav_dc_ros.core.scenario import parse
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.paper import cli
-from uav_dc_ros.experiments.paper.claims import CLAIMS
-from uav_dc_ros.experiments.paper.contradictions import CONTRADICTIONS
+from uav_dc_ros.experiments.paper.claims.contradictions import CONTRADICTIONS
+from uav_dc_ros.experiments.paper.claims.findings import CLAIMS
 from uav_dc_ros.experiments.paper.evidence import NotMeasured
 from uav_dc_ros.experiments.paper.setting import HIDDEN, Setting
 from uav_dc_ros.experiments.paper.shards import ShardResult, save_result, train_shard

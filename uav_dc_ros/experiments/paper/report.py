@@ -12,9 +12,9 @@ from uav_dc_ros import files
 from uav_dc_ros.core.reward import DATA, MISSION_REWARD
 from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.env.trajectory import Trajectory
-from uav_dc_ros.experiments.paper.claims import Finding, check
-from uav_dc_ros.experiments.paper.contradictions import mark
-from uav_dc_ros.experiments.paper.criteria import RULES, Criterion, Table, Verdict
+from uav_dc_ros.experiments.paper.claims.contradictions import mark
+from uav_dc_ros.experiments.paper.claims.criteria import RULES, Criterion, Table, Verdict
+from uav_dc_ros.experiments.paper.claims.findings import Finding, check
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES

@@ -15,7 +15,7 @@ from uav_dc_ros import files
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.env.render import FAINT, INK, PAPER
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.paper.criteria import Verdict
+from uav_dc_ros.experiments.paper.claims.criteria import Verdict
 from uav_dc_ros.experiments.paper.worlds.choices import CHOICES
 from uav_dc_ros.experiments.paper.worlds.choose import choose
 from uav_dc_ros.experiments.paper.worlds.verdicts import IDS, VERDICTS, Multiverse

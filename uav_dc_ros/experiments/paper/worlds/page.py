@@ -8,8 +8,8 @@ import numpy as np
 
 from uav_dc_ros import files
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.experiments.paper.claims import CLAIMS
-from uav_dc_ros.experiments.paper.contradictions import CONTRADICTIONS, mark
+from uav_dc_ros.experiments.paper.claims.contradictions import CONTRADICTIONS, mark
+from uav_dc_ros.experiments.paper.claims.findings import CLAIMS
 from uav_dc_ros.experiments.paper.worlds import plan
 from uav_dc_ros.experiments.paper.worlds.choices import CHOICES, FIXED, PLACES, REFERENCES
 from uav_dc_ros.experiments.paper.worlds.choose import implausibility, ranking

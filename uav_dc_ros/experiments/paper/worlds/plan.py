@@ -12,8 +12,8 @@ import numpy as np
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.experiments.paper import setting, sweep
-from uav_dc_ros.experiments.paper.claims import CLAIMS, Finding, finding
-from uav_dc_ros.experiments.paper.criteria import Claim
+from uav_dc_ros.experiments.paper.claims.criteria import Claim
+from uav_dc_ros.experiments.paper.claims.findings import CLAIMS, Finding, finding
 from uav_dc_ros.experiments.paper.evidence import Evidence
 from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results, ScenarioFacts
 from uav_dc_ros.experiments.paper.setting import OBSERVATION, PlannedRun, Scale, Setting, domain

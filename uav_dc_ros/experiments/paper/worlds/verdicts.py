@@ -17,8 +17,8 @@ import pyarrow as pa  # type: ignore[import-untyped]
 from uav_dc_ros import __version__
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.paper.claims import CLAIMS, Finding
-from uav_dc_ros.experiments.paper.criteria import Verdict
+from uav_dc_ros.experiments.paper.claims.criteria import Verdict
+from uav_dc_ros.experiments.paper.claims.findings import CLAIMS, Finding
 from uav_dc_ros.experiments.paper.results import read_table, write_table
 from uav_dc_ros.experiments.paper.setting import Scale
 from uav_dc_ros.experiments.paper.worlds.draw import World

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from uav_dc_ros.experiments.paper.criteria import Criterion, Table, beside, claim, greater, lead
+from uav_dc_ros.experiments.paper.claims.criteria import Criterion, Table, beside, claim, greater, lead
 from uav_dc_ros.experiments.paper.evidence import Evidence
 from uav_dc_ros.experiments.paper.setting import Setting, name
 

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-from uav_dc_ros.experiments.paper import claims_learning, claims_reward, claims_throughput
-from uav_dc_ros.experiments.paper.criteria import Claim, Criterion, Verdict, joint
+from uav_dc_ros.experiments.paper.claims import learning, reward, throughput
+from uav_dc_ros.experiments.paper.claims.criteria import Claim, Criterion, Verdict, joint
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import PAPER_ENVIRONMENTS
 
-CLAIMS = (*claims_reward.CLAIMS, *claims_throughput.CLAIMS, *claims_learning.CLAIMS)
+CLAIMS = (*reward.CLAIMS, *throughput.CLAIMS, *learning.CLAIMS)
 
 
 class Finding(NamedTuple):

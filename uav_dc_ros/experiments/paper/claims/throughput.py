@@ -4,8 +4,7 @@ from collections.abc import Iterator
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.stats import interval
-from uav_dc_ros.experiments.paper.claims_reward import FORMS_ARE_ONE
-from uav_dc_ros.experiments.paper.criteria import (
+from uav_dc_ros.experiments.paper.claims.criteria import (
     Criterion,
     Table,
     all_within,
@@ -17,6 +16,7 @@ from uav_dc_ros.experiments.paper.criteria import (
     lead,
     over_ratios,
 )
+from uav_dc_ros.experiments.paper.claims.reward import FORMS_ARE_ONE
 from uav_dc_ros.experiments.paper.evidence import Evidence
 from uav_dc_ros.experiments.paper.setting import ALGORITHMS, FORMS, R_PLUS, Setting, name
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.stats import interval
-from uav_dc_ros.experiments.paper.criteria import (
+from uav_dc_ros.experiments.paper.claims.criteria import (
     Criterion,
     Table,
     beside,
