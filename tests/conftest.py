@@ -18,9 +18,9 @@ from typing import IO, Any
 import hypothesis
 import pytest
 
-from uav_dc_ros import files
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.runner.working_folder import memory
 
 MissionController.is_strict = (
     True  # a phase that cannot follow fails the test; in the air it would end the mission
@@ -45,9 +45,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def pytest_configure() -> None:
     """Put the tests' folders in memory if there is room: beside other programs a disk takes seconds."""
-    memory = files.memory_folder()
-    if memory is not None and shutil.disk_usage(memory).free > 4e9:
-        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", memory)
+    folder = memory()
+    if folder is not None and shutil.disk_usage(folder).free > 4e9:
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(folder))
 
 
 # Where the longest tests are, in this order: at the end, short files are left for the workers to share.

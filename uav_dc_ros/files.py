@@ -36,12 +36,6 @@ def shipped_folder(name: str) -> Path:
     raise FileNotFoundError(f"no folder {name}: expected it at {' or '.join(map(str, candidates))}")
 
 
-def memory_folder() -> str | None:
-    """A folder in memory, where no write waits for a busy disk; None: there is none."""
-    folders = (os.environ.get("XDG_RUNTIME_DIR", ""), "/dev/shm")
-    return next((folder for folder in folders if os.access(folder, os.W_OK | os.X_OK)), None)
-
-
 def write(path: Path, content: bytes) -> None:
     """Write a whole file; after a UavDcError a regular file keeps its previous content."""
     try:

@@ -1,7 +1,6 @@
 """One run of run_all: check the options, start the nodes, follow the missions, stop the nodes, report."""
 
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.runner import node_locks, run_options
 from uav_dc_ros.runner.monitor import MissionMonitor, MonitoredMission
 from uav_dc_ros.runner.supervisor import Supervisor
+from uav_dc_ros.runner.working_folder import working_folder
 from uav_dc_ros.topics import SIMULATED, TOPICS
 
 if TYPE_CHECKING:
@@ -109,9 +109,7 @@ class MissionRunner:
     def run(self) -> int:
         """Fly, in a ROS context of its own and without signal handlers; returns the command's exit status."""
         status = 0
-        journals = tempfile.TemporaryDirectory("", "uav_dc_ros_", files.memory_folder())
-        with journals as temporary, ExitStack() as stack:
-            folder = Path(temporary)
+        with working_folder() as folder, ExitStack() as stack:
             network = Network(self.config.namespace, self._create_monitor)
             stack.callback(network.leave)
             namespace, parameters = network.node.get_namespace(), self._parameters(folder)
