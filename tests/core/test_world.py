@@ -289,6 +289,7 @@ def test_shapes_and_types(three, array, batch, dtype):
         "total_reward": ((), real),
         "mission_reward": ((), real),
         "energy_used_j": ((), real),
+        "motion": ((users, 0), real),
     }
     of_outcome = {
         "reward": ((), real),

@@ -68,6 +68,15 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         """Highest index east, north and up."""
         return self.n_x - 1, self.n_y - 1, self.n_z - 1
 
+    @property
+    def area_m(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """South-west and north-east corner x, y of the area of all cells, metres.
+
+        It ends half a cell beyond the outermost centres.
+        """
+        east_m, north_m = (self.n_x - 0.5) * self.cell_m, (self.n_y - 0.5) * self.cell_m
+        return (-0.5 * self.cell_m, -0.5 * self.cell_m), (east_m, north_m)
+
     def move(self, cell: Array, action: Array) -> Array:
         """The cell `[..., 3]` after an `Action` (its value, `[...]`); a move off the grid has no effect."""
         xp = array_namespace(cell)

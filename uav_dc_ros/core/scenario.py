@@ -23,6 +23,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.channel import AERIAL, AERIAL_MAX_HEIGHT_M, AerialVehicle, FreeSpace, Radio
 from uav_dc_ros.core.energy import EnergySettings, StepEnergies
 from uav_dc_ros.core.grid import Grid
+from uav_dc_ros.core.mobility import Mobility, RandomWalk, RandomWaypoint
 from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.errors import ScenarioError
@@ -40,14 +41,15 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """A table of the scenario file."""
 
 
-class UserSettings(_Table, frozen=True):
+class UserSettings(_Table, frozen=True, omit_defaults=True):
     """The users on the ground."""
 
     # Centre x, y of each of the M clusters, metres
     cluster_centres_m: Annotated[tuple[tuple[float, float], ...], Meta(min_length=1, max_length=1000)]
     users_per_cluster: Annotated[int, Meta(ge=1, le=100_000)]  # users K in a cluster
     cluster_radius_m: Positive  # radius C of the disc in which a cluster's users start, metres
-    v_max_mps: NotNegative  # maximum speed v of the random walk, m/s
+    v_max_mps: NotNegative | None = None  # maximum speed v, m/s; only of the random walk, which needs it
+    mobility: Mobility = RandomWalk()  # how users move; `mobility.model` names the struct, see `mobility`
 
 
 class MissionSettings(_Table, frozen=True):
@@ -109,6 +111,11 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
         """Centre of each user's cluster, metres, `[U, 2]`."""
         return tuple(self.users.cluster_centres_m[i] for i in self.user_cluster)
 
+    @property
+    def draws_shape(self) -> tuple[int, int]:
+        """Users U, and uniform draws D of each for the start of a mission and again for each step."""
+        return self.n_users, self.users.mobility.n_draws
+
     @cached_property
     def step_ns(self) -> int:
         """Duration of a step, nanoseconds."""
@@ -161,6 +168,8 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
         del world["reward"]
         if isinstance(self.radio, FreeSpace):
             del world["radio"]["model"]  # which scenarios of version 0.2.0 lack
+        if isinstance(self.users.mobility, RandomWalk):
+            world["users"].pop("mobility", None)  # likewise
         return hashlib.sha256(msgspec.json.encode(world, order="sorted")).hexdigest()[:12]
 
 
@@ -214,7 +223,7 @@ def _check_keys(values: Any, struct: type, source: str, table: str = "") -> None
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
             raise ScenarioError(f"{source}: unknown key {name} = {reprlib.repr(value)}; {hint}")
         if (inner := _table(known[key], value)) is not None:
-            _check_keys(value, inner, source, f"{key}.")
+            _check_keys(value, inner, source, f"{name}.")
 
 
 def _keys(struct: type) -> dict[str, Any]:
@@ -284,6 +293,7 @@ def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 def _inconsistencies(scenario: Scenario) -> Iterator[str]:
     """Errors of combined values, lazily: a later check relies on the earlier ones."""
     grid, mission = scenario.grid, scenario.mission
+    yield from _wrong_speeds(scenario.users)
     top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
     extent = (
         f"x 0 to {(grid.n_x - 1) * grid.cell_m:g} and y 0 to {(grid.n_y - 1) * grid.cell_m:g} m "
@@ -324,6 +334,24 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
         yield from scenario.energy.inconsistencies(grid, mission.step_s, mission.max_steps, moves)
     if isinstance(scenario.radio, AerialVehicle):
         yield from _out_of_range(scenario, scenario.radio.environment, top_m)
+
+
+def _wrong_speeds(users: UserSettings) -> Iterator[str]:
+    """Errors of the speeds of users."""
+    walks = isinstance(users.mobility, RandomWalk)
+    if walks and users.v_max_mps is None:
+        yield "missing key users.v_max_mps"
+    if not walks and users.v_max_mps is not None:
+        model = users.mobility.__struct_config__.tag
+        yield (
+            f"users.v_max_mps = {users.v_max_mps:g}; expected no such key with users.mobility.model = "
+            f"{model!r}: it is the speed of the random walk"
+        )
+    if isinstance(users.mobility, RandomWaypoint) and users.mobility.v_min_mps > users.mobility.v_max_mps:
+        yield (
+            f"users.mobility.v_min_mps = {users.mobility.v_min_mps:g}; expected at most "
+            f"users.mobility.v_max_mps = {users.mobility.v_max_mps:g}"
+        )
 
 
 def _out_of_range(scenario: Scenario, environment: str, top_m: float) -> Iterator[str]:

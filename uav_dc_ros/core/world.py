@@ -37,6 +37,7 @@ class State:
     total_reward: Array  # r^t (eq. 7), `[...]`
     mission_reward: Array  # reward of the mission so far, see `reward.mission_reward`, `[...]`
     energy_used_j: Array  # energy of the steps flown, joules, `[...]`; 0 in a scenario without `energy`
+    motion: Array  # what the users' mobility remembers, see `mobility.move`, `[..., U, 0 to 4]`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,21 +56,25 @@ Act: TypeAlias = Callable[[State], Array]
 
 
 def initial(scenario: Scenario, draws: Array) -> State:
-    """The world before the first step, from uniform draws `[..., U, 2]`, whose library and dtype it takes."""
+    """The world before the first step, from uniform draws `[..., U, D]`, whose library and dtype it takes.
+
+    U and D, 2 for the paper's users, are `scenario.draws_shape`.
+    """
     xp = array_namespace(draws)
     zeros = xp.zeros_like(draws[..., 0])
     zero = xp.sum(zeros, axis=-1)
     step = xp.astype(zero, xp.int64)
-    centres_m = constant(scenario.user_centres_m, draws)
+    users_m, motion = mobility.begin(scenario, draws)
     return State(
         step=step,
         cell=step[..., None] + constant(scenario.start_cell, step),
-        users_m=mobility.scatter(centres_m, scenario.users.cluster_radius_m, draws),
+        users_m=users_m,
         data_bits=zeros,
         collected=zeros > 0.0,
         total_reward=zero,
         mission_reward=zero,
         energy_used_j=zero,
+        motion=motion,
     )
 
 
@@ -156,11 +161,11 @@ def step(
 ) -> tuple[State, Outcome]:
     """The world after one step, and the step's outcome.
 
-    `action` is the value of a `grid.Action`, integers `[...]`; `draws` are uniform in [0, 1), `[..., U, 2]`;
+    `action` is the value of a `grid.Action`, integers `[...]`; `draws` are uniform in [0, 1), `[..., U, D]`;
     `rewards` are those of each world, `[...]`, by default the scenario's.
     """
     cell = scenario.grid.move(state.cell, action)
-    users_m = mobility.walk(state.users_m, scenario.users.v_max_mps, scenario.mission.step_s, draws)
+    users_m, motion = mobility.move(scenario, state.users_m, state.motion, draws)
     uav_m = scenario.grid.centre_m(cell, like=users_m)
     link = measure(scenario, uav_m, users_m, state.collected)
     data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
@@ -180,6 +185,7 @@ def step(
         total_reward=total,
         mission_reward=reward.mission_reward(state.mission_reward, total, n_rewards, values.data),
         energy_used_j=used_j,
+        motion=motion,
     )
     agent_reward = reward.step_reward(total, state.total_reward, values.form)
     return after, Outcome(
@@ -219,12 +225,12 @@ class BatchWorld:
         self.state = initial(scenario, draws)  # of all worlds between two steps, `[N, ...]`
 
     def step(self, action: Array, draws: Array) -> Outcome:
-        """One step of every world: integers `[N]`, and uniform draws `[N, U, 2]`."""
+        """One step of every world: integers `[N]`, and uniform draws `[N, U, D]`."""
         self.state, outcome = step(self.scenario, self.state, action, draws, self._rewards)
         return outcome
 
     def restart(self, where: Array, draws: Array) -> None:
-        """Restart the worlds in `where` (bool `[N]`) from their part of `draws` `[N, U, 2]`."""
+        """Restart the worlds in `where` (bool `[N]`) from their part of `draws` `[N, U, D]`."""
         self.state = select(where, initial(self.scenario, draws), self.state)
 
     def observe(self, kind: Observation) -> Array:

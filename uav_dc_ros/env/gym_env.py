@@ -41,7 +41,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
 
     Start:
         The UAV in the scenario's start cell; users uniform in their clusters' discs. In each step the
-        UAV moves, then the users walk, then data is collected at rates that hold for the step.
+        UAV moves, then the users move, then data is collected at rates that hold for the step.
 
     End:
         `episode_end = "at_time_limit"`: terminates after `max_steps`; it has landed if it is over the
@@ -49,7 +49,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         the battery is spent, where `energy.ends` is `"battery"` or `"both"`.
 
     Randomness:
-        `reset` draws `np_random.random((U, 2))`, and every `step` the same; nothing else draws.
+        `reset` draws `np_random.random(scenario.draws_shape)`, and every `step` the same; nothing else draws.
 
     Info:
         step, cell `[3]`, users_m `[U, 2]`, data_bits `[U]`, collected `[U]`, landed, dock_distance_m
@@ -116,7 +116,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         return picture(self._trajectory)
 
     def _draws(self) -> Array:
-        return self.np_random.random((self.scenario.n_users, 2))
+        return self.np_random.random(self.scenario.draws_shape)
 
 
 def prepare(

@@ -87,7 +87,7 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
         return self._batch.observe(self.observation), reward, terminated, truncated, self._masked(infos)
 
     def _draws(self) -> Array:
-        return np.stack([rng.random((self.scenario.n_users, 2)) for rng in self._rngs])
+        return np.stack([rng.random(self.scenario.draws_shape) for rng in self._rngs])
 
     def _masked(self, infos: dict[str, Any]) -> dict[str, Any]:
         return infos | {f"_{key}": np.ones(self.num_envs, bool) for key in infos}

@@ -1,6 +1,7 @@
 """Missions flown side by side, one per seed, in numpy: the evaluation of every policy.
 
-Seed s draws from `numpy.random.default_rng(s)`: `(U, 2)` numbers for the start, then `(U, 2)` for each step.
+Seed s draws from `numpy.random.default_rng(s)`: `(U, D)` numbers for the start, then `(U, D)` for each step;
+`Scenario.draws_shape` has both.
 The environment and the ROS nodes do the same: seed s is the same mission everywhere.
 """
 
@@ -17,7 +18,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act
 from uav_dc_ros.env.trajectory import Trajectory
 
-# Of each run: the draws of its users' start positions, `[U, 2]`, or None for those of the mission's seed.
+# Of each run: the draws of its users' start, `[U, D]`, or None for those of the mission's seed.
 Layouts: TypeAlias = Sequence[Array | None]
 
 
@@ -50,7 +51,7 @@ def rollout_steps(
     rngs = [np.random.default_rng(seed) for seed in seeds]
 
     def draws() -> Array:
-        one = np.stack([rng.random((scenario.n_users, 2)) for rng in rngs])
+        one = np.stack([rng.random(scenario.draws_shape) for rng in rngs])
         return np.broadcast_to(one, (*runs, *one.shape))
 
     start = draws().copy()
@@ -103,7 +104,7 @@ def roll_out(
 
 
 def roll_out_trajectory(scenario: Scenario, act: Act, seed: int, layout: Array | None = None) -> Trajectory:
-    """Fly the mission of a seed, step by step; `layout` as one of `rollout_steps`, `[U, 2]`."""
+    """Fly the mission of a seed, step by step; `layout` as one of `rollout_steps`, `[U, D]`."""
 
     def unbatched(batch: Any) -> Any:
         return type(batch)(**{f.name: getattr(batch, f.name)[0, 0] for f in fields(batch)})

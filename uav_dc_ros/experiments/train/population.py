@@ -55,7 +55,7 @@ class Population(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def layout(environment: int, shape: tuple[int, int]) -> np.ndarray:
-    """Draws for the initial users, float32 `[U, 2]`: those of the mission whose seed is `environment`."""
+    """Draws for the initial users, float32 `[U, D]`: those of the mission whose seed is `environment`."""
     return np.random.default_rng(environment).random(shape).astype(np.float32)
 
 

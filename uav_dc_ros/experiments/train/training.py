@@ -117,21 +117,21 @@ class Training:
         self.n_flown += 1
 
     def _draws(self, n_steps: int) -> tuple[Array, Tensor, Tensor, Tensor]:
-        """Uniform draws for walks `[T, N, U, 2]`, explore and choice `[T, N]`, and replay `[T, N, B]`."""
-        n_users, runs = self.population.scenario.n_users, self.population.runs
+        """Uniform draws for walks `[T, N, U, D]`, explore and choice `[T, N]`, and replay `[T, N, B]`."""
+        shape, runs = self.population.scenario.draws_shape, self.population.runs
         sizes = [run.hyperparameters.batch_size for run in runs]
-        walk = np.empty((n_steps, len(runs), 2 * n_users), np.float32)
+        walk = np.empty((n_steps, len(runs), shape[0] * shape[1]), np.float32)
         pick = np.zeros((n_steps, len(runs), 2 + max(sizes)), np.float32)
         for i, (rng, size) in enumerate(zip(self._rngs, sizes, strict=True)):
-            walk[:, i] = rng.random((n_steps, 2 * n_users), np.float32)
+            walk[:, i] = rng.random((n_steps, shape[0] * shape[1]), np.float32)
             pick[:, i, : 2 + size] = rng.random((n_steps, 2 + size), np.float32)
-        walks = self._world_array(walk.reshape(n_steps, len(runs), n_users, 2))
+        walks = self._world_array(walk.reshape(n_steps, len(runs), *shape))
         picks = torch.from_numpy(pick).to(self.device)
         return walks, picks[..., 0], picks[..., 1], picks[..., 2:]
 
     def _layouts(self, n: int) -> Array:
-        """Draws for the initial users of n missions, `[n, N, U, 2]`."""
-        shape = (self.population.scenario.n_users, 2)
+        """Draws for the initial users of n missions, `[n, N, U, D]`."""
+        shape = self.population.scenario.draws_shape
         starts = np.empty((n, len(self.population.runs), *shape), np.float32)
         for i, (rng, run) in enumerate(zip(self._rngs, self.population.runs, strict=True)):
             fixed = None if run.environment is None else layout(run.environment, shape)
@@ -172,6 +172,7 @@ class Training:
         # Checkpoints of version 0.1.0 lack it. Their data is that so far.
         state.setdefault("mission_reward", state["total_reward"])
         state.setdefault("energy_used_j", 0.0 * state["total_reward"])  # nor that: they have no battery
+        state.setdefault("motion", state["users_m"][..., :0])  # nor that: their users walk at random
         self._worlds.state = State(**state)
         self._stats.restore(in_worlds("books"))
         self.n_flown = values["n_flown"]
@@ -201,7 +202,7 @@ def roll_out_greedily(training: Training, seeds: range) -> Missions:
     A run with an environment starts from its layout; the seed decides how the users walk.
     """
     population, learner = training.population, training.learner
-    shape = (population.scenario.n_users, 2)
+    shape = population.scenario.draws_shape
     fixed = [None if run.environment is None else layout(run.environment, shape) for run in population.runs]
 
     def act(state: State) -> Array:
