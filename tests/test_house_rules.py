@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "uav_dc_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 400
+FILES_MAX = 15  # in a folder
 
 CHECKS = {
     "ruff check": ["-m", "ruff", "check", "."],
@@ -37,6 +39,21 @@ def test_the_modules_were_found():
 def test_a_file_can_be_read_in_one_sitting():
     lines = {str(path.relative_to(ROOT)): len(path.read_text("utf-8").splitlines()) for path in MODULES}
     assert {name: n for name, n in lines.items() if n > LONGEST} == {}
+
+
+def test_a_public_class_name_stands_for_one_thing_and_no_folder_is_a_corridor():
+    names = [
+        node.name
+        for path in MODULES
+        for node in ast.parse(path.read_text("utf-8")).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    assert [name for name, count in Counter(names).items() if count > 1] == []
+    # The package's own folder holds the commands and what all rooms share.
+    folders = Counter(
+        path.parent for path in MODULES if path.name != "__init__.py" and path.parent != PACKAGE
+    )
+    assert {str(folder): count for folder, count in folders.items() if count > FILES_MAX} == {}
 
 
 def undocumented(tree, prefix=""):

@@ -12,7 +12,7 @@ import numpy as np
 from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.experiments.paper.plan import runs
-from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results, ScenarioFacts
+from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Results, ScenarioFacts, SweepMetadata
 from uav_dc_ros.experiments.paper.setting import FULL, PlannedRun, Scale, Setting
 
 SHORT = msgspec.structs.replace(FULL, episodes=400)
@@ -71,7 +71,7 @@ def sweep(
             shown = f"greedy_{metric.replace('episode_return', 'return')}"
             greedy[shown][i] = made.get(shown, made[metric]) * here * (1 + noise * rng.standard_normal())
     return Results(
-        metadata=Metadata(command="a test", scale=scale, worlds=WORLDS, greedy_missions=20),
+        metadata=SweepMetadata(command="a test", scale=scale, worlds=WORLDS, greedy_missions=20),
         planned=planned,
         episode=episode,
         curves=curves,

@@ -22,7 +22,7 @@ from uav_dc_ros.experiments.paper.setting import HIDDEN, Setting
 from uav_dc_ros.experiments.paper.shards import ShardResult, save_result, train_shard
 from uav_dc_ros.experiments.paper.worlds import choose, draw, figure, page, plan, shares, verdicts
 from uav_dc_ros.experiments.paper.worlds.choices import CHOICES, PLACES, Options, Span
-from uav_dc_ros.experiments.paper.worlds.verdicts import IDS, VERDICTS, Metadata, Multiverse, Row
+from uav_dc_ros.experiments.paper.worlds.verdicts import IDS, VERDICTS, Multiverse, MultiverseMetadata, Row
 
 N = 24
 
@@ -49,7 +49,7 @@ def multiverse(worlds, verdict):
         for world in worlds
         for claim in IDS
     ]
-    metadata = Metadata(scale=plan.FULL, rejected={"a reason": 2})
+    metadata = MultiverseMetadata(scale=plan.FULL, rejected={"a reason": 2})
     return Multiverse(metadata=metadata, worlds=tuple(worlds), rows=tuple(rows))
 
 

@@ -155,7 +155,7 @@ def _train_worlds(options: argparse.Namespace) -> "Multiverse":
         for world, of_world in zip(worlds, shards, strict=True)
         for row in verdicts.rows(world, plan.findings(world, scale, sweep.load_results(of_world, folder)))
     ]
-    metadata = verdicts.Metadata(scale=scale, rejected=rejected)
+    metadata = verdicts.MultiverseMetadata(scale=scale, rejected=rejected)
     multiverse = verdicts.Multiverse(metadata=metadata, worlds=tuple(worlds), rows=tuple(rows))
     multiverse.save(options.out)
     return multiverse
@@ -166,7 +166,7 @@ def _train(
 ) -> "tuple[Results, Networks]":
     """Trains the planned runs, and saves the results."""
     from uav_dc_ros.experiments.paper import sweep
-    from uav_dc_ros.experiments.paper.results import Metadata, ScenarioFacts
+    from uav_dc_ros.experiments.paper.results import ScenarioFacts, SweepMetadata
 
     scale, out = _scale(options), options.out
     folder = out / "shards"
@@ -177,7 +177,7 @@ def _train(
     found = sweep.load_results(shards, folder)
     local = f"{options.workers} processes on {_cores()} cores of {platform.machine()}"
     names = sorted({one.setting.scenario for one in planned})
-    metadata = Metadata(
+    metadata = SweepMetadata(
         command=command,
         scale=scale,
         worlds={name: ScenarioFacts.of(scenarios.load(name)) for name in names},

@@ -13,7 +13,7 @@ from uav_dc_ros.core.reward import DATA, MISSION_REWARD
 from uav_dc_ros.core.stats import Interval, interval
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.experiments.paper.claims.contradictions import mark
-from uav_dc_ros.experiments.paper.claims.criteria import RULES, Criterion, Table, Verdict
+from uav_dc_ros.experiments.paper.claims.criteria import RULES, ClaimTable, Criterion, Verdict
 from uav_dc_ros.experiments.paper.claims.findings import Finding, check
 from uav_dc_ros.experiments.paper.evidence import Evidence, NotMeasured
 from uav_dc_ros.experiments.paper.figures import draw, drawable
@@ -182,7 +182,7 @@ def _with_five(finding: Finding) -> Iterator[tuple[Criterion, Criterion | None]]
     return zip_longest(finding.criteria, finding.of_five.criteria if finding.of_five else ())
 
 
-def tables_md(evidence: Evidence, table: Table) -> list[str]:
+def tables_md(evidence: Evidence, table: ClaimTable) -> list[str]:
     """A table in Markdown; with `columns`, one for each measure. Settings without runs are left out."""
     if table.columns is None:
         header = [_title(measure, evidence, table) for measure in table.measures]
@@ -196,13 +196,13 @@ def tables_md(evidence: Evidence, table: Table) -> list[str]:
     return sections
 
 
-def _title(measure: str, evidence: Evidence, table: Table) -> str:
+def _title(measure: str, evidence: Evidence, table: ClaimTable) -> str:
     """A measure in words."""
     data = evidence.results.metadata.worlds[table.setting.scenario].reward_data
     return _UNITS[measure][0].replace("r^t", MISSION_REWARD[data])
 
 
-def _rows(evidence: Evidence, table: Table, measures: Sequence[str], *axes: str) -> list[list[str]]:
+def _rows(evidence: Evidence, table: ClaimTable, measures: Sequence[str], *axes: str) -> list[list[str]]:
     """For each setting its label, and a cell for each measure and each value on `axes`."""
     rows = []
     for setting in table.setting.along(table.rows, evidence.scale):

@@ -81,7 +81,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         )
 
 
-class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SweepMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The origin of results."""
 
     command: str
@@ -99,7 +99,7 @@ class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 class Results:
     """Runs and their measures."""
 
-    metadata: Metadata
+    metadata: SweepMetadata
     planned: tuple[PlannedRun, ...]
     episode: Array  # number of the last episode of each point, `[n_points]`
     # By `METRICS`: a mean over the episodes of each point, float32 `[n_runs, n_points]`.
@@ -168,8 +168,8 @@ class Results:
     @classmethod
     def load(cls, folder: Path) -> "Results":
         """Reads what `save` wrote; raises TrainingError for missing, damaged or other files."""
-        runs, metadata = read_table(folder / RUNS_FILE, _RUNS_SCHEMA, Metadata)
-        curves, other = read_table(folder / CURVES_FILE, _CURVES_SCHEMA, Metadata)
+        runs, metadata = read_table(folder / RUNS_FILE, _RUNS_SCHEMA, SweepMetadata)
+        curves, other = read_table(folder / CURVES_FILE, _CURVES_SCHEMA, SweepMetadata)
         if metadata != other:
             raise TrainingError(f"{folder}: {RUNS_FILE} and {CURVES_FILE} are of different sweeps")
         planned = []

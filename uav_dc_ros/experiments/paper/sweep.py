@@ -19,7 +19,7 @@ from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.rollout import roll_out_trajectory
 from uav_dc_ros.experiments.paper.plan import FIGURES
-from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results
+from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Results, SweepMetadata
 from uav_dc_ros.experiments.paper.setting import HIDDEN, OBSERVATION, PlannedRun, Scale, Setting
 from uav_dc_ros.experiments.paper.shards import Shard, ShardResult, load_result
 from uav_dc_ros.experiments.train.population import Population, architecture, layout
@@ -80,7 +80,7 @@ def load_results(shards: Iterable[tuple[Shard, list[PlannedRun]]], folder: Path)
     return found
 
 
-def collect(planned: Sequence[PlannedRun], metadata: Metadata, found: RunResults) -> Results:
+def collect(planned: Sequence[PlannedRun], metadata: SweepMetadata, found: RunResults) -> Results:
     """The measures of the runs, as means over the episodes of a point and over the greedy missions."""
     n_points, per_point = metadata.scale.n_points, metadata.scale.episodes_per_point
 

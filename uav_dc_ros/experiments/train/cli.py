@@ -46,7 +46,7 @@ _LEARNING_OPTIONS = {
 _REWARD_OPTIONS = ("beta", "zeta", "r_plus", "reward_form", "reward_data", "data_scale_bits")
 
 
-class _Progress(msgspec.Struct):
+class _SavedProgress(msgspec.Struct):
     """What a checkpoint holds beside the training; the file keeps the older names."""
 
     every: int  # episodes between checkpoints
@@ -121,9 +121,9 @@ def _train(options: argparse.Namespace, command: str) -> int:
     except (MemoryError, RuntimeError) as error:  # torch raises the latter when memory is short
         raise TrainingError(f"the training cannot be set up: {str(error).splitlines()[0]}") from None
     every = options.checkpoint_every
-    progress = _Progress(every)
+    progress = _SavedProgress(every)
     if options.resume and saved.is_file():
-        progress = msgspec.convert(checkpoint.restore(saved, training), _Progress)
+        progress = msgspec.convert(checkpoint.restore(saved, training), _SavedProgress)
         checkpoint.refuse_other(saved, "checkpoint_every", progress.every, every)
         bags = list(progress.prefilled.bags) if progress.prefilled else None
         expected = list(map(str, options.from_bags)) if options.from_bags else None
@@ -206,7 +206,7 @@ def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
 
 
 def _save_best(
-    folder: Path, config: PolicyConfig, training: "Training", progress: _Progress, command: str
+    folder: Path, config: PolicyConfig, training: "Training", progress: _SavedProgress, command: str
 ) -> str:
     """Saves the best run's policy, and returns the name of its folder."""
     assert progress.score is not None

@@ -55,7 +55,7 @@ class Criterion(NamedTuple):
     decides: bool = True  # the verdict on the claim
 
 
-class Table(NamedTuple):
+class ClaimTable(NamedTuple):
     """A table beside a claim; its cells are means over environments with their intervals."""
 
     setting: Setting  # common to all cells
@@ -71,7 +71,7 @@ class Claim(NamedTuple):
     setting: str  # in words
     text: str
     test: Callable[[Evidence], Iterator[Criterion]]
-    tables: tuple[Table, ...]
+    tables: tuple[ClaimTable, ...]
     # Contradictions with arithmetic, the paper's text or another claim; independent of the results.
     notes: tuple[str, ...]
 
@@ -82,7 +82,7 @@ class Claim(NamedTuple):
 
 
 def claim(
-    id: str, setting: str, text: str, *notes: str, tables: Sequence[Table]
+    id: str, setting: str, text: str, *notes: str, tables: Sequence[ClaimTable]
 ) -> Callable[[Callable[[Evidence], Iterator[Criterion]]], Claim]:
     """Makes a claim of the function that yields its criteria."""
     return lambda test: Claim(id, setting, text, test, tuple(tables), notes)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from uav_dc_ros.experiments.paper.claims.criteria import Criterion, Table, beside, claim, greater, lead
+from uav_dc_ros.experiments.paper.claims.criteria import ClaimTable, Criterion, beside, claim, greater, lead
 from uav_dc_ros.experiments.paper.evidence import Evidence
 from uav_dc_ros.experiments.paper.setting import Setting, name
 
@@ -19,7 +19,7 @@ _GREEDY = ("reward", "greedy_reward")
     "The curves are of missions with exploration, so a greater epsilon looks better whether or not more was "
     "learnt; the greedy missions beside separate the two.",
     "What the winners were compared with is not in the paper; the grid is this project's.",
-    tables=[Table(_FIVE, ("gamma",), (*_GREEDY, "landing_rate"), "epsilon")],
+    tables=[ClaimTable(_FIVE, ("gamma",), (*_GREEDY, "landing_rate"), "epsilon")],
 )
 def _c18(e: Evidence) -> Iterator[Criterion]:
     reward, greedy = (e.of(measure, _FIVE, "gamma", "epsilon") for measure in _GREEDY)
@@ -35,7 +35,7 @@ def _c18(e: Evidence) -> Iterator[Criterion]:
     "batch 32 converges fastest",
     "The paper calls the difference slight.",
     "Runs with different batch sizes draw different numbers, so these pairs share the users' start only.",
-    tables=[Table(_FIVE, ("batch_size",), ("convergence", *_GREEDY))],
+    tables=[ClaimTable(_FIVE, ("batch_size",), ("convergence", *_GREEDY))],
 )
 def _c19(e: Evidence) -> Iterator[Criterion]:
     settled, reward = (e.of(measure, _FIVE, "batch_size") for measure in ("convergence", "reward"))
@@ -49,7 +49,7 @@ def _c19(e: Evidence) -> Iterator[Criterion]:
     "5 clusters, DQL",
     "lr 0.01 fluctuates; 1e-4 and 1e-5 slower or stuck; 1e-3 best",
     '"Slower or stuck" is measured against the level that 1e-3 reaches in the same environment.',
-    tables=[Table(_FIVE, ("learning_rate",), (*_GREEDY, "fluctuation", "convergence"))],
+    tables=[ClaimTable(_FIVE, ("learning_rate",), (*_GREEDY, "fluctuation", "convergence"))],
 )
 def _c20(e: Evidence) -> Iterator[Criterion]:
     rates = e.scale.learning_rates

@@ -7,8 +7,8 @@ import numpy as np
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.stats import interval
 from uav_dc_ros.experiments.paper.claims.criteria import (
+    ClaimTable,
     Criterion,
-    Table,
     beside,
     claim,
     everywhere,
@@ -48,7 +48,7 @@ _GREEDY = ("greedy_users_collected", "greedy_landing_rate", "greedy_arrival_step
     "The paper does not state the reward; taken: exponential, episode, 1:1. The table has the others.",
     "The state is the position alone, so a greedy policy is one fixed path, which can hover only for good: "
     "it cannot wait over a cluster and fly on.",
-    tables=[Table(_FIVE, _ALL, (*_GREEDY, "users_collected", "landing_rate"))],
+    tables=[ClaimTable(_FIVE, _ALL, (*_GREEDY, "users_collected", "landing_rate"))],
 )
 def _c1(e: Evidence) -> Iterator[Criterion]:
     users = e.of("greedy_users_collected", _FIVE) / e.results.metadata.worlds[_FIVE.scenario].n_users
@@ -64,7 +64,7 @@ def _c1(e: Evidence) -> Iterator[Criterion]:
     "exponential reaches the best reward, and converges faster than binary",
     "The paper does not state the form; taken: episode.",
     _EXPONENTIAL_IS_MORE,
-    tables=[Table(_THREE_AT_TWO, _ALL, _AT_ONE)],
+    tables=[ClaimTable(_THREE_AT_TWO, _ALL, _AT_ONE)],
 )
 def _c2(e: Evidence) -> Iterator[Criterion]:
     reward, settled, common = (
@@ -84,7 +84,7 @@ def _c2(e: Evidence) -> Iterator[Criterion]:
     "mean reward: dueling > DQL; exponential > binary",
     "The paper does not state the form; taken: episode.",
     _EXPONENTIAL_IS_MORE,
-    tables=[Table(_THREE, _ALL, _SHARES, "ratio")],
+    tables=[ClaimTable(_THREE, _ALL, _SHARES, "ratio")],
 )
 def _c3(e: Evidence) -> Iterator[Criterion]:
     share, common = (e.of(measure, _THREE, *_BOTH, "ratio") for measure in _SHARES[:2])
@@ -102,7 +102,7 @@ def _c3(e: Evidence) -> Iterator[Criterion]:
     FORMS_ARE_ONE,
     "Of the throughput figures the paper states that a *similar* reward is achieved with different reward "
     "settings: that and C4, C8, C9 cannot both be.",
-    tables=[Table(_FIVE, _ALL, _AT_ONE)],
+    tables=[ClaimTable(_FIVE, _ALL, _AT_ONE)],
 )
 def _c4(e: Evidence) -> Iterator[Criterion]:
     reward, greedy = (e.of(measure, _FIVE, *_ALL) for measure in ("reward", "greedy_reward"))
@@ -122,7 +122,7 @@ def _c4(e: Evidence) -> Iterator[Criterion]:
     "at another scale.",
     "C6 (dueling best, at the same ratio with exponential) and C7 (dueling better at every ratio, 1:1 among "
     "them) claim otherwise, unless dueling is better by less than is visible.",
-    tables=[Table(_FIVE, _ALL, _AT_ONE)],
+    tables=[ClaimTable(_FIVE, _ALL, _AT_ONE)],
 )
 def _c5(e: Evidence) -> Iterator[Criterion]:
     reward, middle = (e.of(measure, _FIVE, "r_plus", "algorithm") for measure in ("reward", "middle"))
@@ -143,7 +143,7 @@ def _c5(e: Evidence) -> Iterator[Criterion]:
     "5 clusters, exponential",
     "dueling best, and converges faster than DQL",
     "Contradicts C5 unless the lead is too small to see.",
-    tables=[Table(_FIVE, ("algorithm", "form"), _AT_ONE)],
+    tables=[ClaimTable(_FIVE, ("algorithm", "form"), _AT_ONE)],
 )
 def _c6(e: Evidence) -> Iterator[Criterion]:
     reward, settled = (e.of(measure, _FIVE, "algorithm", "form") for measure in ("reward", "convergence"))
@@ -163,7 +163,7 @@ def _c6(e: Evidence) -> Iterator[Criterion]:
     _EXPONENTIAL_IS_MORE,
     "The head start is zeta/(beta + zeta) of the reward share, so the advantage of exponential shrinks as "
     "the ratio grows by arithmetic alone.",
-    tables=[Table(_FIVE, _BOTH, (*_SHARES, "landing_rate"), "ratio")],
+    tables=[ClaimTable(_FIVE, _BOTH, (*_SHARES, "landing_rate"), "ratio")],
 )
 def _c7(e: Evidence) -> Iterator[Criterion]:
     ratios = e.scale.ratios
@@ -192,7 +192,7 @@ def _c7(e: Evidence) -> Iterator[Criterion]:
     FORMS_ARE_ONE,
     "C4 has the same comparison at 1:1, without a condition on the ratio.",
     "The text adds that exponential is better than binary for all ratios, against C7; it stands beside.",
-    tables=[Table(_FIVE, _KIND, _AT_ONE), Table(_FIVE, _KIND, _SHARES, "ratio")],
+    tables=[ClaimTable(_FIVE, _KIND, _AT_ONE), ClaimTable(_FIVE, _KIND, _SHARES, "ratio")],
 )
 def _c8(e: Evidence) -> Iterator[Criterion]:
     reward, settled = (e.of(measure, _FIVE, *_KIND) for measure in ("reward", "convergence"))
@@ -213,7 +213,7 @@ def _c8(e: Evidence) -> Iterator[Criterion]:
     "5 clusters, dueling",
     "immediate is less effective than episode",
     FORMS_ARE_ONE,
-    tables=[Table(_DUELING, _KIND, _SHARES, "ratio")],
+    tables=[ClaimTable(_DUELING, _KIND, _SHARES, "ratio")],
 )
 def _c9(e: Evidence) -> Iterator[Criterion]:
     share, _, greedy = (e.of(measure, _DUELING, *_KIND, "ratio") for measure in _SHARES)

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.stats import interval
 from uav_dc_ros.experiments.paper.claims.criteria import (
+    ClaimTable,
     Criterion,
-    Table,
     all_within,
     beside,
     claim,
@@ -51,7 +51,7 @@ def _throughput(e: Evidence, setting: Setting, *axes: str, greedy: bool = False)
     _BETA_WEIGHS_DATA,
     "C11 puts the peak of DQL at 1:2 in the same figure. Both can be true only if that peak belongs to "
     "exponential.",
-    tables=[Table(_THREE_BINARY, ("algorithm",), (*_SHOWN, "landing_rate", "arrival_step"), "ratio")],
+    tables=[ClaimTable(_THREE_BINARY, ("algorithm",), (*_SHOWN, "landing_rate", "arrival_step"), "ratio")],
 )
 def _c10(e: Evidence) -> Iterator[Criterion]:
     throughput, one = _throughput(e, _THREE_BINARY), e.scale.ratios.index(_ONE)
@@ -65,7 +65,7 @@ def _c10(e: Evidence) -> Iterator[Criterion]:
     "best of all: dueling, 1:1, binary; above DQL's peak at 1:2",
     "The episode form. The peak of DQL is looked for in both R_plus: with binary alone, C10 puts it at 1:1.",
     "C17 finds exponential better than binary with 5 clusters.",
-    tables=[Table(_THREE, _ALL, _SHOWN, "ratio")],
+    tables=[ClaimTable(_THREE, _ALL, _SHOWN, "ratio")],
 )
 def _c11(e: Evidence) -> Iterator[Criterion]:
     ratios = e.scale.ratios
@@ -88,7 +88,7 @@ def _c11(e: Evidence) -> Iterator[Criterion]:
     "best at 1:1 and 2:1",
     "C14 claims stable up to 1:1: then 1:1 cannot stand out from 1:2.",
     _BETA_WEIGHS_DATA,
-    tables=[Table(_FIVE_BINARY, (), (*_SHOWN, "landing_rate"), "ratio")],
+    tables=[ClaimTable(_FIVE_BINARY, (), (*_SHOWN, "landing_rate"), "ratio")],
 )
 def _c12(e: Evidence) -> Iterator[Criterion]:
     best = lead(_throughput(e, _FIVE_BINARY), [e.scale.ratios.index(ratio) for ratio in (_ONE, _TWO)])
@@ -100,7 +100,7 @@ def _c12(e: Evidence) -> Iterator[Criterion]:
     "5 clusters, DQL, exponential, episode: throughput",
     "little difference between ratios",
     "C14 claims that the throughput falls above 1:1, of these settings too.",
-    tables=[Table(_FIVE, (), (*_SHOWN, "landing_rate"), "ratio")],
+    tables=[ClaimTable(_FIVE, (), (*_SHOWN, "landing_rate"), "ratio")],
 )
 def _c13(e: Evidence) -> Iterator[Criterion]:
     throughput = e.of("throughput_bps", _FIVE, "ratio")
@@ -116,7 +116,7 @@ def _c13(e: Evidence) -> Iterator[Criterion]:
     "beta grows is the wrong way round.",
     _THROUGHPUT_IS_DATA,
     'C13, and the text on C17 ("stable with different beta/zeta values"), claim that it does not fall.',
-    tables=[Table(_FIVE, _ALL, (*_SHOWN, *_ARRIVAL, "greedy_landing_rate"), "ratio")],
+    tables=[ClaimTable(_FIVE, _ALL, (*_SHOWN, *_ARRIVAL, "greedy_landing_rate"), "ratio")],
 )
 def _c14(e: Evidence) -> Iterator[Criterion]:
     ratios = e.scale.ratios
@@ -139,7 +139,7 @@ def _c14(e: Evidence) -> Iterator[Criterion]:
     "episode > immediate for every ratio",
     FORMS_ARE_ONE,
     _THROUGHPUT_IS_DATA,
-    tables=[Table(_FIVE, _ALL, _SHOWN, "ratio")],
+    tables=[ClaimTable(_FIVE, _ALL, _SHOWN, "ratio")],
 )
 def _c15(e: Evidence) -> Iterator[Criterion]:
     ratios = e.scale.ratios
@@ -158,7 +158,7 @@ def _c15(e: Evidence) -> Iterator[Criterion]:
     "5 clusters, exponential: throughput",
     "dueling > DQL for almost all ratios, both reward forms",
     '"Almost all" is read as all but one.',
-    tables=[Table(_FIVE, ("algorithm", "form"), _SHOWN, "ratio")],
+    tables=[ClaimTable(_FIVE, ("algorithm", "form"), _SHOWN, "ratio")],
 )
 def _c16(e: Evidence) -> Iterator[Criterion]:
     def criterion(form: str, text: str, greedy: bool) -> Criterion:
@@ -178,7 +178,7 @@ def _c16(e: Evidence) -> Iterator[Criterion]:
     "R_plus rewards the trajectory and not the data, so it has no direct way to raise the throughput.",
     "The paper itself adds that other settings are better in some scenarios; C11 is one.",
     "The text also calls the throughput stable over the ratios here, against C12 and C14; it stands beside.",
-    tables=[Table(_FIVE, _ALL, (*_SHOWN, "landing_rate"), "ratio")],
+    tables=[ClaimTable(_FIVE, _ALL, (*_SHOWN, "landing_rate"), "ratio")],
 )
 def _c17(e: Evidence) -> Iterator[Criterion]:
     ratios = e.scale.ratios

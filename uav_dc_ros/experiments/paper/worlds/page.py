@@ -15,7 +15,7 @@ from uav_dc_ros.experiments.paper.worlds.choices import CHOICES, FIXED, PLACES, 
 from uav_dc_ros.experiments.paper.worlds.choose import implausibility, ranking
 from uav_dc_ros.experiments.paper.worlds.draw import World
 from uav_dc_ros.experiments.paper.worlds.figure import draw
-from uav_dc_ros.experiments.paper.worlds.shares import Decider, Share, Summary, summaries
+from uav_dc_ros.experiments.paper.worlds.shares import ClaimShares, Decider, Share, summaries
 from uav_dc_ros.experiments.paper.worlds.verdicts import VERDICTS_FILE, WORLDS_FILE, Multiverse
 
 PAGE_FILE, FIGURE_FILE = "worlds.md", "worlds.png"
@@ -87,7 +87,7 @@ def toml(scenario: Scenario) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _claims(found: Sequence[Summary], multiverse: Multiverse) -> str:
+def _claims(found: Sequence[ClaimShares], multiverse: Multiverse) -> str:
     rows = []
     for claim, one, tested in zip(CLAIMS, found, multiverse.tested, strict=True):
         shares = [_share(each) for each in one.shares] if tested else ["", "all: not weighed", ""]
@@ -106,7 +106,7 @@ def _claims(found: Sequence[Summary], multiverse: Multiverse) -> str:
     return _table(header, rows)
 
 
-def _deciders(found: Sequence[Summary]) -> str:
+def _deciders(found: Sequence[ClaimShares]) -> str:
     rows = [
         [one.claim, _TITLES[each.name], ", ".join(f"{label}: {share:.0%}" for label, share in each.shares)]
         for one in found

@@ -15,7 +15,7 @@ from uav_dc_ros.experiments.paper import setting, sweep
 from uav_dc_ros.experiments.paper.claims.criteria import Claim
 from uav_dc_ros.experiments.paper.claims.findings import CLAIMS, Finding, finding
 from uav_dc_ros.experiments.paper.evidence import Evidence
-from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Metadata, Results, ScenarioFacts
+from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Results, ScenarioFacts, SweepMetadata
 from uav_dc_ros.experiments.paper.setting import OBSERVATION, PlannedRun, Scale, Setting, domain
 from uav_dc_ros.experiments.paper.shards import Shard
 from uav_dc_ros.experiments.paper.sweep import GREEDY_SEEDS, RunResults
@@ -57,7 +57,7 @@ class _Needs(Evidence):
         no_points, no_runs = np.zeros((0, scale.n_points)), np.zeros(0)
         super().__init__(
             Results(
-                metadata=Metadata(command="", scale=scale, worlds=worlds, greedy_missions=0),
+                metadata=SweepMetadata(command="", scale=scale, worlds=worlds, greedy_missions=0),
                 planned=(),
                 episode=scale.episodes_per_point * (1 + np.arange(scale.n_points)),
                 curves=dict.fromkeys(METRICS, no_points),
@@ -148,7 +148,7 @@ def findings(world: World, scale: Scale, found: RunResults) -> list[Finding]:
     facts = {name: ScenarioFacts.of(world.scenario(name), any_end=True) for name in SCENARIOS}
     tested = {claim: Finding(claim, "not tested", ()) for claim in CLAIMS}
     for of, claims, runs in _groups(scale):
-        metadata = Metadata(command="", scale=of, worlds=facts, greedy_missions=GREEDY_SEEDS[1])
+        metadata = SweepMetadata(command="", scale=of, worlds=facts, greedy_missions=GREEDY_SEEDS[1])
         evidence = Evidence(sweep.collect(runs, metadata, found))
         # A reward or a throughput of exactly 0 has no relative difference: an equality is then undecided.
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -46,7 +46,7 @@ class Decider(NamedTuple):
     shares: tuple[tuple[str, float], ...]  # of the worlds in which the claim holds, by class
 
 
-class Summary(NamedTuple):
+class ClaimShares(NamedTuple):
     """A claim over all worlds."""
 
     claim: str
@@ -63,7 +63,7 @@ def share(n: int, total: int) -> Share:
     return Share(n, p, max(float(middle - half), 0.0), min(float(middle + half), 1.0))
 
 
-def summaries(multiverse: Multiverse) -> list[Summary]:
+def summaries(multiverse: Multiverse) -> list[ClaimShares]:
     """Every claim over all worlds, in the order of `IDS`."""
     features = [world.features() for world in multiverse.worlds]
     classes = {name: _classes([one[name] for one in features]) for name in features[0]}
@@ -72,7 +72,7 @@ def summaries(multiverse: Multiverse) -> list[Summary]:
     ]
 
 
-def _summary(claim: str, verdicts: Array, classes: dict[str, tuple[Array, list[str]]]) -> Summary:
+def _summary(claim: str, verdicts: Array, classes: dict[str, tuple[Array, list[str]]]) -> ClaimShares:
     n = len(verdicts)
     shares = tuple(share(int((verdicts == verdict).sum()), n) for verdict in VERDICTS)
     measures, null = information(verdicts, [of for of, _ in classes.values()])
@@ -89,7 +89,7 @@ def _summary(claim: str, verdicts: Array, classes: dict[str, tuple[Array, list[s
         if measure > null
         for of, labels in [classes[name]]
     )
-    return Summary(claim, shares, deciders, null)
+    return ClaimShares(claim, shares, deciders, null)
 
 
 def information(verdicts: Array, columns: list[Array]) -> tuple[list[float], float]:

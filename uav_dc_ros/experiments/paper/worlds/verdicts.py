@@ -42,7 +42,7 @@ class Row(NamedTuple):
     unit: str
 
 
-class Metadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class MultiverseMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The origin of the verdicts."""
 
     scale: Scale
@@ -63,7 +63,7 @@ _ROWS_SCHEMA = pa.schema({name: _TYPES[kind] for name, kind in get_type_hints(Ro
 class Multiverse:
     """Worlds, and the verdicts on every claim in each."""
 
-    metadata: Metadata
+    metadata: MultiverseMetadata
     worlds: tuple[World, ...]
     rows: tuple[Row, ...]  # by world, then claim
 
@@ -97,8 +97,8 @@ class Multiverse:
     @classmethod
     def load(cls, folder: Path) -> "Multiverse":
         """Reads what `save` wrote; raises TrainingError for missing, damaged or other files."""
-        worlds, metadata = read_table(folder / WORLDS_FILE, _WORLDS_SCHEMA, Metadata)
-        rows, other = read_table(folder / VERDICTS_FILE, _ROWS_SCHEMA, Metadata)
+        worlds, metadata = read_table(folder / WORLDS_FILE, _WORLDS_SCHEMA, MultiverseMetadata)
+        rows, other = read_table(folder / VERDICTS_FILE, _ROWS_SCHEMA, MultiverseMetadata)
         if metadata != other:
             raise TrainingError(f"{folder}: {WORLDS_FILE} and {VERDICTS_FILE} are of different worlds")
         try:
@@ -132,6 +132,6 @@ def _row(world: int, finding: Finding) -> Row:
     )
 
 
-def _write(path: Path, values: list[dict[str, Any]], schema: pa.Schema, metadata: Metadata) -> None:
+def _write(path: Path, values: list[dict[str, Any]], schema: pa.Schema, metadata: MultiverseMetadata) -> None:
     columns = {name: [one[name] for one in values] for name in schema.names}
     write_table(path, columns, schema, metadata)
