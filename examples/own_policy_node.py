@@ -20,9 +20,7 @@ import uav_dc_ros
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 scenario = uav_dc_ros.load_scenario("five_clusters")
-clusters = sorted(
-    (round(x / 100), round(y / 100)) for x, y in scenario.users.cluster_centres_m
-)  # cells: 100 m
+clusters = sorted((round(x / 100), round(y / 100)) for x, y in scenario.cluster_centres_m)  # cells: 100 m
 way = [cell for cell in clusters for _ in range(5)] + [scenario.dock_cell]  # five steps over each cluster
 
 rclpy.init()

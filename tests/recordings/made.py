@@ -66,7 +66,7 @@ def flight(
     max_steps = scenario.mission.max_steps
     for mission in range(missions):
         rng = np.random.default_rng(seed + mission)
-        state = world.initial(scenario, rng.random((scenario.n_users, 2)))
+        state = world.initial(scenario, rng.random(scenario.draws_shape))
         phase, link = messages.Phase.READY, None
         while True:
             step = int(state.step)
@@ -96,9 +96,7 @@ def flight(
                 break
             action = act(mission, step)
             publish("move", messages.Move(**at, action=ACTION_LABELS[action]))
-            state, outcome = world.step(
-                scenario, state, np.asarray(action), rng.random((scenario.n_users, 2))
-            )
+            state, outcome = world.step(scenario, state, np.asarray(action), rng.random(scenario.draws_shape))
             link = outcome.link
             if outcome.terminated or outcome.truncated:
                 phase = messages.Phase.LANDED if outcome.landed else messages.Phase.TIMEOUT

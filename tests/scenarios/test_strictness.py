@@ -254,11 +254,11 @@ def test_an_unknown_key_and_what_was_meant(refused, table, typo, meant):
 @pytest.mark.parametrize("table", ["", *TABLES])
 def test_an_unknown_key_like_no_other(refused, table):
     text = f"qqqq = 3\n{TEXT}" if not table else TEXT.replace(f"[{table}]", f"[{table}]\nqqqq = 3")
-    known = VALUES[table] if table else [*VALUES, "energy"]
+    known = VALUES[table] if table else [*VALUES, "energy", "datum_deg"]
     if table == "radio":
         known = ["model", *known]
     if table == "users":
-        known = [*known, "mobility"]
+        known = [*known, "mobility", "user", "file"]
     name = f"{table}.qqqq" if table else "qqqq"
     assert refused(text) == f"unknown key {name} = 3; expected one of {', '.join(known)}"
 

@@ -87,7 +87,7 @@ def begin(scenario: "Scenario", draws: Array) -> tuple[Array, Array]:
     """
     model = scenario.users.mobility
     centres_m = constant(scenario.user_centres_m, draws)
-    users_m = scatter(centres_m, scenario.users.cluster_radius_m, draws)
+    users_m = scatter(centres_m, scenario.user_radii_m(draws), draws)
     if isinstance(model, RandomWaypoint):
         # At a waypoint whose pause is over: the first leg starts with the first step.
         resting = draws[..., :1] * 0.0
@@ -123,8 +123,7 @@ def move(scenario: "Scenario", users_m: Array, motion: Array, draws: Array) -> t
 def scatter(centres_m: Array, radius_m: float | Array, draws: Array) -> Array:
     """Points, metres, `[..., U, 2]`, from uniform draws `[..., U, 2]` or more.
 
-    They are uniform by area in a disc of radius C, a number or `[U]`, around the centre of each user's
-    cluster, `[U, 2]`.
+    They are uniform by area in a disc of radius C, a number or `[U]`, around each user's centre, `[U, 2]`.
     """
     xp = array_namespace(draws)
     # The square root makes equal areas, not equal radii, equally likely.
@@ -158,7 +157,7 @@ def _to_waypoints(
         fresh_m = origin_m + draws[..., :2] * constant((east_m - west_m, north_m - south_m), draws)
     else:
         centres_m = constant(scenario.user_centres_m, draws)
-        fresh_m = scatter(centres_m, scenario.users.cluster_radius_m, draws)
+        fresh_m = scatter(centres_m, scenario.user_radii_m(draws), draws)
     leaves = left_s > 0.0  # it has reached its waypoint, and its pause is over
     waypoint_m = xp.where(leaves[..., None], fresh_m, waypoint_m)
     speed_mps = xp.where(

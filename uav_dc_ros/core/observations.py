@@ -75,9 +75,9 @@ def encode(
     if kind != "position":
         max_steps = scenario.mission.max_steps
         parts.append(xp.astype(max_steps - step[..., None], xp.float32) / max_steps)
-        done = _cluster_means(scenario, xp.astype(collected, xp.float32))
-        progress = xp.astype(data_bits, xp.float32) / scenario.mission.r_min_bits
-        data = _cluster_means(scenario, xp.minimum(progress, constant((1.0,), progress)))
+        done = cluster_means(scenario, xp.astype(collected, xp.float32))
+        progress = xp.astype(data_bits, xp.float32) / scenario.user_r_min_bits(cell_f)
+        data = cluster_means(scenario, xp.minimum(progress, constant((1.0,), progress)))
         direction, index = _one_hot_entries(scenario.grid.shape)
         indices = xp.take(cell_f, constant(direction, cell), axis=-1)
         one_hot = xp.astype(indices == constant(index, cell_f), xp.float32)
@@ -109,8 +109,27 @@ def _one_hot_entries(shape: tuple[int, int, int]) -> tuple[tuple[int, ...], ...]
     return tuple(zip(*((i, index) for i, n in enumerate(shape) for index in range(n)), strict=True))
 
 
-def _cluster_means(scenario: Scenario, per_user: Array) -> Array:
+def cluster_means(scenario: Scenario, per_user: Array) -> Array:
     """Mean over the users of each cluster: `[..., U]` to `[..., M]`."""
-    n_users = scenario.users.users_per_cluster
-    shape = (*per_user.shape[:-1], scenario.n_clusters, n_users)
-    return per_user.reshape(shape).sum(axis=-1) / n_users
+    sizes, leading = scenario.users.sizes, per_user.shape[:-1]
+    if len(set(sizes)) == 1:
+        return per_user.reshape((*leading, len(sizes), sizes[0])).sum(axis=-1) / sizes[0]
+    xp, means = array_namespace(per_user), []
+    whole = xp.astype(per_user.reshape((-1,))[:1], xp.int64)
+    users_by_size, order = _by_size(sizes)
+    for size, users in users_by_size:
+        of_size = xp.take(per_user, constant(users, whole), axis=-1)
+        means.append(of_size.reshape((*leading, -1, size)).sum(axis=-1) / size)
+    return xp.take(xp.concat(means, axis=-1), constant(order, whole), axis=-1)
+
+
+@cache
+def _by_size(sizes: tuple[int, ...]) -> tuple[tuple[tuple[int, tuple[int, ...]], ...], tuple[int, ...]]:
+    """The users of all clusters of each size, and the place of each cluster among these clusters."""
+    starts = np.cumsum([0, *sizes])
+    clusters = {size: [i for i, n in enumerate(sizes) if n == size] for size in dict.fromkeys(sizes)}
+    users = tuple(
+        (size, tuple(int(starts[i]) + k for i in of_size for k in range(size)))
+        for size, of_size in clusters.items()
+    )
+    return users, tuple(np.argsort([i for of_size in clusters.values() for i in of_size]).tolist())

@@ -61,14 +61,19 @@ def total(
     beta: float | Array,
     zeta: float | Array,
     data_scale_bits: float | Array,
+    weights: Array | None = None,
 ) -> Array:
     """The reward r^t (eq. 7), `[...]`: `beta / (M K) sum(R) / data_scale_bits + zeta R_plus`.
 
     `counted_bits` `[..., U]` is R of U = M K users, see `counted_data`. `data_scale_bits` is the data of a
     user that counts as 1: it brings the first term to order one; the paper leaves its unit open. It, `beta`
-    and `zeta` are numbers or `[...]`.
+    and `zeta` are numbers or `[...]`. With `weights` `[U]`, which add up to 1, the mean over the users is
+    `sum(weights R)`.
     """
-    mean_bits = array_namespace(counted_bits).mean(counted_bits, axis=-1)
+    if weights is None:
+        mean_bits = array_namespace(counted_bits).mean(counted_bits, axis=-1)
+    else:
+        mean_bits = (counted_bits * weights).sum(axis=-1)
     return beta * (mean_bits / data_scale_bits) + zeta * r_plus
 
 

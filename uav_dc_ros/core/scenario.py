@@ -19,19 +19,22 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.arrays import Array, constant
 from uav_dc_ros.core.channel import AERIAL, AERIAL_MAX_HEIGHT_M, AerialVehicle, FreeSpace, Radio
 from uav_dc_ros.core.energy import EnergySettings, StepEnergies
 from uav_dc_ros.core.grid import Grid
-from uav_dc_ros.core.mobility import Mobility, RandomWalk, RandomWaypoint
+from uav_dc_ros.core.mobility import RandomWalk
 from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
+from uav_dc_ros.core.users.settings import Disc, UserSettings
 from uav_dc_ros.errors import ScenarioError
 
 EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
 
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
+Latitude: TypeAlias = Annotated[float, Meta(ge=-90, le=90)]
+Longitude: TypeAlias = Annotated[float, Meta(ge=-180, le=180)]
 
 _NAME = r"^[a-z][a-z0-9_]{0,63}\Z"
 _NAME_IN_WORDS = "a lower-case letter (a to z), then at most 63 of a to z, 0 to 9 and '_'"
@@ -39,17 +42,6 @@ _NAME_IN_WORDS = "a lower-case letter (a to z), then at most 63 of a to z, 0 to 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table of the scenario file."""
-
-
-class UserSettings(_Table, frozen=True, omit_defaults=True):
-    """The users on the ground."""
-
-    # Centre x, y of each of the M clusters, metres
-    cluster_centres_m: Annotated[tuple[tuple[float, float], ...], Meta(min_length=1, max_length=1000)]
-    users_per_cluster: Annotated[int, Meta(ge=1, le=100_000)]  # users K in a cluster
-    cluster_radius_m: Positive  # radius C of the disc in which a cluster's users start, metres
-    v_max_mps: NotNegative | None = None  # maximum speed v, m/s; only of the random walk, which needs it
-    mobility: Mobility = RandomWalk()  # how users move; `mobility.model` names the struct, see `mobility`
 
 
 class MissionSettings(_Table, frozen=True):
@@ -60,7 +52,7 @@ class MissionSettings(_Table, frozen=True):
     step_s: Positive  # duration of a step, seconds
     max_steps: Annotated[int, Meta(ge=1, le=1_000_000)]  # steps T_cons that the battery allows
     d_cons_m: Positive  # maximum 3D distance at which a user is served, metres
-    r_min_bits: Positive  # data at which a user counts as collected, bit
+    r_min_bits: Positive  # data at which a user counts as collected, bit; a listed user may have its own
     # `at_time_limit`: every mission flies `max_steps` steps, and has landed if it ends over the dock.
     # `on_arrival`: it ends at the dock, or after `max_steps` without landing.
     episode_end: EpisodeEnd
@@ -80,7 +72,7 @@ class RewardSettings(_Table, frozen=True):
 
 
 class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
-    """Every value of a world. `U` below is the number of users, M K."""
+    """Every value of a world. `U` below is the number of users, M K where all clusters are equal."""
 
     name: Annotated[str, Meta(pattern=_NAME)]
     grid: Grid
@@ -90,26 +82,49 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
     reward: RewardSettings
     # The battery. Without the table no energy is counted.
     energy: EnergySettings | None = None
+    # Latitude and longitude of x = 0, y = 0 on WGS 84, degrees; for files with positions in degrees
+    datum_deg: tuple[Latitude, Longitude] | None = None
 
     @property
     def n_clusters(self) -> int:
         """Clusters M."""
-        return len(self.users.cluster_centres_m)
+        return len(self.users.sizes)
 
-    @property
+    @cached_property
     def n_users(self) -> int:
-        """Users U = M K."""
-        return self.n_clusters * self.users.users_per_cluster
+        """Users U."""
+        return sum(self.users.sizes)
 
     @cached_property
     def user_cluster(self) -> Array:
         """Cluster index of each user, integers `[U]`, ascending."""
-        return np.repeat(np.arange(self.n_clusters), self.users.users_per_cluster)
+        return np.repeat(np.arange(self.n_clusters), self.users.sizes)
 
     @cached_property
+    def cluster_centres_m(self) -> tuple[tuple[float, float], ...]:
+        """Centre of each cluster, metres, `[M, 2]`."""
+        return tuple(disc.centre_m for disc in self.users.clusters)
+
+    @property
     def user_centres_m(self) -> tuple[tuple[float, float], ...]:
-        """Centre of each user's cluster, metres, `[U, 2]`."""
-        return tuple(self.users.cluster_centres_m[i] for i in self.user_cluster)
+        """Centre of the disc in which each user starts, metres, `[U, 2]`."""
+        return self.users.centres_m
+
+    def user_radii_m(self, like: Array) -> float | Array:
+        """Radius of that disc, metres; `[U]` with the library, device and dtype of `like`, if they differ."""
+        return _number_or_array(self.users.radii_m, like)
+
+    def user_r_min_bits(self, like: Array) -> float | Array:
+        """Data at which each user counts as collected, bit, as `user_radii_m`."""
+        return _number_or_array(self._r_min_bits, like)
+
+    @cached_property
+    def _r_min_bits(self) -> float | tuple[float, ...]:
+        return self.users.r_min_bits(self.mission.r_min_bits)
+
+    def user_weights(self, like: Array) -> Array | None:
+        """Share of each user in the sum of the priorities, `[U]`, as `user_radii_m`; None: equal shares."""
+        return None if self.users.weights is None else constant(self.users.weights, like)
 
     @property
     def draws_shape(self) -> tuple[int, int]:
@@ -143,7 +158,7 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
     def goals_cells(self) -> tuple[tuple[float, float], ...]:
         """The clusters' centres and the dock, in cells from the grid's origin, `[M + 1, 2]`."""
         cell_m = self.grid.cell_m
-        goals_m = (*self.users.cluster_centres_m, self.mission.dock_m)
+        goals_m = (*self.cluster_centres_m, self.mission.dock_m)
         return tuple((x_m / cell_m, y_m / cell_m) for x_m, y_m in goals_m)
 
     @property
@@ -179,11 +194,15 @@ def parse(text: str, source: str) -> Scenario:
     Raises:
         ScenarioError: not TOML, an unknown key, a wrong type, a value out of range, or inconsistent values.
     """
+    return from_values(read_values(text, source), source)
+
+
+def read_values(text: str, source: str) -> dict[str, Any]:
+    """The plain values in the text of a TOML file; raises ScenarioError if it is no TOML."""
     try:
-        values = tomllib.loads(text.removeprefix("\ufeff"))  # the byte-order mark of Windows editors
+        return tomllib.loads(text.removeprefix("\ufeff"))  # the byte-order mark of Windows editors
     except (ValueError, RecursionError) as error:  # ValueError: also of an integer with too many digits
         raise ScenarioError(f"{source}: not a TOML file: {error}") from None
-    return from_values(values, source)
 
 
 def from_values(values: dict[str, Any], source: str) -> Scenario:
@@ -223,7 +242,9 @@ def _check_keys(values: Any, struct: type, source: str, table: str = "") -> None
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
             raise ScenarioError(f"{source}: unknown key {name} = {reprlib.repr(value)}; {hint}")
         if (inner := _table(known[key], value)) is not None:
-            _check_keys(value, inner, source, f"{name}.")
+            entries = {f"{name}[{i}].": one for i, one in enumerate(value)} if isinstance(value, list) else {}
+            for path, entry in (entries or {f"{name}.": value}).items():
+                _check_keys(entry, inner, source, path)
 
 
 def _keys(struct: type) -> dict[str, Any]:
@@ -293,7 +314,7 @@ def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 def _inconsistencies(scenario: Scenario) -> Iterator[str]:
     """Errors of combined values, lazily: a later check relies on the earlier ones."""
     grid, mission = scenario.grid, scenario.mission
-    yield from _wrong_speeds(scenario.users)
+    yield from scenario.users.inconsistencies()
     top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
     extent = (
         f"x 0 to {(grid.n_x - 1) * grid.cell_m:g} and y 0 to {(grid.n_y - 1) * grid.cell_m:g} m "
@@ -322,11 +343,12 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
             f"mission.d_cons_m = {mission.d_cons_m:g}; expected at least "
             f"grid.altitude_min_m = {grid.altitude_min_m:g}, or no user can be served"
         )
-    for i, centre_m in enumerate(scenario.users.cluster_centres_m):
-        distance_m = _min_distance_m(centre_m, scenario)
+    yield from scenario.users.outside(grid)
+    for disc in scenario.users.start_discs():
+        distance_m = _min_distance_m(disc, grid)
         if distance_m > mission.d_cons_m:
             yield (
-                f"users.cluster_centres_m[{i}] = {list(centre_m)}: its disc is {distance_m:.1f} m from the "
+                f"{disc.key} = {list(disc.centre_m)}: its disc is {distance_m:.1f} m from the "
                 f"nearest cell; expected at most mission.d_cons_m = {mission.d_cons_m:g}, or its users are "
                 "out of reach"
             )
@@ -336,27 +358,9 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
         yield from _out_of_range(scenario, scenario.radio.environment, top_m)
 
 
-def _wrong_speeds(users: UserSettings) -> Iterator[str]:
-    """Errors of the speeds of users."""
-    walks = isinstance(users.mobility, RandomWalk)
-    if walks and users.v_max_mps is None:
-        yield "missing key users.v_max_mps"
-    if not walks and users.v_max_mps is not None:
-        model = users.mobility.__struct_config__.tag
-        yield (
-            f"users.v_max_mps = {users.v_max_mps:g}; expected no such key with users.mobility.model = "
-            f"{model!r}: it is the speed of the random walk"
-        )
-    if isinstance(users.mobility, RandomWaypoint) and users.mobility.v_min_mps > users.mobility.v_max_mps:
-        yield (
-            f"users.mobility.v_min_mps = {users.mobility.v_min_mps:g}; expected at most "
-            f"users.mobility.v_max_mps = {users.mobility.v_max_mps:g}"
-        )
-
-
 def _out_of_range(scenario: Scenario, environment: str, top_m: float) -> Iterator[str]:
     """Errors of a grid outside the heights and distances of an environment of TR 36.777."""
-    grid, users = scenario.grid, scenario.users
+    grid = scenario.grid
     aerial = AERIAL[environment]
     if grid.altitude_min_m <= aerial.min_height_m or top_m > AERIAL_MAX_HEIGHT_M:
         yield (
@@ -367,22 +371,25 @@ def _out_of_range(scenario: Scenario, environment: str, top_m: float) -> Iterato
     corners_m = [
         (x * (grid.n_x - 1) * grid.cell_m, y * (grid.n_y - 1) * grid.cell_m) for x in (0, 1) for y in (0, 1)
     ]
-    for i, centre_m in enumerate(users.cluster_centres_m):
-        distance_m = max(math.dist(centre_m, corner_m) for corner_m in corners_m) + users.cluster_radius_m
+    for disc in scenario.users.start_discs():
+        distance_m = max(math.dist(disc.centre_m, corner_m) for corner_m in corners_m) + disc.radius_m
         if distance_m > aerial.max_ground_distance_m:
             yield (
-                f"users.cluster_centres_m[{i}] = {list(centre_m)}: its disc reaches {distance_m:.0f} m from "
+                f"{disc.key} = {list(disc.centre_m)}: its disc reaches {distance_m:.0f} m from "
                 f"a corner of the grid; expected at most {aerial.max_ground_distance_m:g} m, the range of "
                 f"radio.environment = {environment!r}"
             )
 
 
-def _min_distance_m(centre_m: tuple[float, float], scenario: Scenario) -> float:
-    """3D distance between the disc of a cluster and the cell nearest to it, metres."""
-    grid = scenario.grid
+def _min_distance_m(disc: Disc, grid: Grid) -> float:
+    """3D distance between a disc on the ground and the cell nearest to it, metres."""
     cell_m = [
         min(max(round(at_m / grid.cell_m), 0), n - 1) * grid.cell_m
-        for at_m, n in zip(centre_m, (grid.n_x, grid.n_y), strict=True)
+        for at_m, n in zip(disc.centre_m, (grid.n_x, grid.n_y), strict=True)
     ]
-    horizontal_m = max(0.0, math.dist(centre_m, cell_m) - scenario.users.cluster_radius_m)
+    horizontal_m = max(0.0, math.dist(disc.centre_m, cell_m) - disc.radius_m)
     return math.hypot(horizontal_m, grid.altitude_min_m)
+
+
+def _number_or_array(value: float | tuple[float, ...], like: Array) -> float | Array:
+    return constant(value, like) if isinstance(value, tuple) else value

@@ -91,7 +91,7 @@ def measure(scenario: Scenario, uav_m: Array, users_m: Array, collected: Array) 
 
 def collect(scenario: Scenario, link: Link, data_bits: Array, collected: Array) -> tuple[Array, Array]:
     """`data_bits` and `collected` after a step over `link`, `[..., U]`."""
-    step_s, r_min_bits = scenario.mission.step_s, scenario.mission.r_min_bits
+    step_s, r_min_bits = scenario.mission.step_s, scenario.user_r_min_bits(data_bits)
     return mission.collect(data_bits, collected, link.served, link.rate_bps, step_s, r_min_bits)
 
 
@@ -109,9 +109,8 @@ def total_reward(
     """r^t (eq. 7), `[...]`, of a UAV in `cell` `[..., 3]`; `counted_bits` is R of each user, `[..., U]`."""
     values = rewards or scenario.reward
     distance = mission.dock_distance_cells(cell, scenario.dock_cell, like=counted_bits)
-    return reward.total(
-        counted_bits, reward.r_plus(distance, values.r_plus), values.beta, values.zeta, values.data_scale_bits
-    )
+    r_plus, weights = reward.r_plus(distance, values.r_plus), scenario.user_weights(counted_bits)
+    return reward.total(counted_bits, r_plus, values.beta, values.zeta, values.data_scale_bits, weights)
 
 
 def dock_distance_m(scenario: Scenario, cell: Array, like: Array) -> Array:

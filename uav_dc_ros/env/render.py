@@ -57,8 +57,8 @@ def _draw_field(axes: Axes, trajectory: Trajectory) -> None:
     path_m = np.stack(trajectory.cells)[:, :2] * cell_m
     limits = (0, scenario.mission.max_steps)
 
-    for centre_m in scenario.users.cluster_centres_m:
-        axes.add_patch(Circle(centre_m, scenario.users.cluster_radius_m, fc="#e9e4d6", zorder=1))
+    for disc in scenario.users.clusters:
+        axes.add_patch(Circle(disc.centre_m, disc.radius_m, fc="#e9e4d6", zorder=1))
     for done, colour, size in ((False, WAITING, 20), (True, COLLECTED, 26)):
         x_m, y_m = state.users_m[state.collected == done].T
         label = "collected" if done else "waiting"

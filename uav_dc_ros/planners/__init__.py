@@ -11,6 +11,7 @@ import numpy as np
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.observations import cluster_means
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act, State
 
@@ -69,13 +70,12 @@ def _towards(scenario: Scenario, state: State, goal: Array) -> Array:
 
 def _served(scenario: Scenario, state: State) -> Array:
     """Bool `[..., M]`."""
-    per_cluster = state.collected.reshape(*state.collected.shape[:-1], scenario.n_clusters, -1)
-    return per_cluster.mean(axis=-1) >= ENOUGH
+    return cluster_means(scenario, state.collected.astype(np.float64)) >= ENOUGH
 
 
 def _cluster_cells(scenario: Scenario) -> Array:
     """The column of cells on the grid that is closest to each cluster's centre, integers `[M, 2]`."""
-    cells = np.rint(np.asarray(scenario.users.cluster_centres_m) / scenario.grid.cell_m).astype(np.int64)
+    cells = np.rint(np.asarray(scenario.cluster_centres_m) / scenario.grid.cell_m).astype(np.int64)
     return np.clip(cells, 0, np.asarray(scenario.grid.shape[:2]) - 1)
 
 

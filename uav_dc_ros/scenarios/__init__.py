@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-from uav_dc_ros.core.scenario import Scenario, parse
+from uav_dc_ros.core.scenario import Scenario, from_values, read_values
 from uav_dc_ros.errors import ScenarioError
+from uav_dc_ros.scenarios.user_files import with_users
 
 FOLDER = Path(__file__).parent
 
@@ -25,13 +26,15 @@ def find(name_or_path: str | Path) -> Path:
 
 
 def load(name_or_path: str | Path) -> Scenario:
-    """The scenario with a shipped name, or in the TOML file at a path.
+    """The scenario with a shipped name, or in the TOML file at a path, with the users of `users.file`.
 
     Raises:
-        ScenarioError: no such name or file, or a file that `parse` rejects.
+        ScenarioError: no such name or file, or a file that `core.scenario.parse` or `user_files` rejects.
     """
     try:
-        text = find(name_or_path).read_text("utf-8")
+        path = find(name_or_path)
+        text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{name_or_path}: cannot be read: {error}") from None
-    return parse(text, str(name_or_path))
+    source = str(name_or_path)
+    return from_values(with_users(read_values(text, source), path.parent, source), source)

@@ -114,19 +114,21 @@ def status_text(scenario: Scenario, scene: Scene) -> str:
 def _ground(scenario: Scenario) -> Sequence[Shape]:
     """The start areas of the clusters, and the dock."""
     thin_m, side_m = THIN_CELLS * scenario.grid.cell_m, DOCK_CELLS * scenario.grid.cell_m
-    width_m = 2 * scenario.users.cluster_radius_m
-    area_m, dock_m = (width_m, width_m, thin_m), (*scenario.mission.dock_m, 0.0)
-    clusters = [
-        Shape("clusters", i, Marker.CYLINDER, (x_m, y_m, -2 * thin_m), area_m, CLUSTER_COLOUR)
-        for i, (x_m, y_m) in enumerate(scenario.users.cluster_centres_m)
-    ]
+    dock_m = (*scenario.mission.dock_m, 0.0)
+    clusters = []
+    for i, disc in enumerate(scenario.users.clusters):
+        width_m = max(2 * disc.radius_m, thin_m)  # RViz warns about a marker without a size
+        at_m, area_m = (*disc.centre_m, -2 * thin_m), (width_m, width_m, thin_m)
+        clusters.append(Shape("clusters", i, Marker.CYLINDER, at_m, area_m, CLUSTER_COLOUR))
     return [*clusters, Shape("dock", 0, Marker.CUBE, dock_m, (side_m, side_m, thin_m), DOCK_COLOUR)]
 
 
 def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:
     """One marker for the users of each state."""
-    users, cell_m = scenario.users, scenario.grid.cell_m
-    crowded_m = USER_SPACING * users.cluster_radius_m / float(np.sqrt(users.users_per_cluster))
+    cell_m, clusters = scenario.grid.cell_m, zip(scenario.users.clusters, scenario.users.sizes, strict=True)
+    crowded_m = min(
+        USER_SPACING * (disc.radius_m / float(np.sqrt(n)) if n > 1 else cell_m) for disc, n in clusters
+    )
     width_m = min(USER_CELLS * cell_m, max(crowded_m, USER_CELLS_MIN * cell_m))
     others = np.where(scene.served, UserState.SERVED, UserState.WAITING)
     states = np.where(scene.collected, UserState.COLLECTED, others)  # [U]

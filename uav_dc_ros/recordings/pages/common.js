@@ -194,7 +194,7 @@ const space = {
   },
   // The world, for both kinds of page.
   world(world) {
-    const discs = world.clusters.map((centre) => ring(centre, world.cluster_radius_m));
+    const discs = world.clusters.map((centre, i) => ring(centre, world.cluster_radii_m[i]));
     const join = (of) => discs.flatMap((disc) => [...disc[of], null]);
     return [
       ...discs.map((disc) => this.disc(disc, 0, faded("ground", this.flat ? 0.16 : 0.22))),

@@ -115,7 +115,10 @@ class MissionData:
         weights, data_bits = self.scenario.reward, self._counted_bits
         distance = mission.dock_distance_cells(self._cell, self.scenario.dock_cell, like=data_bits)
         trajectory = weights.zeta * reward.r_plus(distance, weights.r_plus)
-        data = reward.total(data_bits, np.zeros(()), weights.beta, weights.zeta, weights.data_scale_bits)
+        of_users = self.scenario.user_weights(data_bits)
+        data = reward.total(
+            data_bits, np.zeros(()), weights.beta, weights.zeta, weights.data_scale_bits, of_users
+        )
         return float(data), float(trajectory), float(world.total_reward(self.scenario, self._cell, data_bits))
 
     def steps(self) -> list[dict[str, Any]]:

@@ -63,8 +63,8 @@ def world_data(scenario: Scenario) -> dict[str, Any]:
         "fingerprint": scenario.fingerprint,
         "channel": channel.title(scenario.radio),
         "users": scenario.n_users,
-        "clusters": scenario.users.cluster_centres_m,
-        "cluster_radius_m": scenario.users.cluster_radius_m,
+        "clusters": scenario.cluster_centres_m,
+        "cluster_radii_m": [disc.radius_m for disc in scenario.users.clusters],
         "top_m": grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m,
         "reach_m": radio.ground_reach_m(mission.d_cons_m, grid.altitude_min_m),
     }

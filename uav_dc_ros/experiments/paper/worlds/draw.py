@@ -218,12 +218,12 @@ def _hover_bits(scenario: Scenario) -> float:
 
     It is the mean over all users, who stand around their centre at the distance that half of them exceed.
     """
-    per_cluster = scenario.users.users_per_cluster
+    per_cluster = scenario.users.sizes[0]
     turn = np.tile(np.arange(per_cluster) / per_cluster, scenario.n_clusters)
     draws = np.stack([np.full_like(turn, 0.5), turn], axis=-1)
     centres_m = np.array(scenario.user_centres_m)
-    users_m = mobility.scatter(centres_m, scenario.users.cluster_radius_m, draws)
-    over_m = np.array(scenario.users.cluster_centres_m)
+    users_m = mobility.scatter(centres_m, scenario.user_radii_m(draws), draws)
+    over_m = np.array(scenario.cluster_centres_m)
     uav_m = np.column_stack([over_m, np.full(len(over_m), scenario.grid.altitude_min_m)])
     link = measure(scenario, uav_m, np.broadcast_to(users_m, (len(uav_m), *users_m.shape)), np.False_)
     below = scenario.user_cluster == np.arange(len(uav_m))[:, None]

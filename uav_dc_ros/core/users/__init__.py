@@ -1,0 +1,1 @@
+"""The users on the ground: their settings, and how well a mission served them."""
