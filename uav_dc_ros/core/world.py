@@ -78,12 +78,19 @@ def initial(scenario: Scenario, draws: Array) -> State:
     )
 
 
-def measure(scenario: Scenario, uav_m: Array, users_m: Array, collected: Array) -> Link:
-    """The channel with the UAV at `uav_m` `[..., 3]` and the users at `users_m` `[..., U, 2]`, metres."""
+def measure(
+    scenario: Scenario, uav_m: Array, users_m: Array, collected: Array, transmitting: Array | None = None
+) -> Link:
+    """The channel with the UAV at `uav_m` `[..., 3]` and the users at `users_m` `[..., U, 2]`, metres.
+
+    `transmitting`: the users that send, bool `[..., U]`; None: all.
+    """
     values = scenario.radio
     distance_m = radio.distance(uav_m, users_m)
     served = mission.served(distance_m, collected, scenario.mission.d_cons_m)
     gain = channel.path_gain(values, uav_m, users_m, distance_m)
+    if transmitting is not None:
+        served, gain = served & transmitting, gain * transmitting
     sinr = radio.sinr(gain, values.tx_power_w, values.noise_power_w, values.interference, served)
     rate_bps = radio.rate_bps(sinr, values.bandwidth_hz)
     return Link(sinr=sinr, rate_bps=rate_bps, served=served, sum_rate_bps=mission.sum_rate(served, rate_bps))
@@ -156,17 +163,22 @@ def end_of_mission(
 
 
 def step(
-    scenario: Scenario, state: State, action: Array, draws: Array, rewards: Rewards | None = None
+    scenario: Scenario,
+    state: State,
+    action: Array,
+    draws: Array,
+    rewards: Rewards | None = None,
+    transmitting: Array | None = None,
 ) -> tuple[State, Outcome]:
     """The world after one step, and the step's outcome.
 
     `action` is the value of a `grid.Action`, integers `[...]`; `draws` are uniform in [0, 1), `[..., U, D]`;
-    `rewards` are those of each world, `[...]`, by default the scenario's.
+    `rewards` are those of each world, `[...]`, by default the scenario's; `transmitting` is as in `measure`.
     """
     cell = scenario.grid.move(state.cell, action)
     users_m, motion = mobility.move(scenario, state.users_m, state.motion, draws)
     uav_m = scenario.grid.centre_m(cell, like=users_m)
-    link = measure(scenario, uav_m, users_m, state.collected)
+    link = measure(scenario, uav_m, users_m, state.collected, transmitting)
     data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
     values = rewards or scenario.reward
     counted_bits = counted_data(scenario, link.served, link.rate_bps, data_bits, rewards)

@@ -1,12 +1,13 @@
 """The command line of `python -m uav_dc_ros.evaluate`."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import msgspec
+from msgspec import UNSET, UnsetType
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -14,12 +15,14 @@ from rich.table import Table
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core.reward import MISSION_REWARD
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act
-from uav_dc_ros.errors import UavDcError
+from uav_dc_ros.errors import PolicyError, UavDcError
 from uav_dc_ros.experiments.evaluate.evaluation import (
     COLUMNS,
     TITLES,
+    Comparison,
     EvaluatedMissions,
     Evaluation,
     EvaluationReport,
@@ -30,13 +33,16 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     mean_and_interval,
     rows,
     save_mission_picture,
+    shift_effect,
 )
+from uav_dc_ros.experiments.evaluate.shifts import MISSING, ShiftedValue, ShiftRequest, World, apply, parse
 from uav_dc_ros.planners import PLANNERS
 
 PROG = "python -m uav_dc_ros.evaluate"
 
-# Figures of the overview.
+# Figures of the overview, and of the table of shifts.
 _MAIN_FIGURES = ("landing_rate", "users_collected", "arrival_step", "sum_rate_bps")
+_SHIFT_FIGURES = ("users_collected", "data_bits", "landing_rate", "arrival_step", "reward")
 
 
 class Candidate(NamedTuple):
@@ -62,13 +68,19 @@ def main(argv: list[str] | None = None) -> None:
     add("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
     add("--json", type=Path, metavar="FILE", help="write evaluations and comparisons")
     add("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
+    text = "fly also with values of the scenario changed: KEY=+DELTA, KEY=-DELTA, KEY=xFACTOR, KEY=VALUE, or "
+    text += "users.missing=SHARE%% for users that send nothing; several with ',' between; may be repeated"
+    add("--shift", type=parse, action="append", default=[], metavar="KEY=CHANGE[,...]", help=text)
 
     def command() -> int:
         options = parser.parse_args(argv)
+        _check_once("--shift", [request.text for request in options.shift])
         pairs = _pairs(options.policy, options.scenario)
-        acts = [candidate.act_in(scenario) for candidate, scenario in pairs]
-        if options.picture and len(pairs) > 1:
-            raise UavDcError(f"--picture of {len(pairs)} evaluations; expected one policy in one scenario")
+        flights = [flight for pair in pairs for flight in _flights(*pair, options.shift)]
+        if options.picture and len(flights) > 1:
+            raise UavDcError(
+                f"--picture of {len(flights)} evaluations; expected one policy, one scenario, no --shift"
+            )
         for path in filter(None, (options.json, options.picture)):
             files.check_writable(path)
         if options.picture:
@@ -76,16 +88,10 @@ def main(argv: list[str] | None = None) -> None:
             save_mission_picture(candidate.act_in(scenario), scenario, 0, options.picture)
 
         evaluated = [
-            evaluate_act(candidate.name, candidate.sha256, act, scenario, range(options.seeds))
-            for (candidate, scenario), act in zip(pairs, acts, strict=True)
+            evaluate_act(one.name, one.sha256, act, world.scenario, range(options.seeds), world.shift)
+            for one, world, act in flights
         ]
-        first: dict[str, EvaluatedMissions] = {}  # in each scenario
-        comparisons = []
-        for one in evaluated:
-            baseline = first.setdefault(one.evaluation.fingerprint, one)
-            if one is not baseline:
-                comparisons.append(compare(one, baseline))
-        report = EvaluationReport(evaluations=[one.evaluation for one in evaluated], comparisons=comparisons)
+        report = _report(evaluated)
         if options.json:
             files.write(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
         show(report)
@@ -94,12 +100,16 @@ def main(argv: list[str] | None = None) -> None:
     cli.run(command, PROG)
 
 
+def _check_once(option: str, values: Sequence[str]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise UavDcError(f"{option} {value} is given {values.count(value)} times; expected once")
+
+
 def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[tuple[Candidate, Scenario]]:
     """Candidates and scenarios in the order of the results: every policy in each scenario, or in its own."""
     for option, values in (("--policy", policy_names), ("--scenario", scenario_names)):
-        for value in values:
-            if values.count(value) > 1:
-                raise UavDcError(f"{option} {value} is given {values.count(value)} times; expected once")
+        _check_once(option, values)
     candidates = [_candidate(value) for value in policy_names]
     names = [candidate.name for candidate in candidates]
     candidates = [  # equal names are replaced by the arguments, which differ
@@ -125,6 +135,39 @@ def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[t
     return pairs
 
 
+def _flights(
+    candidate: Candidate, scenario: Scenario, shifts: Sequence[ShiftRequest]
+) -> Iterator[tuple[Candidate, World, Act]]:
+    """A candidate in the scenario as it is and in each shifted world, with its actions there."""
+    yield candidate, World(scenario, scenario), candidate.act_in(scenario)
+    for request in shifts:
+        world = apply(request, scenario)
+        try:
+            act = candidate.act_in(world.known)
+        except PolicyError as error:
+            raise PolicyError(f"--shift {request.text}: {error}") from None
+        yield candidate, world, act
+
+
+def _report(evaluated: Sequence[EvaluatedMissions]) -> EvaluationReport:
+    """All evaluations, compared with the first policy's in the same world and with the unshifted ones."""
+    first: dict[tuple[str, str | UnsetType], EvaluatedMissions] = {}  # by scenario and shift
+    unshifted = evaluated[0]
+    comparisons, effects = [], []
+    for one in evaluated:
+        evaluation = one.evaluation
+        text = UNSET if evaluation.shift is UNSET else evaluation.shift.text
+        if text is UNSET:
+            unshifted = one
+        else:
+            effects.append(shift_effect(one, unshifted))
+        baseline = first.setdefault((evaluation.scenario, text), one)
+        if one is not baseline:
+            comparisons.append(compare(one, baseline))
+    evaluations = [one.evaluation for one in evaluated]
+    return EvaluationReport(evaluations=evaluations, comparisons=comparisons, shifts=effects or UNSET)
+
+
 def _candidate(value: str) -> Candidate:
     if value in PLANNERS:
         return Candidate(value, None, None, PLANNERS[value])
@@ -133,12 +176,12 @@ def _candidate(value: str) -> Candidate:
 
 
 def show(report: EvaluationReport) -> None:
-    """Print a table for each evaluation, and an overview of several."""
+    """Print a table for each evaluation without a shift, an overview of several, and the shifts."""
     # A file or a pipe has no width; rich wraps at 80 by default.
     console = Console(width=None if sys.stdout.isatty() else 100, highlight=False)
-    for evaluation in report.evaluations:
-        where = f"{evaluation.scenario}, {evaluation.users_total} users"
-        title = f"{evaluation.policy} in {where}, {_missions(evaluation)}"
+    evaluations = [one for one in report.evaluations if one.shift is UNSET]
+    for evaluation in evaluations:
+        title = f"{_where(evaluation)}, {_missions(evaluation)}"
         console.print(title, style="bold", markup=False, soft_wrap=True)
         table = _table()
         for column in COLUMNS:
@@ -146,30 +189,75 @@ def show(report: EvaluationReport) -> None:
         for row in rows(evaluation):
             table.add_row(*row)
         console.print(table, "")
-    if len(report.evaluations) > 1:
-        title = f"Means and their 95% bootstrap intervals, {_missions(report.evaluations[0])}"
-        console.print(title, style="bold", soft_wrap=True)
-        console.print(_overview(report))
-        console.print("Arrival: over missions that landed; its difference: over those in which both did.")
+    if len(report.evaluations) == 1:
+        return
+    title = f"Means and their 95% bootstrap intervals, {_missions(evaluations[0])}"
+    console.print(title, style="bold", soft_wrap=True)
+    if len(evaluations) > 1:
+        console.print(_overview(evaluations, report.comparisons), "")
+    for evaluation in evaluations if report.shifts else ():
+        console.print(_shifts(evaluation, report), "")
+    console.print("Arrival: over missions that landed; its difference: over those in which both did.")
 
 
-def _overview(report: EvaluationReport) -> Table:
+def _overview(evaluations: Sequence[Evaluation], comparisons: Sequence[Comparison]) -> Table:
     """The main figures of all policies, and their differences from the first policy's."""
-    table = _table()
-    table.add_column("", overflow="fold")
-    for name in _MAIN_FIGURES:
-        table.add_column(TITLES[name].replace(" ", "\n", 1), justify="right", no_wrap=True)
-    for scenario in dict.fromkeys(evaluation.scenario for evaluation in report.evaluations):
-        differences = [comparison for comparison in report.comparisons if comparison.scenario == scenario]
+    table = _figures_table(_MAIN_FIGURES)
+    for scenario in dict.fromkeys(evaluation.scenario for evaluation in evaluations):
+        compared = [one for one in comparisons if one.scenario == scenario and one.shift is UNSET]
         table.add_section()
         table.add_row(f"[bold]in {escape(scenario)}")
-        for evaluation in report.evaluations:
+        for evaluation in evaluations:
             if evaluation.scenario == scenario:
-                _add(table, evaluation.policy, {name: getattr(evaluation, name) for name in _MAIN_FIGURES})
-        if differences:
-            table.add_row(f"[bold]less {escape(differences[0].baseline)}")
-        for comparison in differences:
-            _add(table, comparison.policy, comparison.differences, "+")
+                _add(table, escape(evaluation.policy), _MAIN_FIGURES, _figures(evaluation))
+        if compared:
+            table.add_row(f"[bold]less {escape(compared[0].baseline)}")
+        for comparison in compared:
+            _add(table, escape(comparison.policy), _MAIN_FIGURES, comparison.differences, "+")
+    return table
+
+
+def _shifts(unshifted: Evaluation, report: EvaluationReport) -> Table:
+    """A policy in a scenario as it is and in the shifted worlds, and the differences."""
+    own = (unshifted.policy, unshifted.scenario)
+    table = _figures_table(_SHIFT_FIGURES, MISSION_REWARD[unshifted.reward_data])
+    table.add_row(f"[bold]{escape(_where(unshifted))}")
+    for evaluation in report.evaluations:
+        if (evaluation.policy, evaluation.scenario) == own:
+            text = (
+                "as it is"
+                if evaluation.shift is UNSET
+                else _changes(evaluation.shift.text, evaluation.shift.values)
+            )
+            _add(table, text, _SHIFT_FIGURES, _figures(evaluation))
+    table.add_row("[bold]less the scenario as it is")
+    for effect in report.shifts or ():
+        if (effect.policy, effect.scenario) == own:
+            _add(table, _changes(effect.shift), _SHIFT_FIGURES, effect.differences, "+")
+    return table
+
+
+def _changes(shift: str, values: Sequence[ShiftedValue] = ()) -> str:
+    """Each key of a shift and its change, with the numbers before and after where they are given."""
+    lines = []
+    for i, change in enumerate(shift.split(",")):
+        key, _, text = change.strip().partition("=")
+        known = values and key != MISSING and not isinstance(values[i].after, list)
+        numbers = f": {values[i].before} -> {values[i].after}" if known else ""
+        lines.append(f"{escape(key)}\n  [dim]{text}{numbers}[/dim]")
+    return "\n ".join(lines)
+
+
+def _figures(evaluation: Evaluation) -> dict[str, Figure]:
+    return {name: getattr(evaluation, name) for name in {*_MAIN_FIGURES, *_SHIFT_FIGURES}}
+
+
+def _figures_table(names: Sequence[str], reward_words: str = "") -> Table:
+    table = _table()
+    table.add_column("", overflow="fold")
+    for name in names:
+        words = f" {reward_words}" if name == "reward" else ""
+        table.add_column(f"{TITLES[name]}{words}".replace(" ", "\n", 1), justify="right", no_wrap=True)
     return table
 
 
@@ -177,12 +265,22 @@ def _table() -> Table:
     return Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
 
 
-def _add(table: Table, policy: str, figures: Mapping[str, Figure], sign: Literal["", "+"] = "") -> None:
+def _add(
+    table: Table,
+    title: str,
+    names: Sequence[str],
+    figures: Mapping[str, Figure],
+    sign: Literal["", "+"] = "",
+) -> None:
     cells = []
-    for name in _MAIN_FIGURES:
+    for name in names:
         mean, interval = mean_and_interval(name, figures[name], sign)
         cells.append(f"{mean}\n[dim]{interval.replace(' to ', '..')}[/dim]")  # four of them in 80 columns
-    table.add_row(f" {escape(policy)}", *cells)
+    table.add_row(f" {title}", *cells)
+
+
+def _where(evaluation: Evaluation) -> str:
+    return f"{evaluation.policy} in {evaluation.scenario}, {evaluation.users_total} users"
 
 
 def _missions(evaluation: Evaluation) -> str:

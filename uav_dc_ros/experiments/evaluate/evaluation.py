@@ -18,6 +18,7 @@ from uav_dc_ros.core.stats import interval
 from uav_dc_ros.core.world import Act, observe
 from uav_dc_ros.errors import FROM_TRAIN, UavDcError
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out, roll_out_trajectory
+from uav_dc_ros.experiments.evaluate.shifts import Shift, transmitting
 
 # The missions on every policy card. Nothing is tuned or selected on them.
 TEST_SEEDS = range(100)
@@ -47,6 +48,8 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     # scenario, fingerprint: name, and hash of the world's values
     scenario: str
     fingerprint: str
+    # Absent in the scenario as it is. `fingerprint` is that of the shifted world
+    shift: Shift | UnsetType = UNSET
     version: str  # of the package
     seeds: tuple[int, int]  # first seed and number of seeds
     users_total: int  # users in the field
@@ -76,8 +79,22 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     # scenario, fingerprint, seeds: as in `Evaluation`
     scenario: str
     fingerprint: str
+    shift: str | UnsetType = UNSET  # text of the shift of both; absent without one
     seeds: tuple[int, int]
     # `policy` minus `baseline`, by the name of the figure in `Evaluation`, over the missions in which both
+    # have it
+    differences: dict[str, Figure]
+
+
+class ShiftEffect(msgspec.Struct, frozen=True, kw_only=True):
+    """A policy in a shifted world and in the scenario as it is, mission by mission."""
+
+    # policy, scenario: names
+    policy: str
+    scenario: str
+    shift: str  # text of the shift
+    seeds: tuple[int, int]  # as in `Evaluation`
+    # Shifted minus unshifted, by the name of the figure in `Evaluation`, over the missions in which both
     # have it
     differences: dict[str, Figure]
 
@@ -85,8 +102,10 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 class EvaluationReport(msgspec.Struct, frozen=True, kw_only=True):
     """The content of a file of `python -m uav_dc_ros.evaluate --json`."""
 
-    evaluations: list[Evaluation]  # one for each policy in each scenario
-    comparisons: list[Comparison]  # in each scenario, every further policy with the first
+    # One for each policy in each scenario; with shifts, first as it is and then in each shifted world
+    evaluations: list[Evaluation]
+    comparisons: list[Comparison]  # in each world, every further policy with the first
+    shifts: list[ShiftEffect] | UnsetType = UNSET  # one for each evaluation with a shift; absent without one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,10 +128,16 @@ def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEE
 
 
 def evaluate_act(
-    name: str, sha256: str | None, act: Act, scenario: Scenario, seeds: Sequence[int]
+    name: str,
+    sha256: str | None,
+    act: Act,
+    scenario: Scenario,
+    seeds: Sequence[int],
+    shift: Shift | UnsetType = UNSET,
 ) -> EvaluatedMissions:
-    """Fly one mission per seed with the actions of a policy or a planner."""
-    missions = roll_out(scenario, act, seeds)
+    """Fly one mission per seed with the actions of a policy or a planner; `shift`: that of the scenario."""
+    sends = transmitting(scenario, seeds, shift.missing) if shift is not UNSET and shift.missing else None
+    missions = roll_out(scenario, act, seeds, transmitting=sends)
     of_missions = {f.name: getattr(missions, f.name) for f in fields(Missions)}
     values = {name: np.asarray(v, np.float64) for name, v in of_missions.items() if v is not None}
     values["landing_rate"] = values.pop("landed")
@@ -121,6 +146,7 @@ def evaluate_act(
         sha256=sha256,
         scenario=scenario.name,
         fingerprint=scenario.fingerprint,
+        shift=shift,
         version=__version__,
         seeds=(seeds[0], len(seeds)),
         users_total=scenario.n_users,
@@ -131,20 +157,37 @@ def evaluate_act(
 
 
 def compare(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> Comparison:
-    """`evaluated` minus `baseline`, of the same seeds in the same scenario."""
+    """`evaluated` minus `baseline`, of the same seeds in the same world."""
     evaluation = evaluated.evaluation
     return Comparison(
         policy=evaluation.policy,
         baseline=baseline.evaluation.policy,
         scenario=evaluation.scenario,
         fingerprint=evaluation.fingerprint,
+        shift=UNSET if evaluation.shift is UNSET else evaluation.shift.text,
         seeds=evaluation.seeds,
-        differences={
-            name: _figure(evaluated.values[name] - baseline.values[name])
-            for name in TITLES
-            if name in evaluated.values
-        },
+        differences=_differences(evaluated, baseline),
     )
+
+
+def shift_effect(shifted: EvaluatedMissions, unshifted: EvaluatedMissions) -> ShiftEffect:
+    """`shifted` minus `unshifted`, of the same policy and seeds in the same scenario."""
+    evaluation = shifted.evaluation
+    assert evaluation.shift is not UNSET, "the first argument is the shifted one"
+    return ShiftEffect(
+        policy=evaluation.policy,
+        scenario=evaluation.scenario,
+        shift=evaluation.shift.text,
+        seeds=evaluation.seeds,
+        differences=_differences(shifted, unshifted),
+    )
+
+
+def _differences(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> dict[str, Figure]:
+    pairs = {
+        name: (evaluated.values[name], baseline.values[name]) for name in TITLES if name in evaluated.values
+    }
+    return {name: _figure(one - other) for name, (one, other) in pairs.items()}
 
 
 _RANGES = {"landing_rate": (0.0, 1.0)}  # of possible values; the interval ends there

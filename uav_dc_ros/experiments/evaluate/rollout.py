@@ -40,12 +40,18 @@ class Missions:
 
 
 def rollout_steps(
-    scenario: Scenario, act: Act, seeds: Sequence[int], layouts: Layouts = (), rewards: Rewards | None = None
+    scenario: Scenario,
+    act: Act,
+    seeds: Sequence[int],
+    layouts: Layouts = (),
+    rewards: Rewards | None = None,
+    transmitting: Array | None = None,
 ) -> Iterator[tuple[world.State, world.Outcome | None]]:
     """The S missions of `seeds` step by step: first their start, without an outcome, then every step.
 
     With the `layouts` of R runs, each run flies all missions: `[R, S]`, otherwise `[S]`. `rewards` are the
-    reward settings of each run, `[R, 1]`; default: the scenario's.
+    reward settings of each run, `[R, 1]`; default: the scenario's. `transmitting`: the users that send in
+    each mission, bool `[S, U]`; None: all.
     """
     runs = (len(layouts),) if layouts else ()
     rngs = [np.random.default_rng(seed) for seed in seeds]
@@ -61,15 +67,20 @@ def rollout_steps(
     state = world.initial(scenario, start)
     yield state, None
     for _ in range(scenario.mission.max_steps):
-        state, outcome = world.step(scenario, state, act(state), draws(), rewards)
+        state, outcome = world.step(scenario, state, act(state), draws(), rewards, transmitting)
         yield state, outcome
 
 
 def roll_out(
-    scenario: Scenario, act: Act, seeds: Sequence[int], layouts: Layouts = (), rewards: Rewards | None = None
+    scenario: Scenario,
+    act: Act,
+    seeds: Sequence[int],
+    layouts: Layouts = (),
+    rewards: Rewards | None = None,
+    transmitting: Array | None = None,
 ) -> Missions:
     """Fly every mission to its end; arguments as in `rollout_steps`, results `[S]` or `[R, S]`."""
-    steps = rollout_steps(scenario, act, seeds, layouts, rewards)
+    steps = rollout_steps(scenario, act, seeds, layouts, rewards, transmitting)
     final, _ = next(steps)
     over = final.step < 0
     landed, arrival = over, np.full(over.shape, np.nan)

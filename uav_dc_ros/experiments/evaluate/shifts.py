@@ -1,0 +1,177 @@
+"""Shifts of `evaluate --shift`: a scenario with some values changed, and users that send nothing.
+
+A policy knows its own vehicle and mission: it observes with the shifted scenario, as in a flight. It does not
+know that the users have moved: its map, `users.cluster_centres_m`, is that of the scenario without the shift.
+"""
+
+import argparse
+import difflib
+import re
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.scenario import Scenario, from_values, leaves
+from uav_dc_ros.errors import ScenarioError
+
+MISSING = "users.missing"  # the share of the users that sends nothing: no key of a scenario
+EXPECTED = (
+    "expected KEY=VALUE (KEY==VALUE for a negative one), KEY=+DELTA, KEY=-DELTA, KEY=xFACTOR or "
+    f"{MISSING}=SHARE%, with ',' between"
+)
+_KEY = r"\w+(?:\[[0-9]+\])*(?:\.\w+(?:\[[0-9]+\])*)*"
+_NUMBER = r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_CHANGE = re.compile(rf"({_KEY})(?:=(=)(-?{_NUMBER})|=([-+x]?)({_NUMBER})(%?))", re.ASCII)
+
+Operator: TypeAlias = Literal["=", "+", "-", "x", "%"]
+
+
+class Change(NamedTuple):
+    """A change of one key."""
+
+    key: str  # dotted path, with `[i]` for an element of a list
+    operator: Operator  # `=` sets, `+` and `-` add, `x` multiplies, `%` is that of `MISSING`
+    number: float
+
+
+class ShiftRequest(NamedTuple):
+    """The value of one `--shift`."""
+
+    text: str
+    changes: tuple[Change, ...]
+
+
+class ShiftedValue(msgspec.Struct, frozen=True, kw_only=True):
+    """A changed value: a number, a list with nested lists of numbers, or null for a key that was not set."""
+
+    key: str
+    before: Any
+    after: Any
+
+
+class Shift(msgspec.Struct, frozen=True, kw_only=True):
+    """A shift in the results."""
+
+    text: str  # as in `--shift`
+    values: list[ShiftedValue]  # changed values, in the order of the text
+
+    @property
+    def missing(self) -> float:
+        """Share of the users that sends nothing, 0 to 1."""
+        return next((float(value.after) for value in self.values if value.key == MISSING), 0.0)
+
+
+class World(NamedTuple):
+    """A scenario, or a shifted one."""
+
+    scenario: Scenario  # in which missions are flown
+    known: Scenario  # with which a policy observes
+    shift: Shift | UnsetType = UNSET
+
+
+def parse(text: str) -> ShiftRequest:
+    """The type of the option `--shift`."""
+    changes = tuple(map(_change, text.split(",")))
+    keys = [change.key for change in changes]
+    if (double := next((key for key in keys if keys.count(key) > 1), None)) is not None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: {double} is changed {keys.count(double)} times; expected once"
+        )
+    return ShiftRequest(text, changes)
+
+
+def apply(request: ShiftRequest, scenario: Scenario) -> World:
+    """The world of a scenario after a shift.
+
+    Raises:
+        ScenarioError: an unknown key, a key that is no number, or a world that `scenario.parse` rejects.
+    """
+    source = f"--shift {request.text} in {scenario.name!r}"
+    values = msgspec.json.decode(msgspec.json.encode(scenario))
+    shifted = []
+    for change in request.changes:
+        if change.key == MISSING:
+            after = change.number / 100.0
+            if not n_missing(scenario, after) or after > 1.0:
+                raise ScenarioError(
+                    f"{source}: {MISSING} = {change.number:g}%; expected at least one and at most all of "
+                    f"{scenario.n_users} users"
+                )
+            shifted.append(ShiftedValue(key=MISSING, before=0.0, after=after))
+            continue
+        container, part = _find(values, change.key, source)
+        before = container[part]
+        container[part] = _changed(before, change, source)
+        shifted.append(ShiftedValue(key=change.key, before=before, after=container[part]))
+    flown = from_values(values, source)
+    users = msgspec.structs.replace(flown.users, cluster_centres_m=scenario.users.cluster_centres_m)
+    known = msgspec.structs.replace(flown, users=users)
+    return World(flown, known, Shift(text=request.text, values=shifted))
+
+
+def n_missing(scenario: Scenario, share: float) -> int:
+    """Users that send nothing, of a share from 0 to 1."""
+    return round(share * scenario.n_users)
+
+
+def transmitting(scenario: Scenario, seeds: Sequence[int], missing: float) -> Array:
+    """Which users send in the missions of seeds, where a share of them does not, bool `[S, U]`.
+
+    A user that is missing at a share is also missing at every greater one.
+    """
+    # Other draws than those of the mission, which stays the same.
+    ranks = [np.random.default_rng([seed, 1]).permutation(scenario.n_users) for seed in seeds]
+    return np.stack(ranks) >= n_missing(scenario, missing)
+
+
+def _change(text: str) -> Change:
+    match = _CHANGE.fullmatch(text.strip())
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r}; {EXPECTED}")
+    key, sets, value, operator, number, percent = match.groups()
+    if (key == MISSING) != bool(percent) or (percent and (sets or operator)):
+        raise argparse.ArgumentTypeError(f"{text!r}; {EXPECTED}")
+    return Change(key, cast(Operator, percent or sets or operator or "="), float(value or number))
+
+
+def _find(values: Any, path: str, source: str) -> tuple[Any, str | int]:
+    """The table or list that holds a key, and the key's last part."""
+    here = container = values
+    part: str | int = ""
+    try:
+        for name in re.findall(r"\w+", path):
+            part = int(name) if name.isdecimal() else name
+            container, here = here, here[part]
+    except (KeyError, IndexError, TypeError):
+        known = [key for key, value in leaves(values) if isinstance(value, float | int)]
+        close = difflib.get_close_matches(path, known, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"expected a numeric key, such as {known[-1]}"
+        raise ScenarioError(f"{source}: unknown key {path}; {hint}") from None
+    return container, part
+
+
+def _changed(value: Any, change: Change, source: str) -> Any:
+    """A value after a change; of a list, every element."""
+    operator, number = change.operator, change.number
+    if isinstance(value, list) and operator != "=":
+        return [_changed(entry, change, source) for entry in value]
+    if value is None and operator == "=":
+        return number
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        kind = {list: "a list", dict: "a table", type(None): "not set"}.get(type(value), repr(value))
+        expected = {
+            list: "+DELTA, -DELTA, xFACTOR, or one of its elements",
+            dict: "one of its keys",
+            type(None): "=VALUE",
+        }.get(type(value), "a numeric key")
+        raise ScenarioError(f"{source}: {change.key} is {kind}; expected {expected}")
+    after = {"=": number, "+": value + number, "-": value - number, "x": value * number}[operator]
+    if isinstance(value, float):
+        return after
+    if not after.is_integer():
+        raise ScenarioError(f"{source}: {change.key} = {after:g}; expected a whole number")
+    return int(after)
