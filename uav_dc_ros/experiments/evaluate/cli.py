@@ -35,7 +35,14 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     save_mission_picture,
     shift_effect,
 )
-from uav_dc_ros.experiments.evaluate.shifts import MISSING, ShiftedValue, ShiftRequest, World, apply, parse
+from uav_dc_ros.experiments.evaluate.shifts import (
+    MISSING,
+    ShiftedValue,
+    ShiftRequest,
+    ShiftedWorld,
+    apply,
+    parse,
+)
 from uav_dc_ros.planners import PLANNERS
 
 PROG = "python -m uav_dc_ros.evaluate"
@@ -137,9 +144,9 @@ def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[t
 
 def _flights(
     candidate: Candidate, scenario: Scenario, shifts: Sequence[ShiftRequest]
-) -> Iterator[tuple[Candidate, World, Act]]:
+) -> Iterator[tuple[Candidate, ShiftedWorld, Act]]:
     """A candidate in the scenario as it is and in each shifted world, with its actions there."""
-    yield candidate, World(scenario, scenario), candidate.act_in(scenario)
+    yield candidate, ShiftedWorld(scenario, scenario), candidate.act_in(scenario)
     for request in shifts:
         world = apply(request, scenario)
         try:

@@ -65,7 +65,7 @@ class Shift(msgspec.Struct, frozen=True, kw_only=True):
         return next((float(value.after) for value in self.values if value.key == MISSING), 0.0)
 
 
-class World(NamedTuple):
+class ShiftedWorld(NamedTuple):
     """A scenario, or a shifted one."""
 
     scenario: Scenario  # in which missions are flown
@@ -84,7 +84,7 @@ def parse(text: str) -> ShiftRequest:
     return ShiftRequest(text, changes)
 
 
-def apply(request: ShiftRequest, scenario: Scenario) -> World:
+def apply(request: ShiftRequest, scenario: Scenario) -> ShiftedWorld:
     """The world of a scenario after a shift.
 
     Raises:
@@ -110,7 +110,7 @@ def apply(request: ShiftRequest, scenario: Scenario) -> World:
     flown = from_values(values, source)
     users = msgspec.structs.replace(flown.users, cluster_centres_m=scenario.users.cluster_centres_m)
     known = msgspec.structs.replace(flown, users=users)
-    return World(flown, known, Shift(text=request.text, values=shifted))
+    return ShiftedWorld(flown, known, Shift(text=request.text, values=shifted))
 
 
 def n_missing(scenario: Scenario, share: float) -> int:
