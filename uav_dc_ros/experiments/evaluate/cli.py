@@ -38,8 +38,8 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
 from uav_dc_ros.experiments.evaluate.shifts import (
     MISSING,
     ShiftedValue,
-    ShiftRequest,
     ShiftedWorld,
+    ShiftRequest,
     apply,
     parse,
 )
