@@ -50,7 +50,7 @@ class Running:
             status = self.process.wait(timeout_s)
         finally:
             self.process.kill()
-            self._thread.join(5)
+            self._thread.join(90)
         return status, "".join(self.lines)
 
 

@@ -499,7 +499,7 @@ def test_a_monitor_that_outlives_a_flight_takes_no_pose_of_it_for_the_next(ros: 
     for node in (second, *others):
         stop(node)
     probe.stdin.close()
-    probe.wait(10)
+    probe.wait(90)
     probe.stdout.close()
     status, out = verify(capsys, bag)
     assert status == 0, out

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import queue
+import signal
 import subprocess
 import threading
 import time
@@ -60,7 +61,11 @@ class FakeProcess:
         assert self.process.stdin is not None
         with contextlib.suppress(OSError):
             self.process.stdin.close()
-        self.process.wait(10.0)
+        try:
+            self.process.wait(90.0)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGABRT)  # it prints its stack
+            raise
         assert died is None, f"the stand-in died: {died}, {self.events[-20:]}"
 
 

@@ -148,7 +148,7 @@ def fly(kind: str, wire: str, name: str, at_s: float | None) -> dict[str, Any]:
                     flight.tick()
                     time.sleep(0.01)
                 looks.append(autopilot.report())
-            lands_until_s = time.monotonic() + (0.0 if line in ("pilot", "") else 20.0)
+            lands_until_s = time.monotonic() + (0.0 if line in ("pilot", "") else 90.0)
             while looks[-1]["armed"] and time.monotonic() < lands_until_s:  # a busy machine is slow
                 flight.tick()
                 time.sleep(0.01)

@@ -40,8 +40,8 @@ class Fake(FakeProcess):
         number = free_udp_port() if wire == "udp" else 0
         command = [
             sys.executable,
-            "-m",
-            "tests.support.fake_autopilot.autopilot",
+            *("-X", "faulthandler"),
+            *("-m", "tests.support.fake_autopilot.autopilot"),
             "--kind",
             kind,
             f"--{wire}",
