@@ -3,12 +3,15 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import Ros, finish, read_bag, until, wait_for
 from tests.support.fake_autopilot.flight import fake
+from uav_dc_ros.runner.node_process import waits_for_disk
 
 NODES = ("world", "channel_monitor", "policy", "recorder", "visualizer")
 AT_A_PACE = ("--pace", 15)  # twenty seconds: longer than the recorder is waited for
@@ -32,6 +35,26 @@ def flown_with_hangs(ros: Ros, options: list[object], names: tuple[str, ...], *h
     told = json.loads((ros.folder / "summary.json").read_text())
     assert {each["steps"] for each in (told if isinstance(told, list) else [told])} == {30}
     return printed + output
+
+
+# A parent waits for the child of vfork in the same state of the kernel as for a disk.
+WAITS_IN_THE_KERNEL = "import ctypes, signal; ctypes.CDLL(None).vfork(); signal.pause()"
+
+
+def test_a_process_that_waits_for_the_disk_does_not_hang() -> None:
+    waiting = subprocess.Popen([sys.executable, "-c", WAITS_IN_THE_KERNEL], start_new_session=True)
+    stopped = subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"])
+    try:
+        until(lambda: waits_for_disk(waiting.pid))
+        stopped.send_signal(signal.SIGSTOP)
+        assert not waits_for_disk(stopped.pid)
+        assert not waits_for_disk(os.getpid())
+    finally:
+        os.killpg(waiting.pid, signal.SIGKILL)
+        stopped.kill()
+        waiting.wait()
+        stopped.wait()
+    assert not waits_for_disk(waiting.pid)
 
 
 @pytest.fixture

@@ -21,7 +21,20 @@ from uav_dc_ros.nodes.framework.process_control import FINALIZED, REPORTS, SUPER
 from uav_dc_ros.nodes.ros import environment
 
 READ_BYTES = 1 << 16  # capacity of a pipe
+DISK_WAIT_S = 0.5  # a process that is silent for so long may wait for the disk
 READER_S = 1.0  # timeout for the last lines of output
+
+
+def waits_for_disk(process_id: int) -> bool:
+    """Whether the main thread of a process waits within the kernel, as for a disk that stalls.
+
+    It does not hang: it goes on when the disk does, and until then a kill ends neither it nor its wait.
+    """
+    try:
+        stat = Path(f"/proc/{process_id}/stat").read_bytes()
+    except OSError:  # it has ended
+        return False
+    return stat.rpartition(b") ")[2].startswith(b"D")
 
 
 class NodeProcess:
@@ -91,7 +104,10 @@ class NodeProcess:
             received = os.read(self._pipe, READ_BYTES)
         except BlockingIOError:
             received = b""
-        self.silent_s = 0.0 if received else self.silent_s + passed_s
+        if received:
+            self.silent_s = 0.0
+        elif self.silent_s < DISK_WAIT_S or not waits_for_disk(self.process.pid):
+            self.silent_s += passed_s
         *lines, self._partial = (self._partial + received).split(b"\n")
         if lines:
             self.reports = process_control.decode(lines[-1])

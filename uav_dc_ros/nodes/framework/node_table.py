@@ -74,7 +74,7 @@ NODES: dict[str, NodeRow] = {
             ),
             keeps_all=True,
             rank=0,
-            hang_timeout_s=10.0,  # a slow disk blocks its callbacks, ...
+            hang_timeout_s=10.0,  # a slow disk blocks its callbacks between waits within the kernel, ...
             stop_timeout_s=60.0,  # ... and the end of its bag
             restart_parameters={"resume": True},
         ),
