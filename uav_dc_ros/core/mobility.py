@@ -85,7 +85,7 @@ def begin(scenario: "Scenario", draws: Array) -> tuple[Array, Array]:
 
     D is `scenario.draws_shape[1]`. Motion is what the model remembers, see `move`.
     """
-    model = scenario.users.mobility
+    model = scenario.users.moves
     centres_m = constant(scenario.user_centres_m, draws)
     users_m = scatter(centres_m, scenario.user_radii_m(draws), draws)
     if isinstance(model, RandomWaypoint):
@@ -105,7 +105,7 @@ def move(scenario: "Scenario", users_m: Array, motion: Array, draws: Array) -> t
     (m/s) and the pause that is due there (s), `[..., U, 4]`; of `gauss_markov` the velocity x, y (m/s),
     `[..., U, 2]`; of other models nothing, `[..., U, 0]`.
     """
-    model, step_s = scenario.users.mobility, scenario.mission.step_s
+    model, step_s = scenario.users.moves, scenario.mission.step_s
     match model:
         case RandomWalk():
             assert scenario.users.v_max_mps is not None, "checked by parse()"

@@ -129,7 +129,7 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
     @property
     def draws_shape(self) -> tuple[int, int]:
         """Users U, and uniform draws D of each for the start of a mission and again for each step."""
-        return self.n_users, self.users.mobility.n_draws
+        return self.n_users, self.users.moves.n_draws
 
     @cached_property
     def step_ns(self) -> int:
@@ -183,7 +183,7 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
         del world["reward"]
         if isinstance(self.radio, FreeSpace):
             del world["radio"]["model"]  # which scenarios of version 0.2.0 lack
-        if isinstance(self.users.mobility, RandomWalk):
+        if isinstance(self.users.moves, RandomWalk):
             world["users"].pop("mobility", None)  # likewise
         return hashlib.sha256(msgspec.json.encode(world, order="sorted")).hexdigest()[:12]
 

@@ -55,10 +55,16 @@ class UserSettings(
     users_per_cluster: Size | tuple[Size, ...] | None = None  # users K in a cluster; or a number for each
     cluster_radius_m: Positive | None = None  # radius C of the disc in which a cluster's users start, metres
     v_max_mps: NotNegative | None = None  # maximum speed v, m/s; only of the random walk, which needs it
-    mobility: Mobility = RandomWalk()  # how users move; `mobility.model` names the struct, see `mobility`
+    # How users move; `mobility.model` names the struct, see `mobility`. None: the random walk.
+    mobility: Mobility | None = None
     user: Annotated[tuple[User, ...], Meta(max_length=USERS_MAX)] = ()  # the users one by one
     # A CSV or GeoJSON file of users beside the scenario's file. `scenarios.load` puts its users into `user`.
     file: str | None = None
+
+    @property
+    def moves(self) -> Mobility:
+        """How users move."""
+        return self.mobility or RandomWalk()
 
     @cached_property
     def listed(self) -> tuple[tuple[User, ...], ...]:
@@ -166,7 +172,7 @@ class UserSettings(
                     yield f"users.user[{i}].{key} = {label!r}; expected printable characters"
             if user.name is not None and (first := seen.setdefault(user.name, i)) != i:
                 yield f"users.user[{i}].name = {user.name!r}, as of users.user[{first}]; expected another one"
-        walks, model = isinstance(self.mobility, RandomWalk), self.mobility
+        walks, model = isinstance(self.moves, RandomWalk), self.moves
         if walks and self.v_max_mps is None:
             yield "missing key users.v_max_mps"
         if not walks and self.v_max_mps is not None:
