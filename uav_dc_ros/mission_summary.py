@@ -25,6 +25,11 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     # the data of the `step`, the mean of r^t over the steps with rates.
     reward: float
     reward_data: RewardData  # data in r^t, `so_far` or `step`
+    # How users were served, see `core.users.service`: age of information, seconds; Jain's index of the data;
+    # step in which the last of the collected users was collected. Null where unknown
+    mean_age_s: float | None
+    fairness: float | None
+    last_collected_step: int | None
     # Energy by the scenario's model, joules, and for each Mbit collected (null where none was); absent in a
     # scenario without a battery
     energy_used_j: float | UnsetType = UNSET

@@ -64,6 +64,8 @@ def test_a_clean_flight_verifies_to_the_last_bit(flown, capsys):
         "channel: 122 of 122 steps recomputed, equal to the last bit",
         "world: 122 of 122 steps recomputed, equal to the last bit",
         "decisions: 120 of 120 steps recomputed, equal to the last bit",
+        "users: age of information 252.1 s, fairness 0.981, last user collected at step 37.0 (means of 2 "
+        "missions)",
         "verified",
     ]
     assert "2 missions, 122 steps in scenario 'five_clusters', policy 'five_clusters_dueling' (sha" in out

@@ -14,6 +14,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users.service import ServiceRecord
 from uav_dc_ros.core.world import observe
 from uav_dc_ros.env.trajectory import Trajectory
 
@@ -55,6 +56,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         step, cell `[3]`, users_m `[U, 2]`, data_bits `[U]`, collected `[U]`, landed, dock_distance_m
         (horizontal), and of the last step (zero before the first): served `[U]`, sinr `[U]` linear,
         rate_bps `[U]`, sum_rate_bps. In a scenario with `energy` also energy_used_j and state_of_charge.
+        At the end of a mission also mean_age_s, fairness and last_collected_step, see `core.users.service`.
 
     Args:
         scenario: a shipped name, the path of a TOML file, or a Scenario.
@@ -89,6 +91,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         self._state = world.initial(self.scenario, self._draws())
         self._trajectory = Trajectory(self.scenario)
         self._trajectory.add(self._state)
+        self._service = ServiceRecord(np.zeros(self.scenario.n_users))
         return observe(self.observation, self.scenario, self._state), info(self.scenario, self._state)
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -99,10 +102,15 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
             raise InvalidAction(f"action is {action!r}; expected an integer: {ACTIONS_TEXT}")
         state, outcome = world.step(self.scenario, self._state, np.asarray(action), self._draws())
         self._trajectory.add(state, outcome.link)
+        self._service.add(state.step, outcome.link.served, state.collected)
         terminated, truncated = bool(outcome.terminated), bool(outcome.truncated)
-        self._state = None if terminated or truncated else state
+        infos = info(self.scenario, state, outcome)
+        self._state = state
+        if terminated or truncated:
+            self._state = None
+            infos |= self._service.figures(self.scenario, state.data_bits)
         observation = observe(self.observation, self.scenario, state)
-        return observation, float(outcome.reward), terminated, truncated, info(self.scenario, state, outcome)
+        return observation, float(outcome.reward), terminated, truncated, infos
 
     def render(self) -> Array | None:
         """The mission so far as a picture `[H, W, 3]`, uint8; None without a render mode."""

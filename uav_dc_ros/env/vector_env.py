@@ -14,6 +14,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users.service import ServiceRecord
 from uav_dc_ros.core.world import BatchWorld
 from uav_dc_ros.env.gym_env import ACTIONS_TEXT, info, prepare
 
@@ -24,7 +25,7 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
     A mission that has ended restarts at the next step (`AutoresetMode.NEXT_STEP`), which ignores its action
     and gives reward 0. Environment i draws from its own generator exactly as a single one does:
     `reset(seed=s)` gives it seed s + i. Keys of `info` are those of the single environment, `[num_envs,
-    ...]`, each with its mask `_key`.
+    ...]`, each with its mask `_key`; those of the end of a mission are there when a mission has ended.
     """
 
     # Gymnasium declares it as an instance variable.
@@ -62,6 +63,7 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
                     self._rngs[i] = seeding.np_random(one)[0]
         self._over = np.zeros(self.num_envs, bool)
         self._batch = BatchWorld(self.scenario, self._draws())
+        self._service = ServiceRecord(np.zeros((self.num_envs, self.scenario.n_users)))
         return self._batch.observe(self.observation), self._masked(info(self.scenario, self._batch.state))
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -76,15 +78,22 @@ class DataCollectionVectorEnv(VectorEnv[Array, Array, Array]):
         restarted, draws = self._over, self._draws()
         outcome = self._batch.step(np.where(restarted, Action.HOVER, actions), draws)
         infos = info(self.scenario, self._batch.state, outcome)
+        state = self._batch.state
+        self._service.add(state.step, outcome.link.served, state.collected)
         if restarted.any():
             self._batch.restart(restarted, draws)
+            self._service.restart(restarted)
             initial = info(self.scenario, self._batch.state)
             for key, values in infos.items():
                 values[restarted] = initial[key][restarted]
         terminated, truncated = outcome.terminated & ~restarted, outcome.truncated & ~restarted
         self._over = terminated | truncated
+        infos = self._masked(infos)
+        if self._over.any():
+            for key, values in self._service.figures(self.scenario, state.data_bits).items():
+                infos |= {key: values, f"_{key}": self._over}
         reward = np.where(restarted, 0.0, outcome.reward)
-        return self._batch.observe(self.observation), reward, terminated, truncated, self._masked(infos)
+        return self._batch.observe(self.observation), reward, terminated, truncated, infos
 
     def _draws(self) -> Array:
         return np.stack([rng.random(self.scenario.draws_shape) for rng in self._rngs])

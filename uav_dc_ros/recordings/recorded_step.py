@@ -1,10 +1,11 @@
 """Steps of a recorded mission: the messages that a bag holds of each, and the totals of all."""
 
+import math
 from bisect import insort
 from dataclasses import dataclass, field
 from itertools import groupby
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -14,6 +15,7 @@ from uav_dc_ros.core import energy
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import RewardData, mission_reward
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users.service import FIGURES, ServiceRecord
 from uav_dc_ros.messages import FaultKind, Mission, Phase, Rates
 from uav_dc_ros.phases import BEFORE_START
 
@@ -140,6 +142,9 @@ class MissionTotals:
     seed: int | None = None
     scenario: str | None = None
     fingerprint: str | None = None
+    # Of the steps with rates; before the first ones unknown
+    _service: ServiceRecord | None = field(default=None, init=False, repr=False)
+    _user_bits: Array | None = field(default=None, init=False, repr=False)  # data at the last rates, `[U]`
 
     @property
     def is_over(self) -> bool:
@@ -153,6 +158,15 @@ class MissionTotals:
             return None
         return float(energy.per_mbit_j(np.asarray(self.energy_used_j), np.asarray(self.data_bits)))
 
+    def service_figures(self, scenario: Scenario) -> dict[str, Any]:
+        """The `FIGURES` of `core.users.service`, as plain numbers; None where unknown."""
+        if self._service is None or self._user_bits is None:
+            return dict.fromkeys(FIGURES)
+        found = self._service.figures(scenario, self._user_bits)
+        known = {name: None if math.isnan(value) else float(value) for name, value in found.items()}
+        last = known["last_collected_step"]
+        return known | {"last_collected_step": None if last is None else int(last)}
+
     def add_reward(self, total: float, data: RewardData) -> None:
         """Add the r^t of the next step that has one."""
         self.n_rewards += 1
@@ -164,6 +178,11 @@ class MissionTotals:
         if rates is not None:
             self.collected, self.users = sum(rates.collected), len(rates.collected)
             self.data_bits = float(np.sum(rates.data_bits))
+            self._user_bits = np.asarray(rates.data_bits, np.float64)
+            if self._service is None:
+                self._service = ServiceRecord(np.zeros(self.users))
+            if step:  # step 0 is the start
+                self._service.add(np.asarray(step), np.asarray(rates.served), np.asarray(rates.collected))
         if status is not None:
             self.seed, self.scenario, self.fingerprint = status.seed, status.scenario, status.fingerprint
             self.reason, self.steps_not_reached = status.reason, status.steps_not_reached

@@ -56,6 +56,7 @@ class MonitoredMission(MissionTotals):
             reward_data=scenario.reward.data,
             reason=self.reason,
             bag=bag,
+            **self.service_figures(scenario),
             **({} if scenario.energy is None else self._battery()),
         )
 

@@ -65,6 +65,11 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     # over its steps with the data of the `step`
     reward: Figure
     episode_return: Figure  # undiscounted sum of the agent's rewards
+    # How users were served, see `core.users.service`: age of information, seconds; Jain's index of the data;
+    # step in which the last of the collected users was collected
+    mean_age_s: Figure
+    fairness: Figure
+    last_collected_step: Figure
     # Energy used in a mission, joules, and for each Mbit collected; absent in a scenario without a battery
     energy_used_j: Figure | UnsetType = UNSET
     energy_per_mbit_j: Figure | UnsetType = UNSET
@@ -190,7 +195,7 @@ def _differences(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> d
     return {name: _figure(one - other) for name, (one, other) in pairs.items()}
 
 
-_RANGES = {"landing_rate": (0.0, 1.0)}  # of possible values; the interval ends there
+_RANGES = {"landing_rate": (0.0, 1.0), "fairness": (0.0, 1.0)}  # of possible values; the interval ends there
 
 
 def _figure(values: Array, possible: tuple[float, float] | None = None) -> Figure:
@@ -214,6 +219,9 @@ _SHOWN = {
     "data_bits": ("data, Mbit", 1e6, 1),
     "reward": ("reward", 1.0, 3),  # with the words of `MISSION_REWARD` behind it
     "episode_return": ("return", 1.0, 3),
+    "mean_age_s": ("age of information, s", 1.0, 1),
+    "fairness": ("fairness of data", 1.0, 3),
+    "last_collected_step": ("last user collected at step", 1.0, 1),
     "energy_used_j": ("energy, kJ", 1e3, 2),
     "energy_per_mbit_j": ("energy, J/Mbit", 1.0, 1),
 }

@@ -15,6 +15,7 @@ from uav_dc_ros.core import energy, mission, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users.service import ServiceRecord
 from uav_dc_ros.core.world import Act
 from uav_dc_ros.env.trajectory import Trajectory
 
@@ -34,6 +35,10 @@ class Missions:
     data_bits: Array  # collected from all users
     reward: Array  # of the mission, see `core.reward.mission_reward`
     episode_return: Array  # undiscounted sum of the agent's rewards
+    # How users were served, see `core.users.service`; None in a rollout without it
+    mean_age_s: Array | None = None
+    fairness: Array | None = None
+    last_collected_step: Array | None = None
     # Energy used, joules, and for each Mbit collected (NaN where none was); None without a battery
     energy_used_j: Array | None = None
     energy_per_mbit_j: Array | None = None
@@ -78,13 +83,19 @@ def roll_out(
     layouts: Layouts = (),
     rewards: Rewards | None = None,
     transmitting: Array | None = None,
+    *,
+    service: bool = True,
 ) -> Missions:
-    """Fly every mission to its end; arguments as in `rollout_steps`, results `[S]` or `[R, S]`."""
+    """Fly every mission to its end; arguments as in `rollout_steps`, results `[S]` or `[R, S]`.
+
+    Without `service` the result lacks how users were served.
+    """
     steps = rollout_steps(scenario, act, seeds, layouts, rewards, transmitting)
     final, _ = next(steps)
     over = final.step < 0
     landed, arrival = over, np.full(over.shape, np.nan)
     rate_sum, episode_return = np.zeros(over.shape), np.zeros(over.shape)
+    record = ServiceRecord(np.zeros(final.data_bits.shape)) if service else None
     for state, outcome in steps:
         assert outcome is not None, "every step but the start has one"
         final = world.select(over, final, state)
@@ -92,6 +103,8 @@ def roll_out(
         arrival = np.where(docked, np.where(np.isnan(arrival), final.step, arrival), np.nan)
         rate_sum += np.where(over, 0.0, outcome.link.sum_rate_bps)
         episode_return += np.where(over, 0.0, outcome.reward)
+        if record is not None:
+            record.add(state.step, outcome.link.served, state.collected, over)
         landed = landed | (outcome.landed & ~over)
         over = over | outcome.terminated | outcome.truncated
         if over.all():
@@ -110,6 +123,7 @@ def roll_out(
         data_bits=data_bits,
         reward=final.mission_reward,
         episode_return=episode_return,
+        **({} if record is None else record.figures(scenario, final.data_bits)),
         **battery,
     )
 

@@ -108,7 +108,12 @@ def apply(request: ShiftRequest, scenario: Scenario) -> ShiftedWorld:
         container[part] = _changed(before, change, source)
         shifted.append(ShiftedValue(key=change.key, before=before, after=container[part]))
     flown = from_values(values, source)
-    users = msgspec.structs.replace(flown.users, cluster_centres_m=scenario.users.cluster_centres_m)
+    pairs = zip(flown.users.user, scenario.users.user, strict=True)
+    users = msgspec.structs.replace(
+        flown.users,
+        cluster_centres_m=scenario.users.cluster_centres_m,
+        user=tuple(msgspec.structs.replace(user, x_m=own.x_m, y_m=own.y_m) for user, own in pairs),
+    )
     known = msgspec.structs.replace(flown, users=users)
     return ShiftedWorld(flown, known, Shift(text=request.text, values=shifted))
 

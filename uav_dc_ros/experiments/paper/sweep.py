@@ -126,7 +126,7 @@ def roll_out_trajectories(networks: Networks, scale: Scale) -> list[Trajectory]:
             observation = observe(OBSERVATION, scenario, state)
             return network.q_values(sizes, networks[environment], observation).argmax(-1)
 
-        users = layout(environment, (scenario.n_users, 2))
+        users = layout(environment, scenario.draws_shape)
         return roll_out_trajectory(scenario, act, greedy_seeds(scale)[0], users)
 
     return [trajectory(environment) for environment in sorted(networks)]

@@ -3,6 +3,7 @@
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
 from uav_dc_ros.core import reward
+from uav_dc_ros.core.mobility import GaussMarkov, RandomWalk, RandomWaypoint, Static
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate.evaluation import COLUMNS, TEST_SEEDS, evaluate, rows
 from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay
@@ -15,6 +16,12 @@ greedy mission is one fixed path, and where it stays for one step it stays for g
     "mission": "It sees how far each cluster is collected, but not where single users are.",
     "energy": "It sees how far each cluster is collected and how full the battery is, but not single users.",
     "map": "It sees where the clusters are, but it has met no other map than this one.",
+}
+_USERS = {
+    RandomWalk: "slowly walking users",
+    Static: "users that stand still",
+    RandomWaypoint: "users on the way to random waypoints",
+    GaussMarkov: "Gauss-Markov users",
 }
 
 
@@ -35,6 +42,7 @@ def card(
     config, values = policy.config, policy.config.hyperparameters
     hidden = " and ".join(map(str, config.hidden))
     first, last = TEST_SEEDS[0], TEST_SEEDS[-1]
+    users = _USERS[type(scenario.users.moves)]
     algorithm, n_users = _ALGORITHMS[config.algorithm], scenario.n_users
     lines = (COLUMNS, ["---"] * len(COLUMNS), *rows(evaluate(policy, scenario)))
     began = "" if prefilled is None else f"\n- the replay buffer began with {prefilled}"
@@ -71,7 +79,7 @@ The arrival step is over missions that landed. Intervals of the mean are by the 
 
 {_LIMITS[config.observation]}
 It knows one field: another layout of clusters on the same grid would be flown as if it were this one. It has
-met slowly walking users and a line-of-sight channel, in simulation only: no wind, no fading, no lost packets.
+met {users} and a line-of-sight channel, in simulation only: no wind, no fading, no lost packets.
 """
 
 

@@ -210,7 +210,7 @@ def roll_out_greedily(training: Training, seeds: range) -> Missions:
         return learner.greedy(observation.to(training.device)).cpu().numpy()
 
     own = rewards(population.runs, lambda values: values[:, None])
-    return roll_out(population.scenario, act, seeds, layouts=fixed, rewards=own)
+    return roll_out(population.scenario, act, seeds, layouts=fixed, rewards=own, service=False)
 
 
 class Validation(NamedTuple):

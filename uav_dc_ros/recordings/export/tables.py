@@ -58,6 +58,7 @@ TABLES: dict[str, Columns] = {
         "total_reward": "float",  # r^t at the last step
         "reward": "float",  # of the mission, over the steps with a known r^t: `core.reward.mission_reward`
         "reward_data": "text",  # data in r^t: step, so_far
+        "mean_age_s": "float", "fairness": "float", "last_collected_step": "int",  # `core.users.service`
     },
 }
 # Further columns of a scenario with a battery, by its model; those of a step are at its end.
@@ -193,6 +194,7 @@ class MissionRows:
             "total_reward": self._total and self._total[1],
             "reward": totals.reward,
             "reward_data": self._scenario.reward.data,
+            **totals.service_figures(self._scenario),
             "energy_used_j": totals.energy_used_j,
             "energy_per_mbit_j": totals.energy_per_mbit_j,
             "vehicle": self._vehicle,

@@ -4,7 +4,9 @@
 const METRICS = (rewardWords) => [
   ["landed", "landed", "%", 0], ["users_collected", "users collected", "", 1], ["data_bits", "data", "bit", null],
   ["sum_rate_bps", "mean sum-rate", "bit/s", null], ["distance_m", "distance flown", "m", null], ["steps", "steps", "", 1],
-  ["reward", `reward ${rewardWords}`, "", 3], ["energy_used_j", "energy used", "J", null], ["energy_per_mbit_j", "energy for data", "J/Mbit", 1],
+  ["reward", `reward ${rewardWords}`, "", 3],
+  ["mean_age_s", "age of information", "s", 1], ["fairness", "fairness of data", "", 3], ["last_collected_step", "last user collected at step", "", 1],
+  ["energy_used_j", "energy used", "J", null], ["energy_per_mbit_j", "energy for data", "J/Mbit", 1],
 ];
 // Okabe and Ito's colours without yellow, which is invisible on paper. Dashes distinguish groups without colour.
 const SHADES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c7853", "#7f7f9f"];

@@ -18,6 +18,7 @@ from uav_dc_ros.core import stats
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import MISSION_REWARD
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users.service import FIGURES
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.messages import Phase, printable
 from uav_dc_ros.recordings import step_reader
@@ -29,7 +30,16 @@ from uav_dc_ros.recordings.thinning import spread
 GROUPS_MAX = 8  # distinguishable colours and dashes
 PATHS_MAX = 20  # of a group, in a picture
 POINTS_MAX = 400  # of a curve
-METRICS = ("landed", "users_collected", "data_bits", "sum_rate_bps", "distance_m", "steps", "reward")
+METRICS = (
+    "landed",
+    "users_collected",
+    "data_bits",
+    "sum_rate_bps",
+    "distance_m",
+    "steps",
+    "reward",
+    *FIGURES,
+)
 CURVES = ("n_collected", "sum_rate_bps", "reward")
 
 

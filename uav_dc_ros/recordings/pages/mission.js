@@ -247,6 +247,9 @@ open(async (page, data) => {
       ["steps", `${one.steps}`, `of ${world.max_steps}`],
       ...(one.steps_not_reached ? [["steps not reached", `${one.steps_not_reached}`, `of ${one.steps}`, "bad"]] : []),
       [`reward ${world.reward_words}`, fixed(one.reward, 3)],
+      ["age of information", one.mean_age_s === null ? NONE : fixed(one.mean_age_s, 1), "s"],
+      ["fairness of data", one.fairness === null ? NONE : fixed(one.fairness, 3)],
+      ["last user collected", one.last_collected_step === null ? NONE : `step ${one.last_collected_step}`],
       ...("energy_used_j" in one ? [
         ["energy used", ...si(one.energy_used_j, "J").split(" ")],
         ["energy for data", one.energy_per_mbit_j === null ? NONE : fixed(one.energy_per_mbit_j, 1), "J/Mbit"],

@@ -105,6 +105,7 @@ class MissionData:
             "distance_m": self._distance_m,
             "reward": (math.nan if totals.steps else 0.0) if totals.reward is None else totals.reward,
             "reward_data": self.scenario.reward.data,
+            **totals.service_figures(self.scenario),
             **({name: getattr(totals, name) for name in BATTERY} if self.scenario.energy else {}),
         }
 

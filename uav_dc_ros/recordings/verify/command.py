@@ -20,6 +20,7 @@ from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import Steps
 from uav_dc_ros.recordings.verify.recompute import ChannelCheck, Check, DecisionCheck, WorldCheck
+from uav_dc_ros.recordings.verify.service import ServiceSummary
 from uav_dc_ros.recordings.verify.vehicle_flights import VehicleCheck
 from uav_dc_ros.topics import SIMULATED
 
@@ -126,17 +127,20 @@ def _verify(
     world = WorldCheck(scenario, seed=seed, lockstep=lockstep, real=real, tolerance=tolerance)
     flights = VehicleCheck(scenario, vehicle) if real else None
     decisions = DecisionCheck(scenario, policy) if policy else None
+    service = ServiceSummary(scenario)
     recorded = Steps(reader, namespace, scenario.step_ns)
     n_missions = n_steps = 0
     for (flight, mission), steps in groupby(recorded, attrgetter("flight", "mission")):
         n_missions += 1
         for step in steps:
             n_steps += 1
+            service.add(step)
             if step.is_measured or step.users is not None or step.rates is not None:
                 channel.add(step)
             for check in (world, flights, decisions, other):
                 if check:
                     check.add(step)
+        service.end_mission()
         if other:
             other.end_mission(mission_name(mission, flight))
     if not channel.compared and not world.compared:
@@ -147,6 +151,7 @@ def _verify(
     lines = [line for check in checks for line in check.lines()]
     if not decisions:
         lines.append(f"decisions: not verified: {missing_policy}")
+    lines += service.lines()
     losses = list(recorded.losses())
     missions = f"{n_missions} mission{'s' * (n_missions != 1)}"
     by = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
