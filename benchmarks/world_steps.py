@@ -1,4 +1,4 @@
-"""World steps per second on one core, without a learner, over the number of users.
+"""World steps per second on one core, without a learner, over the number of users and of buildings.
 
     python benchmarks/world_steps.py [REPEATS]
 
@@ -13,6 +13,7 @@ into memory that is there already. A world in NumPy cannot do without these.
 import statistics
 import sys
 import time
+import tracemalloc
 
 import msgspec
 import numpy as np
@@ -25,11 +26,27 @@ from uav_dc_ros.core.world import BatchWorld
 # Users, and worlds side by side: enough to drown the cost of a call, few enough to stay near the cache.
 SIZES = ((10, 4096), (50, 1024), (100, 1024), (1000, 64), (10_000, 8))
 TARGET = (50, 500_000)  # users, world steps per second
+TOWNS = (
+    (50, 5, 512),
+    (50, 10, 512),
+    (50, 100, 128),
+    (1000, 100, 16),
+)  # users, buildings, worlds side by side
+TOWN_TARGET = (50, 100_000)
 
 
-def field(n_users: int) -> Scenario:
-    """`five_clusters` with another number of users."""
+def field(n_users: int, n_buildings: int = 0) -> Scenario:
+    """`five_clusters` with another number of users, and buildings 20 to 60 m wide and high."""
     values = msgspec.to_builtins(scenarios.load("five_clusters"))
+    rng = np.random.default_rng(0)
+    boxes = np.stack([rng.uniform(50, 890, n_buildings), rng.uniform(50, 890, n_buildings)], axis=-1)
+    sizes = rng.uniform(20, 60, (n_buildings, 3))
+    values["obstacles"] = [
+        {"polygon_m": [[x, y], [x + a, y], [x + a, y + b], [x, y + b]], "height_m": height}
+        for (x, y), (a, b, height) in zip(boxes.tolist(), sizes.tolist(), strict=True)
+    ]
+    if n_buildings:
+        values["radio"]["obstruction_loss_db"] = 20.0
     values["users"]["users_per_cluster"] = n_users // len(values["users"]["cluster_centres_m"])
     return from_values(values, f"five_clusters with {n_users} users")
 
@@ -76,7 +93,7 @@ class Bench:
 
 
 def main() -> None:
-    """Prints a row for each number of users: medians, and the best of all repeats."""
+    """Prints a row for each number of users, and for each town: medians, and the best of all repeats."""
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 9
     print(f"world steps per second on one core, float32, numpy {np.__version__}, {repeats} missions each")
     print(f"{'users':>6} {'worlds':>6} {'median':>10} {'best':>10} {'users/s':>10}   time / bare limit")
@@ -92,6 +109,22 @@ def main() -> None:
             verdict = f"   target {TARGET[1]:,}: {'met' if rate >= TARGET[1] else 'missed'}"
         counts = f"{n_users:6} {n_worlds:6} {rate:10,.0f} {best:10,.0f} {rate * n_users / 1e6:8.1f} M"
         print(f"{counts}   {ratio:.1f}{verdict}")
+    print(f"{'users':>6} {'bldgs':>6} {'worlds':>6} {'median':>10} {'best':>10}   peak MB of a mission")
+    for n_users, n_buildings, n_worlds in TOWNS:
+        bench = Bench(field(n_users, n_buildings), n_worlds)
+        bench.mission()
+        times_s = [bench.mission() for _ in range(repeats)]
+        tracemalloc.start()
+        bench.mission()
+        peak_mb = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+        rate, best = bench.n_steps / statistics.median(times_s), bench.n_steps / min(times_s)
+        verdict = ""
+        if n_users == TOWN_TARGET[0]:
+            verdict = f"   target {TOWN_TARGET[1]:,}: {'met' if rate >= TOWN_TARGET[1] else 'missed'}"
+        print(
+            f"{n_users:6} {n_buildings:6} {n_worlds:6} {rate:10,.0f} {best:10,.0f}   {peak_mb:.0f}{verdict}"
+        )
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
-from tests.support.worlds import tiny
+from tests.support.worlds import changed, tiny
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 
 
@@ -18,6 +18,18 @@ def test_a_picture_follows_the_mission():
     np.testing.assert_array_equal(start, env.render())
     env.step(1)
     assert not np.array_equal(start, env.render())
+
+
+def test_obstacles_are_in_the_picture():
+    zone = {"kind": "no_fly", "polygon_m": [[600.0, 300.0], [700.0, 300.0], [700.0, 500.0], [600.0, 500.0]]}
+    pictures = []
+    for obstacles in ([], [zone]):
+        env = DataCollectionEnv(changed("five_clusters", obstacles=obstacles), render_mode="rgb_array")
+        env.reset(seed=0)
+        pictures.append(env.render().astype(int))
+    rows, columns = np.nonzero(np.abs(pictures[0] - pictures[1]).sum(axis=-1))
+    height, width = np.ptp(rows), np.ptp(columns)
+    assert height == pytest.approx(2 * width, rel=0.05)  # the zone, and nothing else
 
 
 def test_the_last_picture_can_still_be_made_when_the_mission_is_over():

@@ -20,6 +20,20 @@ carrier_hz = 2e9
 environment = "urban"
 line_of_sight = "mean_gain"
 """
+# A tower in the middle, a pole beside the start, and a zone over the upper layer.
+OBSTACLES = """
+[[obstacles]]
+name = "tower"
+polygon_m = [[80.0, 80.0], [120.0, 80.0], [100.0, 120.0]]
+height_m = 170.0
+[[obstacles]]
+polygon_m = [[40.0, 5.0], [60.0, 5.0], [60.0, 15.0], [40.0, 15.0]]
+height_m = 90.0
+[[obstacles]]
+kind = "no_fly"
+polygon_m = [[-20.0, 80.0], [20.0, 80.0], [20.0, 220.0], [-20.0, 220.0]]
+base_m = 140.0
+"""
 COLUMNS = ("sinr", "rate_bps", "served", "data_bits", "collected")
 
 
@@ -30,7 +44,7 @@ def test_nodes_and_verify_follow_the_environment_to_the_last_bit(
     text, found = re.subn(free, URBAN, SMALL)
     assert found == 1
     path = tmp_path / "urban.toml"
-    path.write_text(text)
+    path.write_text(text + OBSTACLES)
     scenario = scenarios.load(path)
     policy = saved(tmp_path / "untrained", scenario, name="untrained")
     nodes = "world,channel_monitor,policy,recorder"
@@ -46,9 +60,11 @@ def test_nodes_and_verify_follow_the_environment_to_the_last_bit(
     )
     assert len(moves) == scenario.mission.max_steps
     env = gymnasium.make(ENV_ID, scenario=scenario).unwrapped
-    env.reset(seed=5)
+    _, info = env.reset(seed=5)
     for step in range(scenario.mission.max_steps):
-        *_, info = env.step(Action[moves[step]["action"].upper()])
+        action = Action[moves[step]["action"].upper()]
+        assert info["action_mask"][action], "a policy takes moves that have an effect"
+        *_, info = env.step(action)
         for column in COLUMNS:
             np.testing.assert_array_equal(rates[step + 1][column], info[column], err_msg=f"{step} {column}")
     with pytest.raises(SystemExit) as end:

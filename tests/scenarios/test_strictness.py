@@ -5,6 +5,7 @@ import re
 import tomllib
 from datetime import date
 from importlib.resources import files
+from typing import get_type_hints
 
 import msgspec
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uav_dc_ros import scenarios
+from uav_dc_ros.core.channel import FreeSpace
 from uav_dc_ros.core.scenario import Scenario, from_values, parse
 from uav_dc_ros.errors import ScenarioError, UavDcError
 
@@ -254,9 +256,9 @@ def test_an_unknown_key_and_what_was_meant(refused, table, typo, meant):
 @pytest.mark.parametrize("table", ["", *TABLES])
 def test_an_unknown_key_like_no_other(refused, table):
     text = f"qqqq = 3\n{TEXT}" if not table else TEXT.replace(f"[{table}]", f"[{table}]\nqqqq = 3")
-    known = VALUES[table] if table else [*VALUES, "energy", "datum_deg"]
+    known = VALUES[table] if table else [*VALUES, "energy", "datum_deg", "obstacles"]
     if table == "radio":
-        known = ["model", *known]
+        known = ["model", *get_type_hints(FreeSpace)]
     if table == "users":
         known = [*known, "mobility", "user", "file"]
     name = f"{table}.qqqq" if table else "qqqq"

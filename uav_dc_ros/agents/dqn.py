@@ -9,9 +9,9 @@ where the paper draws both at random, and learning begins with the first transit
 for a full buffer.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -21,12 +21,15 @@ from uav_dc_ros.agents import network
 from uav_dc_ros.agents.policy import Hyperparameters
 from uav_dc_ros.agents.replay import TransitionBatch
 
+# The actions that have an effect in observations `[..., D]`, bool `[..., A]`.
+Mask: TypeAlias = Callable[[Tensor], Tensor]
+
 
 def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float | Tensor) -> Tensor:
     """The target y (eq. 22): `r` when the episode terminated at s', else `r + gamma max_a' Q'(s', a')`.
 
-    `next_q` is Q'(s', .) of the target network, `[..., A]`; everything else is `[...]`. A truncated episode
-    has not terminated.
+    `next_q` is Q'(s', .) of the target network, `[..., A]`, minus infinity for an action that has no effect
+    there; everything else is `[...]`. A truncated episode has not terminated.
     """
     return reward + gamma * next_q.amax(dim=-1).masked_fill_(terminated, 0.0)
 
@@ -44,10 +47,15 @@ class Learner:
 
     Every network has both streams of the dueling one in a single last layer, `head`: its first output is V,
     the others are A(a). The Q-values of a plain network are A(a): its V has no gradient and stays constant.
+
+    Among obstacles a `mask` names the actions that have an effect: the runs take no other action, and the
+    target is the maximum over them (Huang and Ontanon, "A closer look at invalid action masking in policy
+    gradient algorithms", FLAIRS 2022, for Q-learning).
     """
 
-    def __init__(self, members: Sequence[Member], device: torch.device) -> None:
+    def __init__(self, members: Sequence[Member], device: torch.device, mask: Mask | None = None) -> None:
         """Networks with random parameters from the generator of each run."""
+        self._mask = mask
         self._architectures = [member.architecture for member in members]
         settings = [member.hyperparameters for member in members]
         self._n_hidden = len(self._architectures[0].hidden)
@@ -99,20 +107,27 @@ class Learner:
 
     def greedy(self, observation: Tensor) -> Tensor:
         """The greedy action of each run's network: `[N, B, D]` to integers `[N, B]`."""
-        return self.q_values(observation).argmax(dim=-1)
+        return self._masked(self.q_values(observation), observation).argmax(dim=-1)
 
     def act(self, observation: Tensor, explore: Tensor, choice: Tensor) -> Tensor:
         """Epsilon-greedy actions (eq. 18), integers `[N]`: greedy with probability epsilon, else random.
 
         `explore` and `choice` are uniform draws `[N]`: greedy or not, and the random action.
         """
-        random = (choice * self._architectures[0].n_actions).to(torch.int64)
+        if self._mask is None:
+            random = (choice * self._architectures[0].n_actions).to(torch.int64)
+        else:
+            number = self._mask(observation).to(torch.int64).cumsum(dim=-1)  # of each action among the valid
+            n_valid = number[:, -1]
+            drawn = torch.minimum((choice * n_valid).to(torch.int64), n_valid - 1)
+            random = (number > drawn[:, None]).to(torch.int8).argmax(dim=-1)
         return torch.where(explore < self._epsilon, self.greedy(observation[:, None])[:, 0], random)
 
     def update(self, batch: TransitionBatch) -> Tensor:
         """One gradient step on a mini-batch `[N, B, ...]`; returns each run's loss before the step, `[N]`."""
-        next_q = self._q(self._forward(self._theta_target, batch.next_observation)[-1])
-        y = td_target(batch.reward, batch.terminated, next_q.mT, self._gamma)
+        next_q = self._q(self._forward(self._theta_target, batch.next_observation)[-1]).mT
+        next_q = self._masked(next_q, batch.next_observation)
+        y = td_target(batch.reward, batch.terminated, next_q, self._gamma)
         *features, head = self._forward(self._theta, batch.observation)
         action = batch.action[:, None]  # [N, 1, B], as the head is [N, 1 + A, B]
         error = self._q(head).gather(1, action)[:, 0] - y
@@ -123,6 +138,11 @@ class Learner:
         if self._iterations % self._target_every == 0:
             self._flat_target.copy_(self._flat)
         return 0.5 * torch.sum(d_q * error, dim=-1)
+
+    def _masked(self, q_values: Tensor, observation: Tensor) -> Tensor:
+        if self._mask is None:
+            return q_values
+        return q_values.masked_fill(~self._mask(observation), -torch.inf)
 
     def _forward(self, theta: dict[str, Tensor], observation: Tensor) -> list[Tensor]:
         """Input of every layer, `[N, B, *]`, then the output of the head, `[N, 1 + A, B]`."""

@@ -127,9 +127,13 @@ class Policy:
         values = network.q_values(self._architecture, self._float64, rows)
         return values.reshape(*observation.shape[:-1], self._architecture.n_actions)
 
-    def act(self, observation: Array) -> Array:
-        """The greedy action for observations `[..., D]`: values of `core.grid.Action`, `[...]`."""
-        return self.q_values(observation).argmax(axis=-1)
+    def act(self, observation: Array, mask: Array | None = None) -> Array:
+        """The greedy action for observations `[..., D]`: values of `core.grid.Action`, `[...]`.
+
+        Among obstacles it is the best one in a mask, bool `[..., A]`; see `core.world.action_mask`.
+        """
+        q_values = self.q_values(observation)
+        return (q_values if mask is None else np.where(mask, q_values, -np.inf)).argmax(axis=-1)
 
     def check(self, scenario: Scenario) -> None:
         """Reject a world in which the policy's observations have another meaning.

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from uav_dc_ros.core import radio
-from uav_dc_ros.core.arrays import Array, array_namespace
+from uav_dc_ros.core.arrays import Array, array_namespace, constant
 from uav_dc_ros.core.radio import Interference
 
 # Mean over a link with and without line of sight. `mean_loss_db`: of the losses in dB, as in the letter.
@@ -41,12 +41,14 @@ class RadioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
         return 10.0 ** (self.noise_power_dbm / 10.0) * 1e-3
 
 
-class FreeSpace(RadioSettings, frozen=True, tag="free_space"):
+class FreeSpace(RadioSettings, frozen=True, omit_defaults=True, tag="free_space"):
     """The paper's channel: a line-of-sight link (eq. 2)."""
 
     ref_gain_db: Annotated[float, Meta(ge=-200, le=100)]  # channel power gain beta_0 at 1 m, dB
     path_loss_exponent: Annotated[float, Meta(ge=1, le=10)]  # exponent of the path loss
     interference: Interference  # transmitting users, see `radio.sinr`
+    # Loss of a link that a building cuts, dB; only for a scenario with buildings
+    obstruction_loss_db: Annotated[float, Meta(ge=0, le=200)] | None = None
 
     @property
     def ref_gain(self) -> float:
@@ -137,21 +139,36 @@ def title(values: Radio) -> str:
     return f"{model}, {values.environment}, {values.carrier_hz / 1e9:g} GHz"
 
 
-def path_gain(values: Radio, uav_m: Array, users_m: Array, distance_m: Array) -> Array:
+def path_gain(
+    values: Radio, uav_m: Array, users_m: Array, distance_m: Array, cut: Array | None = None
+) -> Array:
     """Channel power gain, linear, `[..., U]`.
 
     The UAV is at `uav_m` `[..., 3]`, the users on the ground at `users_m` `[..., U, 2]`, and `distance_m`
-    `[..., U]` is their 3D distance, metres.
+    `[..., U]` is their 3D distance, metres. A link that a building cuts (`cut`, bool `[..., U]`) loses
+    `obstruction_loss_db` more in free space, and has no line of sight in the other models.
     """
     if isinstance(values, FreeSpace):
-        return radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent)
+        gain = radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent)
+        return gain if cut is None else gain * obstruction_gain(values, cut, like=gain)
     ground_m = radio.ground_distance(uav_m, users_m)
     height_m = uav_m[..., 2:3]
     if isinstance(values, AirToGround):
         sight = air_to_ground_sight(values, height_m, ground_m, distance_m)
     else:
         sight = aerial_vehicle_sight(values, height_m, ground_m, distance_m)
+    if cut is not None:
+        sight = sight._replace(probability=sight.probability * ~cut)
     return mean_gain(sight, values.line_of_sight)
+
+
+def obstruction_gain(values: FreeSpace, cut: Array, like: Array) -> Array:
+    """Gain of the links in free space that a building cuts, linear; 1 for the others, `[..., U]`."""
+    loss_db = values.obstruction_loss_db
+    assert loss_db is not None, "checked by parse()"
+    return array_namespace(like).where(
+        cut, constant((10.0 ** (-loss_db / 10.0),), like), constant((1.0,), like)
+    )
 
 
 def mean_gain(sight: Sight, line_of_sight: LineOfSight) -> Array:

@@ -91,6 +91,15 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         origin = constant((0.0, 0.0, self.altitude_min_m), like)
         return origin + xp.astype(cell, like.dtype) * spacing
 
+    def distance_m(self, centre_m: tuple[float, float], radius_m: float) -> float:
+        """3D distance between a disc on the ground and the cell nearest to it, metres."""
+        cell_m = [
+            min(max(round(at_m / self.cell_m), 0), n - 1) * self.cell_m
+            for at_m, n in zip(centre_m, self.shape[:2], strict=True)
+        ]
+        horizontal_m = max(0.0, math.dist(centre_m, cell_m) - radius_m)
+        return math.hypot(horizontal_m, self.altitude_min_m)
+
     def cell_at(self, position_m: tuple[float, float, float]) -> tuple[int, int, int] | None:
         """The cell whose centre is at `position_m` (x, y, altitude, metres), or None."""
         x_m, y_m, z_m = position_m

@@ -97,6 +97,13 @@ def encode(
     return xp.concat(parts, axis=-1)
 
 
+def cell(scenario: Scenario, observation: Array) -> Array:
+    """The UAV's cell in observations of any kind `[..., D]`, integers `[..., 3]`."""
+    xp = array_namespace(observation)
+    scaled = observation[..., :3] * constant(_spans(scenario), observation)
+    return xp.astype(xp.round(scaled), xp.int64)
+
+
 def _spans(scenario: Scenario) -> tuple[int, ...]:
     """Maximum index in each direction, at least 1."""
     east, north, up = scenario.grid.last_cell

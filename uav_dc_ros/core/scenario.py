@@ -24,9 +24,10 @@ from uav_dc_ros.core.channel import AERIAL, AERIAL_MAX_HEIGHT_M, AerialVehicle, 
 from uav_dc_ros.core.energy import EnergySettings, StepEnergies
 from uav_dc_ros.core.grid import Grid
 from uav_dc_ros.core.mobility import RandomWalk
+from uav_dc_ros.core.obstacles import Buildings, Moves, Obstacle, moves_to_dock, problems
 from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
-from uav_dc_ros.core.users.settings import Disc, UserSettings
+from uav_dc_ros.core.users.settings import UserSettings
 from uav_dc_ros.errors import ScenarioError
 
 EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
@@ -84,6 +85,7 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
     energy: EnergySettings | None = None
     # Latitude and longitude of x = 0, y = 0 on WGS 84, degrees; for files with positions in degrees
     datum_deg: tuple[Latitude, Longitude] | None = None
+    obstacles: Annotated[tuple[Obstacle, ...], Meta(max_length=10_000)] = ()  # buildings and no-fly zones
 
     @property
     def n_clusters(self) -> int:
@@ -160,6 +162,16 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
         cell_m = self.grid.cell_m
         goals_m = (*self.cluster_centres_m, self.mission.dock_m)
         return tuple((x_m / cell_m, y_m / cell_m) for x_m, y_m in goals_m)
+
+    @cached_property
+    def moves(self) -> Moves | None:
+        """The moves that have an effect among the obstacles; None: there are no obstacles."""
+        return Moves(self.grid, self.obstacles) if self.obstacles else None
+
+    @cached_property
+    def buildings(self) -> Buildings | None:
+        """The buildings, which cut lines of sight; None: there are none."""
+        return Buildings(self.obstacles) if any(one.kind == "building" for one in self.obstacles) else None
 
     @property
     def ends_at_any_step(self) -> bool:
@@ -328,11 +340,12 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
     if grid.cell_at((*mission.dock_m, grid.altitude_min_m)) is None:
         yield f"mission.dock_m = {list(mission.dock_m)}; expected the centre of a cell: {extent}"
     moves = sum(abs(a - b) for a, b in zip(scenario.start_cell[:2], scenario.dock_cell, strict=True))
+    if scenario.obstacles:
+        yield from problems(scenario)
+        moves = moves_to_dock(scenario)
     if moves > mission.max_steps:
-        yield (
-            f"mission.max_steps = {mission.max_steps}; expected at least {moves}, "
-            "the moves from start to dock"
-        )
+        expected = f"expected at least {moves}, the moves from start to dock"
+        yield f"mission.max_steps = {mission.max_steps}; {expected}"
     if (mission.max_steps + 1) * mission.step_s >= TIME_MAX_S:
         yield (
             f"mission.step_s = {mission.step_s:g}; expected less than "
@@ -345,7 +358,7 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
         )
     yield from scenario.users.outside(grid)
     for disc in scenario.users.start_discs():
-        distance_m = _min_distance_m(disc, grid)
+        distance_m = grid.distance_m(disc.centre_m, disc.radius_m)
         if distance_m > mission.d_cons_m:
             yield (
                 f"{disc.key} = {list(disc.centre_m)}: its disc is {distance_m:.1f} m from the "
@@ -379,16 +392,6 @@ def _out_of_range(scenario: Scenario, environment: str, top_m: float) -> Iterato
                 f"a corner of the grid; expected at most {aerial.max_ground_distance_m:g} m, the range of "
                 f"radio.environment = {environment!r}"
             )
-
-
-def _min_distance_m(disc: Disc, grid: Grid) -> float:
-    """3D distance between a disc on the ground and the cell nearest to it, metres."""
-    cell_m = [
-        min(max(round(at_m / grid.cell_m), 0), n - 1) * grid.cell_m
-        for at_m, n in zip(disc.centre_m, (grid.n_x, grid.n_y), strict=True)
-    ]
-    horizontal_m = max(0.0, math.dist(disc.centre_m, cell_m) - disc.radius_m)
-    return math.hypot(horizontal_m, grid.altitude_min_m)
 
 
 def _number_or_array(value: float | tuple[float, ...], like: Array) -> float | Array:

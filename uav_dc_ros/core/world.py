@@ -88,7 +88,8 @@ def measure(
     values = scenario.radio
     distance_m = radio.distance(uav_m, users_m)
     served = mission.served(distance_m, collected, scenario.mission.d_cons_m)
-    gain = channel.path_gain(values, uav_m, users_m, distance_m)
+    cut = None if scenario.buildings is None else scenario.buildings.cut(uav_m, users_m)
+    gain = channel.path_gain(values, uav_m, users_m, distance_m, cut)
     if transmitting is not None:
         served, gain = served & transmitting, gain * transmitting
     sinr = radio.sinr(gain, values.tx_power_w, values.noise_power_w, values.interference, served)
@@ -175,7 +176,7 @@ def step(
     `action` is the value of a `grid.Action`, integers `[...]`; `draws` are uniform in [0, 1), `[..., U, D]`;
     `rewards` are those of each world, `[...]`, by default the scenario's; `transmitting` is as in `measure`.
     """
-    cell = scenario.grid.move(state.cell, action)
+    cell = move(scenario, state.cell, action)
     users_m, motion = mobility.move(scenario, state.users_m, state.motion, draws)
     uav_m = scenario.grid.centre_m(cell, like=users_m)
     link = measure(scenario, uav_m, users_m, state.collected, transmitting)
@@ -215,6 +216,20 @@ def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
         collected=state.collected,
         energy_used_j=state.energy_used_j,
     )
+
+
+def move(scenario: Scenario, cell: Array, action: Array) -> Array:
+    """The cell `[..., 3]` after an `Action` (its value, `[...]`).
+
+    A move off the grid or into an obstacle has no effect.
+    """
+    after = scenario.grid.move(cell, action)
+    return after if scenario.moves is None else scenario.moves.apply(cell, action, after)
+
+
+def action_mask(scenario: Scenario, cell: Array) -> Array | None:
+    """The actions that have an effect in cells `[..., 3]`, and hover, bool `[..., 7]`; None: no obstacles."""
+    return None if scenario.moves is None else scenario.moves.valid(cell)
 
 
 def select(where: Array, chosen: State, other: State) -> State:

@@ -27,7 +27,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
 
     Action:
         `Discrete(7)`: 0 left (-x), 1 right (+x), 2 forward (+y), 3 backward (-y), 4 upward, 5 downward,
-        6 hover. One move is one cell; a move off the grid leaves the UAV where it is.
+        6 hover. One move is one cell; a move off the grid or into an obstacle leaves the UAV where it is.
 
     Observation:
         `Box`, float32. `observation="position"`: the UAV's cell, each index scaled to [0, 1].
@@ -55,7 +55,8 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
     Info:
         step, cell `[3]`, users_m `[U, 2]`, data_bits `[U]`, collected `[U]`, landed, dock_distance_m
         (horizontal), and of the last step (zero before the first): served `[U]`, sinr `[U]` linear,
-        rate_bps `[U]`, sum_rate_bps. In a scenario with `energy` also energy_used_j and state_of_charge.
+        rate_bps `[U]`, sum_rate_bps. In a scenario with `energy` also energy_used_j and state_of_charge, and
+        in one with `obstacles` action_mask `[7]`, int8: 1 for a move that has an effect, and for hover.
         At the end of a mission also mean_age_s, fairness and last_collected_step, see `core.users.service`.
 
     Args:
@@ -146,10 +147,12 @@ def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None =
     """The `info` of `reset` and `step`, with the batch dimensions of `state`."""
     zeros, no_users = np.zeros_like(state.data_bits), np.zeros_like(state.collected)
     link = outcome.link if outcome else None
-    battery = {}
+    extra: dict[str, Any] = {}
     if scenario.energy is not None:
         charge = energy.state_of_charge(scenario.energy, state.energy_used_j)
-        battery = {"energy_used_j": state.energy_used_j, "state_of_charge": charge}
+        extra |= {"energy_used_j": state.energy_used_j, "state_of_charge": charge}
+    if (mask := world.action_mask(scenario, state.cell)) is not None:
+        extra["action_mask"] = mask.astype(np.int8)
     return {
         "step": state.step,
         "cell": state.cell,
@@ -162,5 +165,5 @@ def info(scenario: Scenario, state: world.State, outcome: world.Outcome | None =
         "sinr": link.sinr if link else zeros,
         "rate_bps": link.rate_bps if link else zeros,
         "sum_rate_bps": link.sum_rate_bps if link else zeros[..., 0],
-        **battery,
+        **extra,
     }

@@ -1,6 +1,7 @@
 """A picture of a mission: the field from above, and altitude and users collected over the steps."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import CircleCollection, LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 
 from uav_dc_ros import files
 from uav_dc_ros.core import mission, radio
@@ -17,6 +18,8 @@ from uav_dc_ros.env.trajectory import Trajectory
 
 INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
 WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
+BUILDING: dict[str, Any] = {"fc": "#b3ab98", "ec": "#7d7665", "lw": 0.8}
+NO_FLY: dict[str, Any] = {"fc": "#f3d9d2", "ec": "#c9502c", "lw": 0.8, "hatch": "///"}
 PATH_COLOURS = LinearSegmentedColormap.from_list("path", ["#2b3f7e", "#8c5aa6", "#f0a83a"])
 
 
@@ -59,6 +62,9 @@ def _draw_field(axes: Axes, trajectory: Trajectory) -> None:
 
     for disc in scenario.users.clusters:
         axes.add_patch(Circle(disc.centre_m, disc.radius_m, fc="#e9e4d6", zorder=1))
+    for obstacle in scenario.obstacles:
+        style = BUILDING if obstacle.kind == "building" else NO_FLY
+        axes.add_patch(Polygon(obstacle.polygon_m, zorder=1.5, **style))
     for done, colour, size in ((False, WAITING, 20), (True, COLLECTED, 26)):
         x_m, y_m = state.users_m[state.collected == done].T
         label = "collected" if done else "waiting"

@@ -26,6 +26,7 @@ from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
+from uav_dc_ros.offboard.mission.keep_out import cell_conflict
 from uav_dc_ros.offboard.mission.plausibility import PlausibilityFilter
 from uav_dc_ros.offboard.mission.progress import Checkpoint
 from uav_dc_ros.offboard.setpoint_stream import use_realtime_priority
@@ -64,6 +65,8 @@ class AutopilotBridge(MissionNode):
         self.settings = SafetySettings(**settings | {"failsafe_action": Mode(values["failsafe_action"])})
         self.journal = Journal(values["journal"])
         self.fence = Geofence.around(self.scenario, values["fence_margin_m"])
+        if (conflict := cell_conflict(self.scenario, self.fence, self.settings)) is not None:
+            raise NodeError(conflict)
         vehicles.check(*(values[name] for name in ("vehicle", "connect", "system", "arm")))
         self._datum(self._restore())
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from uav_dc_ros import messages, payloads, scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.nodes.framework import node_main
@@ -72,7 +73,7 @@ class PolicyNode(MissionNode):
             collected=collected,
             energy_used_j=energy_used_j,
         )
-        return Action(int(self.policy.act(observation)))
+        return Action(int(self.policy.act(observation, world.action_mask(self.scenario, cell))))
 
 
 if __name__ == "__main__":

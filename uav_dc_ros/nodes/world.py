@@ -260,7 +260,7 @@ class WorldNode(MissionNode):
 
     def _move(self, action: Action) -> None:
         """One step of the world."""
-        before, self._cell = self._cell, self.scenario.grid.move(self._cell, np.asarray(int(action)))
+        before, self._cell = self._cell, core.move(self.scenario, self._cell, np.asarray(int(action)))
         self._energy_used_j = core.energy_after(self.scenario, self._energy_used_j, before, self._cell)
         self._users.walk()
         self._step += 1

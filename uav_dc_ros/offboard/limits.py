@@ -18,10 +18,12 @@ Names = tuple[tuple[str, ...], ...]
 ARDUCOPTER: Names = (
     *[("FENCE_ENABLE",), ("FENCE_AUTOENABLE",), ("FENCE_TYPE",), ("FENCE_RADIUS",)],
     *[("FENCE_ALT_MAX",), ("FENCE_ALT_MIN",), ("FENCE_TOTAL",)],
+    ("RTL_ALT", "RTL_ALT_M"),
     *[("WPNAV_SPEED", "WP_SPD"), ("WPNAV_SPEED_UP", "WP_SPD_UP"), ("WPNAV_SPEED_DN", "WP_SPD_DN")],
 )
 PX4: Names = (
     *[("GF_ACTION",), ("GF_MAX_HOR_DIST",), ("GF_MAX_VER_DIST",)],
+    ("RTL_RETURN_ALT",),
     *[("MPC_XY_VEL_MAX",), ("MPC_Z_VEL_MAX_UP",), ("MPC_Z_VEL_MAX_DN",)],
 )
 
@@ -77,7 +79,9 @@ def of_arducopter(values: Mapping[str, float]) -> Limits:
         cmps = values.get(f"WPNAV_SPEED{suffix}")
         return values.get(f"WP_SPD{suffix}") if cmps is None else cmps / 100
 
+    return_cm = values.get("RTL_ALT")
     return Limits(
+        return_altitude_m=values.get("RTL_ALT_M") if return_cm is None else return_cm / 100,
         fence_radius_m=values.get("FENCE_RADIUS") if fences & CIRCLE else None,
         fence_ceiling_m=values.get("FENCE_ALT_MAX") if fences & CEILING else None,
         fence_floor_m=values.get("FENCE_ALT_MIN") if fences & FLOOR else None,
@@ -93,6 +97,7 @@ def of_px4(values: Mapping[str, float]) -> Limits:
     enforced = values.get("GF_ACTION", 0) >= GF_ACTION_HOLD
     radius_m, ceiling_m = values.get("GF_MAX_HOR_DIST", 0.0), values.get("GF_MAX_VER_DIST", 0.0)
     return Limits(
+        return_altitude_m=values.get("RTL_RETURN_ALT"),
         fence_radius_m=radius_m if enforced and radius_m > 0 else None,
         fence_ceiling_m=ceiling_m if enforced and ceiling_m > 0 else None,
         speed_mps=values.get("MPC_XY_VEL_MAX"),

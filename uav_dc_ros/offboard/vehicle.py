@@ -26,6 +26,7 @@ class Limits:
     fence_ceiling_m: float | None = None  # above home
     fence_floor_m: float | None = None  # above home
     polygon_fence: bool = False  # a fence of another shape, which the bridge does not read
+    return_altitude_m: float | None = None  # minimum altitude of a return, above home
     speed_mps: float | None = None  # horizontal, towards a position target
     climb_mps: float | None = None  # positive
     descent_mps: float | None = None  # positive

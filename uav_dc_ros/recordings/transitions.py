@@ -84,7 +84,7 @@ class RecordedTransitions:
         """The action between two cells: the recorded move if it leads there."""
         others = (Action.HOVER, *Action)
         for action in others if move is None else (move, *others):
-            if np.array_equal(self._scenario.grid.move(cell, np.asarray(int(action))), after):
+            if np.array_equal(world.move(self._scenario, cell, np.asarray(int(action))), after):
                 self.deduced += action is not move
                 return action
         self.skipped["a step between cells that are not adjacent"] += 1

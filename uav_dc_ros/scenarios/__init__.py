@@ -5,6 +5,7 @@ from pathlib import Path
 from uav_dc_ros.core.scenario import Scenario, from_values, read_values
 from uav_dc_ros.errors import ScenarioError
 from uav_dc_ros.scenarios.user_files import with_users
+from uav_dc_ros.scenarios.zone_files import with_zones
 
 FOLDER = Path(__file__).parent
 
@@ -26,10 +27,12 @@ def find(name_or_path: str | Path) -> Path:
 
 
 def load(name_or_path: str | Path) -> Scenario:
-    """The scenario with a shipped name, or in the TOML file at a path, with the users of `users.file`.
+    """The scenario with a shipped name, or in the TOML file at a path, with the users of `users.file`
+    and the obstacles of `zones`.
 
     Raises:
-        ScenarioError: no such name or file, or a file that `core.scenario.parse` or `user_files` rejects.
+        ScenarioError: no such name or file, or a file that `core.scenario.parse`, `user_files` or
+            `zone_files` rejects.
     """
     try:
         path = find(name_or_path)
@@ -37,4 +40,5 @@ def load(name_or_path: str | Path) -> Scenario:
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{name_or_path}: cannot be read: {error}") from None
     source = str(name_or_path)
-    return from_values(with_users(read_values(text, source), path.parent, source), source)
+    values = with_zones(read_values(text, source), path.parent, source)
+    return from_values(with_users(values, path.parent, source), source)

@@ -1,25 +1,21 @@
 """Files of users: CSV with metres or degrees, and GeoJSON. docs/users.md describes both."""
 
 import csv
-import importlib
 import io
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple
 
 import msgspec
-from msgspec import Meta
 
 from uav_dc_ros.core.users.settings import User
 from uav_dc_ros.errors import ScenarioError
+from uav_dc_ros.scenarios import geojson
+from uav_dc_ros.scenarios.geojson import Coordinates, Datum
 
 METRES, DEGREES = ("x_m", "y_m"), ("latitude", "longitude")
 NUMBERS = (*METRES, *DEGREES, "radius_m", "data_bits", "priority")
-# The one name of a coordinate reference system that older programs write for the coordinates of RFC 7946.
-WGS_84 = "urn:ogc:def:crs:OGC:1.3:CRS84"
-
-Datum: TypeAlias = tuple[float, float]  # latitude, longitude, degrees, of the grid's x = 0, y = 0
 _OF_USER = tuple(name for name in User.__struct_fields__ if name not in METRES)
 
 
@@ -31,18 +27,12 @@ class _Row(NamedTuple):
 
 
 class _Point(msgspec.Struct, tag="Point", forbid_unknown_fields=False):
-    # Longitude, latitude, and an altitude, which is not used
-    coordinates: Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
+    coordinates: Coordinates
 
 
 class _Feature(msgspec.Struct, tag="Feature"):
     geometry: _Point
     properties: dict[str, Any] | None = None
-
-
-class _Collection(msgspec.Struct, tag="FeatureCollection"):
-    features: list[msgspec.Raw]
-    crs: dict[str, Any] | None = None
 
 
 def with_users(values: dict[str, Any], folder: Path, source: str) -> dict[str, Any]:
@@ -133,18 +123,7 @@ def _number(name: str, cell: str, where: str) -> float | str:
 
 def _geojson_rows(text: str, path: Path) -> Iterator[_Row]:
     """The points of a GeoJSON feature collection (RFC 7946); their properties are the optional columns."""
-    try:
-        found = msgspec.json.decode(text.encode(), type=_Collection)
-    except (msgspec.DecodeError, RecursionError) as error:
-        raise ScenarioError(f"{path}: {error}; expected a GeoJSON FeatureCollection of points") from None
-    name = found.crs and (found.crs.get("properties") or {}).get("name")
-    if found.crs is not None and name != WGS_84:
-        raise ScenarioError(
-            f"{path}: crs = {name or found.crs!r}; expected longitude and latitude on WGS 84 (RFC 7946), "
-            f"without a crs or with {WGS_84!r}"
-        )
-    for i, raw in enumerate(found.features):
-        where = f"{path}, feature {i}"
+    for where, raw in geojson.features(text, path, "points"):
         try:
             feature = msgspec.json.decode(raw, type=_Feature)
         except msgspec.DecodeError as error:
@@ -182,24 +161,8 @@ def _expected(kind: str = "column") -> str:
 
 def _in_metres(rows: list[_Row], datum: Datum | None, path: Path) -> Iterator[_Row]:
     """Rows with x_m, y_m: east and north of the datum in its tangential plane, exact on WGS 84."""
-    if datum is None:
-        raise ScenarioError(
-            f"{path}: positions in degrees; expected datum_deg in the scenario, latitude and longitude of "
-            "x = 0, y = 0"
-        )
-    try:
-        pymap3d = importlib.import_module("pymap3d")
-    except ImportError:
-        raise ScenarioError(
-            f"{path}: positions in degrees need pymap3d; expected it installed: "
-            "pip install 'uav_dc_ros[mavlink]'"
-        ) from None
+    metres = geojson.to_metres(datum, path)
     for where, values in rows:
-        at = [values.pop(name) for name in DEGREES]
-        for name, value, limit in zip(DEGREES, at, (90.0, 180.0), strict=True):
-            if not abs(value) <= limit:
-                raise ScenarioError(
-                    f"{where}: {name} = {value:g}; expected degrees on WGS 84, from {-limit:g} to {limit:g}"
-                )
-        x_m, y_m, _ = map(float, pymap3d.geodetic2enu(*at, 0.0, *datum, 0.0))
+        latitude, longitude = (values.pop(name) for name in DEGREES)
+        x_m, y_m = metres(latitude, longitude, where)
         yield _Row(where, {"x_m": x_m, "y_m": y_m, **values})

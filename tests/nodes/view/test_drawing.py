@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from visualization_msgs.msg import Marker, MarkerArray
 
 from tests.nodes.poses import pose as pose_message
+from tests.support.worlds import changed
 from uav_dc_ros import cdr, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase
@@ -144,6 +145,20 @@ def test_the_uav_the_dock_and_the_text() -> None:
     landed = scene(mission=msgspec.structs.replace(MISSION, step=60, phase=Phase.LANDED))
     (text,) = read(markers.markers(SCENARIO, landed))["status"]
     assert text.text.startswith("step 60 of 60: landed\n")
+
+
+def test_obstacles_are_drawn_with_walls_and_a_top() -> None:
+    tower = {"polygon_m": [[350.0, 350.0], [450.0, 350.0], [400.0, 450.0]], "height_m": 170.0}
+    zone = {"kind": "no_fly", "polygon_m": [[600.0, 0.0], [700.0, 0.0], [700.0, 90.0], [600.0, 90.0]]}
+    scenario = changed("five_clusters", radio={"obstruction_loss_db": 20.0}, obstacles=[tower, tower, zone])
+    shapes = read(markers.markers(scenario, scene()))
+    for kind, n_triangles, top_m in (("building", 2 * (1 + 6), 170.0), ("no_fly", 2 + 8, 250.0)):
+        (marker,) = shapes[kind]
+        assert marker.type == Marker.TRIANGLE_LIST
+        assert xyz(marker.scale) == (1.0, 1.0, 1.0)
+        points_m = np.asarray([xyz(point) for point in marker.points])
+        assert points_m.shape == (3 * n_triangles, 3)
+        assert (points_m[:, 2].min(), points_m[:, 2].max()) == (0.0, top_m)
 
 
 def test_what_is_not_known_is_not_drawn() -> None:

@@ -119,7 +119,7 @@ class VirtualFlight(FlightRecord):
         checkpoint, old = self.bridge.checkpoint, self.bridge
         self.telemetry = MavlinkTelemetry(self.telemetry.datum, self.place, system, again=True)
         self.session = Session(load_codec(), self.telemetry, self._write)
-        self.bridge = MissionController(old.scenario, old.settings, self._note, checkpoint)
+        self.bridge = MissionController(old.scenario, old.settings, self._note, checkpoint, old.fence)
         self.session.keep_alive(self.now_s)
         self.session.on_connected(self.now_s)
 

@@ -15,7 +15,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import MISSION_REWARD, RewardData
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.stats import interval
-from uav_dc_ros.core.world import Act, observe
+from uav_dc_ros.core.world import Act, action_mask, observe
 from uav_dc_ros.errors import FROM_TRAIN, UavDcError
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out, roll_out_trajectory
 from uav_dc_ros.experiments.evaluate.shifts import Shift, transmitting
@@ -124,7 +124,8 @@ class EvaluatedMissions:
 def greedy_act(policy: Policy, scenario: Scenario) -> Act:
     """The policy's greedy actions in a scenario; raises PolicyError when it does not fit."""
     policy.check(scenario)
-    return lambda state: policy.act(observe(policy.config.observation, scenario, state))
+    kind = policy.config.observation
+    return lambda state: policy.act(observe(kind, scenario, state), action_mask(scenario, state.cell))
 
 
 def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Evaluation:

@@ -14,10 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uav_dc_ros.agents.dqn import Learner, Member
+from uav_dc_ros.agents.dqn import Learner, Mask, Member
 from uav_dc_ros.agents.replay import ReplayBuffer, TransitionBatch
+from uav_dc_ros.core import observations
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.reward import Rewards
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import BatchWorld, State, observe
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.experiments.train.episode_stats import CURVES, EpisodeStats
@@ -53,7 +55,8 @@ class Training:
         ]
         architectures = [architecture(population, run) for run in population.runs]
         members = zip(architectures, population.runs, self._rngs, strict=True)
-        self.learner = Learner([Member(a, run.hyperparameters, rng) for a, run, rng in members], device)
+        mask = action_mask(population.scenario)
+        self.learner = Learner([Member(a, run.hyperparameters, rng) for a, run, rng in members], device, mask)
         capacity = population.runs[0].hyperparameters.buffer_size
         self._buffer = ReplayBuffer(len(population.runs), capacity, architectures[0].n_inputs, device)
         reward = rewards(population.runs, self._world_array)
@@ -179,6 +182,13 @@ class Training:
         self._curves[: self.n_flown] = arrays["curves"].numpy()
         for rng, state in zip(self._rngs, values["rngs"], strict=True):
             rng.bit_generator.state = state
+
+
+def action_mask(scenario: Scenario) -> Mask | None:
+    """The learner's mask of actions; None: a scenario without obstacles."""
+    if (moves := scenario.moves) is None:
+        return None
+    return lambda observation: moves.valid(observations.cell(scenario, observation))
 
 
 def rewards(runs: Sequence[Run], array: Callable[[np.ndarray], Array]) -> Rewards:

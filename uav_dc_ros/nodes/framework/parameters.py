@@ -191,7 +191,12 @@ BRIDGE = (
     ),
     *(SCENARIO, SEED, JOURNAL),
     Parameter(
-        "fence_margin_m", MARGIN_M, "distance of the fence around and above the grid", "m", 1.0, 1000.0
+        "fence_margin_m",
+        MARGIN_M,
+        "distance of the fence around and above the grid, and around obstacles",
+        "m",
+        1.0,
+        1000.0,
     ),
     Parameter(
         "arm",
@@ -214,6 +219,13 @@ BRIDGE = (
         str(SafetySettings.failsafe_action),
         "failsafe action of the bridge",
         choices=("return", "land"),
+    ),
+    _safety(
+        "return_altitude_m",
+        "altitude above home at which the autopilot returns, needed among obstacles; 0: not known",
+        "m",
+        0.0,
+        10_000.0,
     ),
     Parameter(
         "flying_at_start",

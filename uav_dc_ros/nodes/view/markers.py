@@ -11,6 +11,7 @@ from visualization_msgs.msg import Marker
 from uav_dc_ros.cdr import FRAME, Writer
 from uav_dc_ros.core import radio
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.obstacles.mesh import faces_m
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Mission, Phase
 
@@ -52,6 +53,7 @@ USER_COLOURS: dict[UserState, Rgba] = {
 }
 FOOTPRINT_COLOUR = _rgba("F0E442", 0.18)
 CLUSTER_COLOUR = _rgba("999999", 0.35)
+OBSTACLE_COLOURS = {"building": _rgba("999999", 0.9), "no_fly": _rgba("D55E00", 0.25)}
 DOCK_COLOUR = _rgba("009E73", 0.9)  # bluish green
 UAV_COLOUR = _rgba("CC79A7")  # reddish purple
 TEXT_COLOUR = _rgba("FFFFFF")
@@ -112,7 +114,7 @@ def status_text(scenario: Scenario, scene: Scene) -> str:
 
 
 def _ground(scenario: Scenario) -> Sequence[Shape]:
-    """The start areas of the clusters, and the dock."""
+    """The start areas of the clusters, the obstacles, and the dock."""
     thin_m, side_m = THIN_CELLS * scenario.grid.cell_m, DOCK_CELLS * scenario.grid.cell_m
     dock_m = (*scenario.mission.dock_m, 0.0)
     clusters = []
@@ -120,7 +122,22 @@ def _ground(scenario: Scenario) -> Sequence[Shape]:
         width_m = max(2 * disc.radius_m, thin_m)  # RViz warns about a marker without a size
         at_m, area_m = (*disc.centre_m, -2 * thin_m), (width_m, width_m, thin_m)
         clusters.append(Shape("clusters", i, Marker.CYLINDER, at_m, area_m, CLUSTER_COLOUR))
-    return [*clusters, Shape("dock", 0, Marker.CUBE, dock_m, (side_m, side_m, thin_m), DOCK_COLOUR)]
+    dock = Shape("dock", 0, Marker.CUBE, dock_m, (side_m, side_m, thin_m), DOCK_COLOUR)
+    return [*clusters, *_obstacles(scenario), dock]
+
+
+def _obstacles(scenario: Scenario) -> Sequence[Shape]:
+    """One marker for all buildings, and one for all no-fly zones."""
+    ceiling_m = scenario.grid.altitude_min_m + scenario.grid.n_z * scenario.grid.altitude_step_m
+    shapes = []
+    for kind, colour in OBSTACLE_COLOURS.items():
+        faces = [faces_m(one, ceiling_m).reshape(-1, 3) for one in scenario.obstacles if one.kind == kind]
+        if faces:
+            points_m = np.concatenate(faces)
+            shapes.append(
+                Shape(kind, 0, Marker.TRIANGLE_LIST, ORIGIN, (1.0, 1.0, 1.0), colour, points_m=points_m)
+            )
+    return shapes
 
 
 def _users(scenario: Scenario, scene: Scene) -> Sequence[Shape]:

@@ -60,7 +60,7 @@ class MissionController:
         home = Enu(*before.home) if before.home else None
         self.detector = FaultDetector(settings, before.at_rest_v, home)
         self._crash = CrashDetector(settings)
-        self._steps = StepControl(self.progress, settings)
+        self._steps = StepControl(self.progress, settings, self.fence)
         self._preflight = Preflight(self.progress, settings, self.fence, self.detector)
         self._landing = Landing(self.progress, self.detector, settings.failsafe_action, Phase.ABORTED, "")
         self._fault_timer = FaultTimer(settings.fault_timeout_s)
@@ -146,6 +146,9 @@ class MissionController:
         target = self.progress.centre(cell)
         if (breach := self.fence.breach(target)) is not None:
             return f"the target is outside the fence: {breach}"
+        here = self._telemetry.position or self.progress.target
+        if (breach := self.fence.path_breach(here, target)) is not None:
+            return f"the way to the target is outside the fence: {breach}"
         self.progress.goal, self.setpoint = cell, target
         self._enter(Phase.MOVING, f"{action.label} to cell {cell}")
         return None
@@ -272,6 +275,10 @@ class MissionController:
             entered_s = self._entered.vehicle_s + (now.vehicle_s - since.vehicle_s)
             self._entered = self._entered._replace(vehicle_s=entered_s)
             self._steps.resume()
+            here = self._telemetry.position or self.progress.target
+            if (breach := self.fence.path_breach(here, self.progress.target)) is not None:
+                self._abort(f"the way to cell {self.progress.goal} is outside the fence: {breach}")
+                return False
             self.setpoint = self.progress.target
             self._set_reason(f"resumed after: {self.reason}")
         return not self.policy_lost

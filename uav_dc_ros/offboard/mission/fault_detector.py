@@ -32,6 +32,8 @@ class SafetySettings:
     link_lost_timeout_s: float = 300.0  # steady clock; a landing from 200 m takes two and a half minutes
     min_battery: float = 0.2  # charge, 0 to 1; 0: only the autopilot monitors the battery
     failsafe_action: Literal[Mode.RETURN, Mode.LAND] = Mode.RETURN  # land if it cannot return
+    # Altitude above home at which the autopilot returns, metres; needed among obstacles. 0: not known
+    return_altitude_m: float = 0.0
     flying_at_start: Literal["resume", "land"] = "resume"  # for a vehicle in the air in the commanded mode
     command_retry_s: float = 2.0  # pause before a command that was not executed is sent again
     max_return_attempts: int = 3  # then the bridge requests land

@@ -4,6 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
+
+from uav_dc_ros.core.obstacles.prisms import Obstacle
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
@@ -14,10 +17,12 @@ MARGIN_M = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class Geofence:
-    """A box in the grid's ENU frame, metres."""
+    """A box in the grid's ENU frame, without the surroundings of obstacles; metres."""
 
     lower: Enu
     upper: Enu
+    obstacles: tuple[Obstacle, ...] = ()
+    margin_m: float = MARGIN_M  # of the obstacles' surroundings
 
     @classmethod
     def around(cls, scenario: Scenario, margin_m: float = MARGIN_M) -> Self:
@@ -28,15 +33,30 @@ class Geofence:
         return cls(
             lower=Enu(-margin_m, -margin_m, -margin_m),
             upper=Enu(east_m + margin_m, north_m + margin_m, top_m + margin_m),
+            obstacles=scenario.obstacles,
+            margin_m=margin_m,
         )
 
     def breach(self, position: Enu) -> str | None:
-        """The coordinate that lies outside; None: the position is inside."""
+        """The coordinate that lies outside, or the obstacle that is near; None: the position is inside."""
         axes = zip(("east", "north", "up"), position, self.lower, self.upper, strict=True)
         for axis, value, lower, upper in axes:
             if not lower <= value <= upper:  # also true for NaN
                 text = f"{value:.1f}" if math.isfinite(value) else str(value)
                 return f"{text} m {axis}; the fence reaches from {lower:g} to {upper:g} m"
+        return self.path_breach(position, position)
+
+    def path_breach(self, start: Enu, end: Enu, more_m: float = 0.0) -> str | None:
+        """The obstacle that a straight path comes too near to; None: none.
+
+        The fence keeps `margin_m` from it, and the path `more_m` besides.
+        """
+        margin_m = self.margin_m + more_m
+        for i, obstacle in enumerate(self.obstacles):
+            if obstacle.is_near(start, end, margin_m) and obstacle.meets(
+                np.asarray(start), np.asarray(end), margin_m
+            ):
+                return f"nearer than {margin_m:g} m to {obstacle.title(i)}"
         return None
 
 

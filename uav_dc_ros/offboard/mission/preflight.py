@@ -4,9 +4,10 @@ from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence, limit_conflict, limit_warnings
+from uav_dc_ros.offboard.mission.keep_out import return_conflict
 from uav_dc_ros.offboard.mission.landing import LANDING_MODES, Decision, finish
 from uav_dc_ros.offboard.mission.progress import MissionProgress
-from uav_dc_ros.offboard.vehicle import Arm, Command, Mode, SetMode, Telemetry
+from uav_dc_ros.offboard.vehicle import Arm, Command, Limits, Mode, SetMode, Telemetry
 
 NO_POSITION_S = 5.0  # a vehicle in the air whose grid position is unknown for longer is refused, steady clock
 
@@ -26,6 +27,7 @@ class Preflight:
         # A pilot has armed or disarmed the vehicle; the bridge does not arm it then.
         self.pilot_has_control = self.checkpoint.pilot_has_control
         self._was_armed = False
+        self._returns: tuple[object, str | None] | None = None  # see `_on_return`
         self._no_position_since_s: float | None = None  # steady clock, of a vehicle in the air
 
     def takeover(self, now_s: float, telemetry: Telemetry) -> str | None:
@@ -66,6 +68,9 @@ class Preflight:
             return Decision(Phase.ABORTED if flies else Phase.CONNECTING, reason)
         if flies and settings.flying_at_start == "land":
             reason, mode = "in the air when the bridge started", settings.failsafe_action
+            return Decision(Phase.LANDING, reason, position, landing_mode=mode)
+        if flies and (blocked := self._way_to_start(telemetry)) is not None:
+            reason, mode = f"in the air when the bridge started: {blocked}", settings.failsafe_action
             return Decision(Phase.LANDING, reason, position, landing_mode=mode)
         if flies:
             reason = f"in the air when the bridge started: flies to cell {self.progress.goal}"
@@ -169,7 +174,7 @@ class Preflight:
         breach, wrong = self.fence.breach(self._above(telemetry)), self._conflict(telemetry)
         if breach is not None:
             wrong = f"the target is outside the fence: {breach}"
-        if wrong is not None:
+        if (wrong := wrong or self._way_to_start(telemetry)) is not None:
             mode = Mode.LAND if telemetry.on_ground else self.settings.failsafe_action
             return Decision(Phase.LANDING, wrong, landing_mode=mode)
         return self._fly_to_start(telemetry, "armed, in the commanded mode")
@@ -179,6 +184,15 @@ class Preflight:
         if self.progress.is_done:
             return finish(self.progress, self.settings, "when the bridge restarted", setpoint)
         return Decision(Phase.TAKEOFF, reason, setpoint)
+
+    def _way_to_start(self, telemetry: Telemetry) -> str | None:
+        """The obstacle on the way up, or down, and across to the goal; None: none."""
+        above, target = self._above(telemetry), self.progress.target
+        more_m = self.settings.tolerance_m
+        for start, end in ((telemetry.position or above, above), (above, target)):
+            if (breach := self.fence.path_breach(start, end, more_m)) is not None:
+                return f"the way to cell {self.progress.goal} is outside the fence: {breach}"
+        return None
 
     def _above(self, telemetry: Telemetry) -> Enu:
         """The vehicle's position at the goal's altitude: it climbs or descends first, then flies across."""
@@ -200,9 +214,21 @@ class Preflight:
     def _conflict(self, telemetry: Telemetry) -> str | None:
         """The autopilot's limit that excludes a cell. Arming moves home to the vehicle's position."""
         home = telemetry.home if telemetry.armed else telemetry.position or telemetry.home
-        if telemetry.limits is None or home is None:
+        if home is None:
+            return None
+        if self.fence.obstacles and (obstacle := self._on_return(telemetry.limits, home)) is not None:
+            return obstacle
+        if telemetry.limits is None:
             return None
         return limit_conflict(self.progress.scenario, self.settings, telemetry.limits, home)
+
+    def _on_return(self, limits: Limits | None, home: Enu) -> str | None:
+        """The obstacle on a way home or down; checked anew when home has moved by a metre."""
+        key = limits, Enu(*map(round, home))
+        if self._returns is None or self._returns[0] != key:
+            conflict = return_conflict(self.progress.scenario, self.fence, self.settings, limits, home)
+            self._returns = key, conflict
+        return self._returns[1]
 
 
 def other_controller(telemetry: Telemetry) -> str | None:

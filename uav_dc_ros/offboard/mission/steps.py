@@ -5,6 +5,7 @@ import math
 from uav_dc_ros.messages import FaultKind, Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import Fault, SafetySettings
+from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.landing import Decision, finish
 from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.mission.timeouts_and_retries import ProgressTimer
@@ -18,8 +19,8 @@ TARGET_M = 1.0  # permitted difference of the autopilot's target and the setpoin
 class StepControl:
     """Decides whether the start or the goal of a step is reached, and detects faults on the way."""
 
-    def __init__(self, progress: MissionProgress, settings: SafetySettings) -> None:
-        self._progress, self._settings = progress, settings
+    def __init__(self, progress: MissionProgress, settings: SafetySettings, fence: Geofence) -> None:
+        self._progress, self._settings, self._fence = progress, settings, fence
         self.resumes_move = progress.checkpoint.goal is not None  # the move that an earlier bridge began
         self._setpoint: Enu | None = None
         self._sent_s = 0.0  # steady clock: first time of the current setpoint
@@ -70,13 +71,21 @@ class StepControl:
             away_m = self._progress.distance_m(position)
             if away_m <= self._settings.tolerance_m:
                 return self._complete(REACHED, setpoint)
-            if self._progress.may_end_at(position, self._settings):
+            if self._progress.may_end_at(position, self._settings) and self._can_go_on_from(position):
                 result = f"cell not reached after {step_s:g} s, {away_m:.0f} m away"
                 return self._complete(result, setpoint, reached=False)
             if not self._is_late:
                 self._is_late = True
                 reason = f"{reason}: {away_m:.0f} m away after {step_s:g} s, flies on"
         return Decision(Phase.MOVING, reason, setpoint)
+
+    def _can_go_on_from(self, position: Enu) -> bool:
+        """Whether the straight ways from a position to the goal and to each next cell are free."""
+        if not self._fence.obstacles:
+            return True
+        return all(
+            self._fence.path_breach(position, target) is None for target in self._progress.next_targets
+        )
 
     def _dwells(self, telemetry: Telemetry) -> bool:
         """Whether the vehicle has been at the goal for `dwell_s`."""

@@ -192,6 +192,24 @@ const space = {
       },
     });
   },
+  // A building or a no-fly zone: its ground plan on the map, its walls and top in 3D.
+  obstacle(one) {
+    const shade = one.kind === "building" ? "ground" : "warm";
+    const common = { hoverinfo: "text", showlegend: false, name: one.kind };
+    if (this.flat) {
+      const ring = [...one.polygon_m, one.polygon_m[0]];
+      return {
+        type: "scatter", mode: "lines", x: ring.map((at) => at[0]), y: ring.map((at) => at[1]), fill: "toself", hoveron: "fills",
+        fillcolor: faded(shade, one.kind === "building" ? 0.55 : 0.2), line: { color: colour(shade), width: 1.5, dash: one.kind === "building" ? "solid" : "dot" },
+        text: plain(one.words), ...common,
+      };
+    }
+    const first = one.x.map((_, i) => i).filter((i) => i % 3 === 0);
+    return {
+      type: "mesh3d", x: one.x, y: one.y, z: one.z, i: first, j: first.map((i) => i + 1), k: first.map((i) => i + 2),
+      color: colour(shade), opacity: one.kind === "building" ? 0.75 : 0.18, flatshading: true, text: one.x.map(() => plain(one.words)), ...common,
+    };
+  },
   // The world, for both kinds of page.
   world(world) {
     const discs = world.clusters.map((centre, i) => ring(centre, world.cluster_radii_m[i]));
@@ -202,6 +220,7 @@ const space = {
         name: "clusters", mode: "lines", x: join("x"), y: join("y"), z: join("x").map((x) => (x === null ? null : 0)),
         line: { color: colour("ground"), width: 1 }, hoverinfo: "skip",
       }),
+      ...world.obstacles.map((one) => this.obstacle(one)),
       this.trace({
         name: "dock", mode: "markers+text", x: [world.dock_m[0]], y: [world.dock_m[1]], z: [0], text: ["dock"],
         textposition: "top center", textfont: { color: colour("ink"), size: 12 }, hoverinfo: "text", hovertext: ["dock"],

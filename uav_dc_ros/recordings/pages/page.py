@@ -14,6 +14,8 @@ from typing import Any
 import msgspec
 
 from uav_dc_ros.core import channel, radio, reward
+from uav_dc_ros.core.obstacles import Obstacle
+from uav_dc_ros.core.obstacles.mesh import faces_m
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 
@@ -53,6 +55,7 @@ class Page:
 def world_data(scenario: Scenario) -> dict[str, Any]:
     """The world as page data."""
     grid, mission = scenario.grid, scenario.mission
+    top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
     return {
         **msgspec.to_builtins(grid),
         **msgspec.to_builtins(mission),
@@ -65,8 +68,22 @@ def world_data(scenario: Scenario) -> dict[str, Any]:
         "users": scenario.n_users,
         "clusters": scenario.cluster_centres_m,
         "cluster_radii_m": [disc.radius_m for disc in scenario.users.clusters],
-        "top_m": grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m,
+        "obstacles": [_obstacle_data(one, 1.15 * top_m) for one in scenario.obstacles],
+        "top_m": top_m,
         "reach_m": radio.ground_reach_m(mission.d_cons_m, grid.altitude_min_m),
+    }
+
+
+def _obstacle_data(obstacle: Obstacle, ceiling_m: float) -> dict[str, Any]:
+    """An obstacle as page data; `faces` are triangles of the corners in x, y and z."""
+    faces = faces_m(obstacle, ceiling_m).reshape(-1, 3)
+    altitudes = f"{obstacle.base_m:g} to {obstacle.height_m:g} m" if obstacle.height_m else "all altitudes"
+    words = {"building": "building", "no_fly": "no-fly zone"}[obstacle.kind]
+    return {
+        "kind": obstacle.kind,
+        "words": f"{words} {obstacle.name}, {altitudes}".replace(" ,", ","),
+        "polygon_m": obstacle.polygon_m,
+        **dict(zip("xyz", faces.T.tolist(), strict=True)),
     }
 
 

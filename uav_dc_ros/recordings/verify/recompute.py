@@ -268,7 +268,7 @@ class WorldCheck(Check):
         if before.move and not self._lockstep:
             actions.append(Action.HOVER)
         left = np.asarray(before.status.cell)
-        reached = [scenario.grid.move(left, np.asarray(int(action))).tolist() for action in actions]
+        reached = [world.move(scenario, left, np.asarray(int(action))).tolist() for action in actions]
         wrong = _cell(step, cell, reached)
         if not wrong and reached[0] != cell and before.move:
             self._hovered += 1
@@ -356,7 +356,8 @@ class DecisionCheck(Check):
             return None
         observation = self.policy.observe(self._scenario, **observed)
         q_values = self.policy.q_values(observation)
-        action = Action(int(self.policy.act(observation))).label
+        mask = world.action_mask(self._scenario, observed["cell"])
+        action = Action(int(self.policy.act(observation, mask))).label
         found = [difference(step, "move", "action", move.action, action)] if action != move.action else []
         self.count(found)
         return q_values if found else None
