@@ -80,6 +80,12 @@ def battery(scenario: Scenario, energy_used_j: Array) -> dict[str, Any]:
     return {"energy_used_j": float(energy_used_j), "state_of_charge": float(charge)}
 
 
+def battery_diagnostics(scenario: Scenario, energy_used_j: Array) -> dict[str, str]:
+    """The battery by the scenario's model for `/diagnostics`, after energy `[]`; none without a battery."""
+    fields = battery(scenario, energy_used_j)
+    return {"battery by the model": f"{fields['state_of_charge']:.0%}"} if fields else {}
+
+
 def energy_used_j(status: messages.Mission) -> Array:
     """Energy used in a mission, joules, `[]`; 0 in a scenario without a battery."""
     return np.asarray(0.0 if status.energy_used_j is UNSET else status.energy_used_j)

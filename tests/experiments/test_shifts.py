@@ -11,8 +11,9 @@ from tests.support.worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.core import world
-from uav_dc_ros.core.scenario import leaves
+from uav_dc_ros.core.scenario import from_values, leaves
 from uav_dc_ros.core.stats import interval
+from uav_dc_ros.errors import ScenarioError
 from uav_dc_ros.experiments.evaluate.cli import main
 from uav_dc_ros.experiments.evaluate.evaluation import EvaluationReport, evaluate_act, greedy_act
 from uav_dc_ros.experiments.evaluate.rollout import roll_out, rollout_steps
@@ -115,6 +116,20 @@ def test_a_list_is_changed_element_by_element():
     one = shifted(five, "users.cluster_centres_m[1][0]=x0.5").scenario
     assert one.users.cluster_centres_m[1] == (150.0, 800.0)
     assert one.users.cluster_centres_m[0] == five.users.cluster_centres_m[0]
+
+
+def test_users_of_a_list_are_changed_all_or_one_by_one():
+    users = {"user": [{"x_m": 10.0 * i, "y_m": 50.0, "data_bits": 1e6} for i in range(4)], "v_max_mps": 1.0}
+    values = msgspec.to_builtins(tiny()) | {"users": users}
+    scenario = from_values(values, "test")
+    moved = shifted(scenario, "users.user.x_m=+60,users.user[2].y_m=-20,users.user.data_bits=x2")
+    assert [user.x_m for user in moved.scenario.users.user] == [60.0, 70.0, 80.0, 90.0]
+    assert [user.y_m for user in moved.scenario.users.user] == [50.0, 50.0, 30.0, 50.0]
+    assert moved.shift.values[0].before == [0.0, 10.0, 20.0, 30.0]
+    assert moved.known.cluster_centres_m == scenario.cluster_centres_m, "the map is the old one"
+    assert [user.data_bits for user in moved.known.users.user] == [2e6] * 4
+    with pytest.raises(ScenarioError, match=r"unknown key users.user.height_m"):
+        shifted(scenario, "users.user.height_m=+1")
 
 
 def test_a_policy_does_not_know_that_the_users_have_moved(tmp_path):

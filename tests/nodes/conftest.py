@@ -87,19 +87,20 @@ LOW = {  # other values than the small world's: a flight of minutes beside a fak
     "d_cons_m": 50.0,
     "episode_end": '"on_arrival"',
 }
+LOW_BATTERY_J = 20_000.0  # of the scenario's model: a step takes about 1.6 kJ
 
 
 @pytest.fixture
 def low(tmp_path: Path) -> tuple[object, ...]:
-    """Options for a low world, where a flight takes a minute, and a policy that goes east to its dock."""
+    """Options for a low world with a battery: a flight of a minute, and a policy that goes east to dock."""
     path = tmp_path / "low.toml"
     text = SMALL
     for key, value in LOW.items():
         text, found = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
         assert found == 1, key
-    path.write_text(text)
+    path.write_text(f"{text}[energy]\nbattery_j = {LOW_BATTERY_J}\nends = 'both'\n")
     scenario = scenarios.load(path)
-    made = config(scenario, name="eastward")
+    made = config(scenario, name="eastward", observation="energy")
     parameters = network.initial(made.architecture(scenario), np.random.default_rng(1))
     zeros = {name: np.zeros_like(array) for name, array in parameters.items()}
     zeros["advantage.bias"][int(Action.RIGHT)] = 1.0

@@ -22,9 +22,12 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.nodes.conftest import LOW_BATTERY_J
 from tests.support.fake_autopilot.flight import Fake, fake
+from uav_dc_ros import bag as bag_command
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.registration import ENV_ID
@@ -48,13 +51,17 @@ def statuses(bag: Path) -> list[dict[str, Any]]:
 
 
 def check_steps(bag: Path, steps: int = STEPS) -> None:
-    """Each step was flown once, and ended one cell further."""
+    """Each step was flown once, ended one cell further, and used the energy of the model."""
     reported = statuses(bag)
     moving = [status["step"] for status in reported if status["phase"] == "moving"]
     begun = [step for step, _ in itertools.groupby(moving)]
     assert begun == list(range(steps)), begun
     cells = {status["step"]: status["cell"] for status in reported}
     assert cells == {step: [step, 0, 0] for step in range(steps + 1)}
+    used_j = {status["step"]: status["energy_used_j"] for status in reported}
+    assert used_j == pytest.approx({step: step * used_j[1] for step in range(steps + 1)})
+    assert 1500.0 < used_j[1] < 1700.0
+    assert reported[-1]["state_of_charge"] == pytest.approx(1.0 - used_j[steps] / LOW_BATTERY_J)
 
 
 def killed(ros: Ros, node: str) -> float:
@@ -194,6 +201,39 @@ def test_the_second_flight_has_the_grid_of_the_first(ros: Ros, low: tuple[object
         assert re.search(
             r"; 1[34]\d\.\d m east and \d\.\d m (north|south) of that of the last flight", output
         )
+
+
+@pytest.mark.long
+def test_the_scenario_s_battery_ends_a_mission_and_not_the_aircraft_s(
+    ros: Ros, low: tuple[object, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Seven steps east need less than it has, but this policy hovers: it is spent after six of seven."""
+    path, policy = Path(str(low[1])), Path(str(low[3]))
+    path.write_text(path.read_text().replace(str(LOW_BATTERY_J), "11600.0"))
+    parameters = dict(policies.load(policy).parameters)
+    parameters["advantage.bias"] = np.eye(7, dtype=np.float32)[Action.HOVER]
+    own = policies.load(policy).config
+    policies.save(ros.folder / "hovers", own, parameters, lambda _: "# test\n")
+    options = ("--scenario", path, "--policy", ros.folder / "hovers")
+    with fake("ardupilot", speed=16.0) as autopilot:
+        given = ("--bag", "bag", "--summary", "summary.json")
+        status, output = ros.run_all(*options, *beside(autopilot, "--arm", *given, *NODES))
+        assert status == 0, output
+        assert autopilot.report()["mode"] == "RTL"
+    (result,) = [json.loads((ros.folder / "summary.json").read_text())]
+    assert (result["outcome"], result["steps"]) == ("timeout", 6)
+    assert "out of the scenario's battery away from the dock" in result["reason"]
+    shown = [
+        pair.value
+        for topic, message in read_bag(ros.folder / "bag")
+        if topic == "/diagnostics" and message.status[0].name == "bridge"
+        for pair in message.status[0].values
+        if pair.key == "battery by the model"
+    ]
+    assert (shown[0], shown[-1]) == ("100%", "13%")
+    with pytest.raises(SystemExit) as exit:
+        bag_command.main(["verify", str(ros.folder / "bag"), "--policy-dir", str(ros.folder / "hovers")])
+    assert exit.value.code == 0, capsys.readouterr().out
 
 
 # What dies.

@@ -114,6 +114,7 @@ def step_messages(
             phase=over if step == scenario.mission.max_steps else messages.Phase.READY,
             cell=tuple(map(int, state.cell)),
             remaining_steps=scenario.mission.max_steps - step,
+            **payloads.battery(scenario, state.energy_used_j),
             seed=seed,
             scenario=scenario.name,
             fingerprint=scenario.fingerprint,

@@ -21,6 +21,7 @@ from uav_dc_ros.errors import MessageError, PolicyError
 from uav_dc_ros.offboard.mission.progress import Checkpoint, MissionProgress
 from uav_dc_ros.recordings.pages.compare import Group
 from uav_dc_ros.recordings.pages.missions import read_missions
+from uav_dc_ros.recordings.pages.page import world_data
 from uav_dc_ros.recordings.step_reader import Steps
 
 # Ten hovers of 10 s, about: each mission of at most 30 steps ends by the battery.
@@ -159,11 +160,29 @@ def test_reports_hold_it(flown):
     assert group.data(group, np.arange(5))["metrics"]["energy_per_mbit_j"] is None
 
 
+def test_a_page_holds_the_charge_of_each_step(flown):
+    with BagReader(flown.bag) as reader:
+        missions = list(read_missions(Steps(reader, "", flown.scenario.step_ns), flown.scenario, False))
+    for mission, infos in zip(missions, flown.simulated, strict=True):
+        charges = [step["state_of_charge"] for step in mission.steps()]
+        assert charges == [float(info["state_of_charge"]) for info in infos]
+
+
+def test_diagnostics_name_the_model():
+    world = tiny(energy={"battery_j": 1e5})
+    assert payloads.battery_diagnostics(world, np.asarray(25_000.0)) == {"battery by the model": "75%"}
+    assert payloads.battery_diagnostics(tiny(), np.asarray(0.0)) == {}
+
+
 def test_a_world_without_a_battery_has_none_of_it(tmp_path, capsys):
     world = tiny()
     recorded = flight(world)
     assert all(b"energy" not in message.data for message in recorded)
     folder = write(tmp_path / "bag", recorded, about(world))
+    with BagReader(folder) as reader:
+        (mission,) = read_missions(Steps(reader, "", world.step_ns), world, False)
+    assert all("state_of_charge" not in step for step in mission.steps())
+    assert "battery_j" not in world_data(world)
     bag_command(capsys, "export", folder, "--out", tmp_path / "tables")
     assert not any(
         "energy" in name for name in parquet.read_table(tmp_path / "tables/steps.parquet").column_names

@@ -63,7 +63,9 @@ def browser_3d(chromium: Any) -> Iterator[Any]:
 def mission_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page of two missions of a bag whose every text is hostile."""
     folder = tmp_path_factory.mktemp("report")
-    scenario = tiny(mission={"max_steps": 12, "r_min_bits": 4e6, "d_cons_m": 150.0})
+    scenario = tiny(
+        mission={"max_steps": 12, "r_min_bits": 4e6, "d_cons_m": 150.0}, energy={"battery_j": 5e4}
+    )
     diagnostics = report_bags.diagnostics(
         HOSTILE, 2, HOSTILE, {HOSTILE: HOSTILE, "restarts": "3", "cpu [%]": "12"}
     )
@@ -167,6 +169,9 @@ def test_the_slider_moves_the_uav_and_colours_the_users(page, mission_page):
         seen.add(tuple(wanted["uav_m"]))
         page.keyboard.press("ArrowRight")
     assert len(seen) > 3, "the UAV flies"
+    charges = [100.0 * wanted["state_of_charge"] for wanted in course]
+    assert page.evaluate("() => document.getElementById('charge').data[0].y") == pytest.approx(charges)
+    assert charges[0] == 100.0 > charges[-1] > 0.0
 
 
 def test_play_flies_step_by_step_to_the_end(page):

@@ -295,6 +295,7 @@ class AutopilotBridge(MissionNode):
             "armed": str(telemetry.armed).lower(),
             "estimate": "good" if telemetry.estimate_ok else "not good",
             "battery": "" if telemetry.battery is None else f"{telemetry.battery:.0%}",
+            **payloads.battery_diagnostics(self.scenario, bridge.progress.energy_used_j),
             "grid": self._grid,
             "system": telemetry.system,
             "other controller": telemetry.other_controller or "",

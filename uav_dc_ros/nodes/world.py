@@ -354,6 +354,7 @@ class WorldNode(MissionNode):
             "mission": str(self._mission),
             "step": str(self._step),
             "phase": self._phase.value if self._phase else "waiting for peers",
+            **payloads.battery_diagnostics(self.scenario, self._energy_used_j),
             "hovered steps": str(self._hovered),
             "step overruns": str(self._overruns),
         }

@@ -377,3 +377,9 @@ def test_the_text_tells_what_a_real_vehicle_does_and_why(phase: Phase, reason: s
     mission = msgspec.structs.replace(MISSION, phase=phase, reason=reason, held=held)
     text = markers.status_text(SCENARIO, scene(mission=mission))
     assert text == f"{expected}\n2 of 50 users collected\n1.23 Mbit/s"
+
+
+def test_the_text_holds_the_charge_of_a_world_with_a_battery() -> None:
+    mission = msgspec.structs.replace(MISSION, phase=Phase.READY, reason="", state_of_charge=0.634)
+    lines = markers.status_text(SCENARIO, scene(mission=mission)).splitlines()
+    assert lines[:2] == ["step 12 of 60", "battery by the model: 63%"]

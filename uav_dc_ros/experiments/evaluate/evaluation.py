@@ -223,8 +223,8 @@ _SHOWN = {
     "mean_age_s": ("age of information, s", 1.0, 1),
     "fairness": ("fairness of data", 1.0, 3),
     "last_collected_step": ("last user collected at step", 1.0, 1),
-    "energy_used_j": ("energy, kJ", 1e3, 2),
-    "energy_per_mbit_j": ("energy, J/Mbit", 1.0, 1),
+    "energy_used_j": ("energy used, kJ", 1e3, 2),
+    "energy_per_mbit_j": ("energy for data, J/Mbit", 1.0, 1),
 }
 TITLES = {name: title for name, (title, _, _) in _SHOWN.items()}
 COLUMNS = ("", "mean", "95% interval", "min", "max")

@@ -1,7 +1,7 @@
 """Shifts of `evaluate --shift`: a scenario with some values changed, and users that send nothing.
 
 A policy knows its own vehicle and mission: it observes with the shifted scenario, as in a flight. It does not
-know that the users have moved: its map, `users.cluster_centres_m`, is that of the scenario without the shift.
+know that the users have moved: its map, the positions in `users`, is that of the scenario without the shift.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from msgspec import UNSET, UnsetType
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario, from_values, leaves
+from uav_dc_ros.core.users.settings import UserSettings
 from uav_dc_ros.errors import ScenarioError
 
 MISSING = "users.missing"  # the share of the users that sends nothing: no key of a scenario
@@ -95,27 +96,37 @@ def apply(request: ShiftRequest, scenario: Scenario) -> ShiftedWorld:
     shifted = []
     for change in request.changes:
         if change.key == MISSING:
-            after = change.number / 100.0
-            if not n_missing(scenario, after) or after > 1.0:
+            share = change.number / 100.0
+            if not n_missing(scenario, share) or share > 1.0:
                 raise ScenarioError(
                     f"{source}: {MISSING} = {change.number:g}%; expected at least one and at most all of "
                     f"{scenario.n_users} users"
                 )
-            shifted.append(ShiftedValue(key=MISSING, before=0.0, after=after))
+            shifted.append(ShiftedValue(key=MISSING, before=0.0, after=share))
             continue
-        container, part = _find(values, change.key, source)
-        before = container[part]
-        container[part] = _changed(before, change, source)
-        shifted.append(ShiftedValue(key=change.key, before=before, after=container[part]))
+        holders = _find(values, change.key, source)
+        before = [holder[part] for holder, part in holders]
+        after = [_changed(value, change, source) for value in before]
+        for (holder, part), value in zip(holders, after, strict=True):
+            holder[part] = value
+        one = len(holders) == 1
+        shifted.append(
+            ShiftedValue(
+                key=change.key, before=before[0] if one else before, after=after[0] if one else after
+            )
+        )
     flown = from_values(values, source)
-    pairs = zip(flown.users.user, scenario.users.user, strict=True)
-    users = msgspec.structs.replace(
-        flown.users,
-        cluster_centres_m=scenario.users.cluster_centres_m,
-        user=tuple(msgspec.structs.replace(user, x_m=own.x_m, y_m=own.y_m) for user, own in pairs),
-    )
-    known = msgspec.structs.replace(flown, users=users)
+    known = msgspec.structs.replace(flown, users=_placed_as(scenario.users, flown.users))
     return ShiftedWorld(flown, known, Shift(text=request.text, values=shifted))
+
+
+def _placed_as(before: UserSettings, after: UserSettings) -> UserSettings:
+    """The users after a shift, with the positions before it."""
+    listed = tuple(
+        msgspec.structs.replace(user, x_m=own.x_m, y_m=own.y_m)
+        for user, own in zip(after.user, before.user, strict=True)
+    )
+    return msgspec.structs.replace(after, cluster_centres_m=before.cluster_centres_m, user=listed)
 
 
 def n_missing(scenario: Scenario, share: float) -> int:
@@ -143,20 +154,22 @@ def _change(text: str) -> Change:
     return Change(key, cast(Operator, percent or sets or operator or "="), float(value or number))
 
 
-def _find(values: Any, path: str, source: str) -> tuple[Any, str | int]:
-    """The table or list that holds a key, and the key's last part."""
-    here = container = values
-    part: str | int = ""
+def _find(values: Any, path: str, source: str) -> list[tuple[Any, str | int]]:
+    """The table or list that holds a key, and the key's last part; of a list of tables, each of them."""
+    here, holders = [values], []
     try:
         for name in re.findall(r"\w+", path):
             part = int(name) if name.isdecimal() else name
-            container, here = here, here[part]
+            if isinstance(part, str):
+                here = [table for entry in here for table in (entry if isinstance(entry, list) else [entry])]
+            holders = [(entry, part) for entry in here]
+            here = [entry[part] for entry in here]
     except (KeyError, IndexError, TypeError):
         known = [key for key, value in leaves(values) if isinstance(value, float | int)]
         close = difflib.get_close_matches(path, known, n=1)
         hint = f"did you mean {close[0]}?" if close else f"expected a numeric key, such as {known[-1]}"
         raise ScenarioError(f"{source}: unknown key {path}; {hint}") from None
-    return container, part
+    return holders
 
 
 def _changed(value: Any, change: Change, source: str) -> Any:

@@ -6,6 +6,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
+from msgspec import UNSET
 from visualization_msgs.msg import Marker
 
 from uav_dc_ros.cdr import FRAME, Writer
@@ -99,7 +100,10 @@ def markers(scenario: Scenario, scene: Scene) -> bytes:
 
 
 def status_text(scenario: Scenario, scene: Scene) -> str:
-    """Step, users collected and sum-rate, a line each; of a real vehicle also its state and the reason."""
+    """Step, state of charge by the scenario's model, users collected and sum-rate, a line each.
+
+    Without a battery in the scenario it lacks the second; of a real vehicle it also has state and reason.
+    """
     lines = []
     if (mission := scene.mission) is not None:
         is_ready = mission.phase is Phase.READY and not mission.held
@@ -107,6 +111,8 @@ def status_text(scenario: Scenario, scene: Scene) -> str:
         lines.append(f"step {mission.step} of {scenario.mission.max_steps}{state}")
         if mission.reason and not is_ready:
             lines += textwrap.wrap(mission.reason, REASON_WIDTH)[:REASON_LINES]
+        if mission.state_of_charge is not UNSET:
+            lines.append(f"battery by the model: {mission.state_of_charge:.0%}")
     if scene.sum_rate_bps is not None:
         lines.append(f"{int(np.sum(scene.collected))} of {scenario.n_users} users collected")
         lines.append(f"{scene.sum_rate_bps / 1e6:.2f} Mbit/s")

@@ -35,7 +35,7 @@ def finish(
     if progress.is_at_dock:
         reason = f"step {progress.step}: at the dock ({result})"
         return Decision(Phase.LANDING, reason, setpoint, outcome=Phase.LANDED)
-    reason = f"step {progress.step}: out of steps away from the dock ({result})"
+    reason = f"step {progress.step}: out of {progress.used_up} away from the dock ({result})"
     mode = settings.failsafe_action
     return Decision(Phase.LANDING, reason, setpoint, landing_mode=mode, outcome=Phase.TIMEOUT)
 

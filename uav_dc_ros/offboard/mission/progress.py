@@ -105,6 +105,11 @@ class MissionProgress:
         """Whether the last step ended where the vehicle lands."""
         return self._ends(self.step, self.cell, self.energy_used_j)[2]
 
+    @property
+    def used_up(self) -> str:
+        """What a mission that ended away from the dock is out of."""
+        return "steps" if self.step >= self.scenario.mission.max_steps else "the scenario's battery"
+
     def _energy_after(self) -> Array:
         """Energy used after a step from the cell to the goal."""
         cell, goal = np.asarray(self.cell), np.asarray(self.goal)

@@ -6,6 +6,7 @@ const STEP_MS = 150;
 
 open(async (page, data) => {
   const { world } = data;
+  const hasBattery = "battery_j" in world;
   const state = { mission: null, at: 0, chosen: null, timer: null };
   const at = (name) => document.getElementById(name);
 
@@ -42,7 +43,8 @@ open(async (page, data) => {
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum-rate" })),
           card("Reward r^t of each step (eq. 7)", make("div", { class: "chart", id: "reward" }),
             make("ul", { class: "legend" }, key("ink", "total"), key("accent", `data: β = ${world.beta} × mean ${world.data_words} / ${si(world.data_scale_bits, "bit")}`),
-              key("warm", `trajectory: ζ = ${world.zeta} × R₊ (${world.r_plus})`))))),
+              key("warm", `trajectory: ζ = ${world.zeta} × R₊ (${world.r_plus})`))),
+          hasBattery ? card(`State of charge by the scenario's model, of ${si(world.battery_j, "J")}`, make("div", { class: "chart", id: "charge" })) : "")),
       make("div", { class: "card transport" }, play, make("div", { class: "slide" }, make("label", { for: "step" }, "Step"), slider), position)),
     make("section", { "aria-labelledby": "users-title" },
       make("h2", { id: "users-title" }, "Users"), make("p", { class: "note", id: "users-note" }),
@@ -134,7 +136,7 @@ open(async (page, data) => {
     return null;
   }
 
-  const CHARTS = ["collected", "sum-rate", "reward", "data"];
+  const CHARTS = ["collected", "sum-rate", "reward", ...(hasBattery ? ["charge"] : []), "data"];
   const cursor = () => ({ type: "line", xref: "x", yref: "paper", x0: 0, x1: 0, y0: 0, y1: 1, line: { color: colour("uav"), width: 2 } });
 
   function drawCharts() {
@@ -154,7 +156,13 @@ open(async (page, data) => {
     const reward = (i) => steps().map((one) => one.reward[i]);
     const term = (name, i, shade, more) => line(name, reward(i), shade, { hovertemplate: "%{y:.3f}", line: { color: colour(shade), width: 2, shape: "hv", ...more } });
     draw("reward", [term("data", 0, "accent", { dash: "dash" }), term("trajectory", 1, "warm", { dash: "dot" }), term("total", 2, "ink")],
-      { yaxis: axis({ rangemode: "tozero", nticks: 5 }), xaxis: stepAxis(stepTitle()) });
+      { yaxis: axis({ rangemode: "tozero", nticks: 5 }), xaxis: stepAxis(hasBattery ? "" : stepTitle()) });
+    if (hasBattery) {
+      const charge = steps().map((one) => one.state_of_charge);
+      draw("charge", [line("state of charge", charge.map((share) => (share === null ? null : 100 * share)), "warm", {
+        customdata: charge.map((share) => (share === null ? NONE : si(share * world.battery_j, "J"))), hovertemplate: "%{y:.1f} %, %{customdata}<extra></extra>",
+      })], { yaxis: axis({ range: [0, 106], title: "%", nticks: 5 }), xaxis: stepAxis(stepTitle()) });
+    }
     const { user, cluster } = state.mission.table;
     const [dataScale, dataPrefix] = siScale(Math.max(world.r_min_bits, ...user.map((_, i) => state.mission.table.data_bits[i])));
     const data_bits = user.map((_, u) => steps().map((one) => (one.data_bits ? one.data_bits[u] / dataScale : null)));
@@ -252,7 +260,7 @@ open(async (page, data) => {
       ["last user collected", one.last_collected_step === null ? NONE : `step ${one.last_collected_step}`],
       ...("energy_used_j" in one ? [
         ["energy used", ...si(one.energy_used_j, "J").split(" ")],
-        ["energy for data", one.energy_per_mbit_j === null ? NONE : fixed(one.energy_per_mbit_j, 1), "J/Mbit"],
+        ["energy for data", one.energy_per_mbit_j === null ? NONE : fixed(one.energy_per_mbit_j, one.energy_per_mbit_j < 100 ? 1 : 0), "J/Mbit"],
       ] : []),
     ]));
     at("why").hidden = !one.reason || landed;

@@ -11,6 +11,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from uav_dc_ros import payloads
 from uav_dc_ros.core import mission, radio, reward, world
@@ -50,6 +51,7 @@ class MissionData:
         self._last: dict[str, Any] | None = None  # the newest step, kept or not
         self._position_m: Array | None = None
         self._cell: Array | None = None
+        self._charge: float | None = None  # state of charge; None: unknown, or no battery in the scenario
         self._next_step = 0
         self._sum_rates_bps: list[float] = [0.0, 0.0]  # sum over the steps, and their number
         self._served_steps: Array = np.zeros(n_users, dtype=np.int64)
@@ -80,6 +82,8 @@ class MissionData:
             self._counted_bits = np.full_like(self._counted_bits, math.nan)
         if step.step and not math.isnan(total := self._rewards()[2]):
             self.totals.add_reward(total, self.scenario.reward.data)
+        if status is not None and status.state_of_charge is not UNSET:
+            self._charge = status.state_of_charge
         self._keep(step, self._move(step.position_m, status if step.is_measured else None), users, rates)
 
     @property
@@ -204,6 +208,7 @@ class MissionData:
             "n_collected": int(self._collected.sum()),
             "sum_rate_bps": rates.sum_rate_bps if rates and step.step else None,
             "reward": _finite(np.asarray(self._rewards())),
+            **({"state_of_charge": self._charge} if self.scenario.energy else {}),
         }
         self._steps.add(step.step, self._last)
 

@@ -65,6 +65,7 @@ def world_data(scenario: Scenario) -> dict[str, Any]:
         "name": scenario.name,
         "fingerprint": scenario.fingerprint,
         "channel": channel.title(scenario.radio),
+        **({"battery_j": scenario.energy.battery_j} if scenario.energy else {}),
         "users": scenario.n_users,
         "clusters": scenario.cluster_centres_m,
         "cluster_radii_m": [disc.radius_m for disc in scenario.users.clusters],
