@@ -27,6 +27,7 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     Evaluation,
     EvaluationReport,
     Figure,
+    ShiftEffect,
     compare,
     evaluate_act,
     greedy_act,
@@ -37,7 +38,7 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
 )
 from uav_dc_ros.experiments.evaluate.shifts import (
     MISSING,
-    ShiftedValue,
+    Shift,
     ShiftedWorld,
     ShiftRequest,
     apply,
@@ -203,7 +204,14 @@ def show(report: EvaluationReport) -> None:
     if len(evaluations) > 1:
         console.print(_overview(evaluations, report.comparisons), "")
     for evaluation in evaluations if report.shifts else ():
-        console.print(_shifts(evaluation, report), "")
+        own = (evaluation.policy, evaluation.scenario)
+        worlds = [one for one in report.evaluations if (one.policy, one.scenario) == own]
+        effects = [one for one in report.shifts or () if (one.policy, one.scenario) == own]
+        console.print(_where(evaluation), style="bold", markup=False, soft_wrap=True)
+        for i, one in enumerate(worlds):
+            text = "as it is" if one.shift is UNSET else _changes(one.shift)
+            console.print(f" {i}  {text}", markup=False, soft_wrap=True)
+        console.print(_shifts(worlds, effects), "")
     console.print("Arrival: over missions that landed; its difference: over those in which both did.")
 
 
@@ -224,35 +232,25 @@ def _overview(evaluations: Sequence[Evaluation], comparisons: Sequence[Compariso
     return table
 
 
-def _shifts(unshifted: Evaluation, report: EvaluationReport) -> Table:
-    """A policy in a scenario as it is and in the shifted worlds, and the differences."""
-    own = (unshifted.policy, unshifted.scenario)
-    table = _figures_table(_SHIFT_FIGURES, MISSION_REWARD[unshifted.reward_data])
-    table.add_row(f"[bold]{escape(_where(unshifted))}")
-    for evaluation in report.evaluations:
-        if (evaluation.policy, evaluation.scenario) == own:
-            text = (
-                "as it is"
-                if evaluation.shift is UNSET
-                else _changes(evaluation.shift.text, evaluation.shift.values)
-            )
-            _add(table, text, _SHIFT_FIGURES, _figures(evaluation))
-    table.add_row("[bold]less the scenario as it is")
-    for effect in report.shifts or ():
-        if (effect.policy, effect.scenario) == own:
-            _add(table, _changes(effect.shift), _SHIFT_FIGURES, effect.differences, "+")
+def _shifts(worlds: Sequence[Evaluation], effects: Sequence[ShiftEffect]) -> Table:
+    """A policy in a scenario as it is and in the shifted worlds, by number, and the differences."""
+    table = _figures_table(_SHIFT_FIGURES, MISSION_REWARD[worlds[0].reward_data])
+    for i, evaluation in enumerate(worlds):
+        _add(table, str(i), _SHIFT_FIGURES, _figures(evaluation))
+    table.add_section()
+    for i, effect in enumerate(effects, start=1):
+        _add(table, f"{i} - 0", _SHIFT_FIGURES, effect.differences, "+")
     return table
 
 
-def _changes(shift: str, values: Sequence[ShiftedValue] = ()) -> str:
-    """Each key of a shift and its change, with the numbers before and after where they are given."""
-    lines = []
-    for i, change in enumerate(shift.split(",")):
-        key, _, text = change.strip().partition("=")
-        known = values and key != MISSING and not isinstance(values[i].after, list)
-        numbers = f": {values[i].before} -> {values[i].after}" if known else ""
-        lines.append(f"{escape(key)}\n  [dim]{text}{numbers}[/dim]")
-    return "\n ".join(lines)
+def _changes(shift: Shift) -> str:
+    """A shift, with the numbers before and after each change."""
+    numbers = [
+        "" if value.key == MISSING or isinstance(value.after, list) else f" ({value.before} -> {value.after})"
+        for value in shift.values
+    ]
+    texts = shift.text.split(",")
+    return ", ".join(text.strip() + more for text, more in zip(texts, numbers, strict=True))
 
 
 def _figures(evaluation: Evaluation) -> dict[str, Figure]:
