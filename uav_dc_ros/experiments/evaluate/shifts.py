@@ -16,7 +16,6 @@ from msgspec import UNSET, UnsetType
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario, from_values, leaves
-from uav_dc_ros.core.users.settings import UserSettings
 from uav_dc_ros.errors import ScenarioError
 
 MISSING = "users.missing"  # the share of the users that sends nothing: no key of a scenario
@@ -116,17 +115,18 @@ def apply(request: ShiftRequest, scenario: Scenario) -> ShiftedWorld:
             )
         )
     flown = from_values(values, source)
-    known = msgspec.structs.replace(flown, users=_placed_as(scenario.users, flown.users))
-    return ShiftedWorld(flown, known, Shift(text=request.text, values=shifted))
+    return ShiftedWorld(flown, _placed_as(scenario, flown), Shift(text=request.text, values=shifted))
 
 
-def _placed_as(before: UserSettings, after: UserSettings) -> UserSettings:
-    """The users after a shift, with the positions before it."""
+def _placed_as(before: Scenario, after: Scenario) -> Scenario:
+    """The scenario after a shift, with the users' positions before it."""
     listed = tuple(
         msgspec.structs.replace(user, x_m=own.x_m, y_m=own.y_m)
-        for user, own in zip(after.user, before.user, strict=True)
+        for user, own in zip(after.users.user, before.users.user, strict=True)
     )
-    return msgspec.structs.replace(after, cluster_centres_m=before.cluster_centres_m, user=listed)
+    centres_m = before.users.cluster_centres_m
+    users = msgspec.structs.replace(after.users, cluster_centres_m=centres_m, user=listed)
+    return msgspec.structs.replace(after, users=users)
 
 
 def n_missing(scenario: Scenario, share: float) -> int:
