@@ -82,8 +82,11 @@ def test_scenarios_are_listed_shown_and_checked(tmp_path: Path) -> None:
     file.write_text(shown.replace("max_steps = ", "max_steps = -"))
     status, out, err = uav_dc("check", file)
     assert (status, out) == (2, "")
-    assert "mission.max_steps = -45; expected int >= 1" in err
-    assert len(err.splitlines()) == 1
+    line = 1 + shown.split("\n").index("max_steps = 45")
+    assert err == f"{file}:{line}: mission.max_steps = -45; expected int >= 1\n"
+    file.write_text(shown.replace("max_steps = ", "max_steps = -").replace("zeta", "seta"))
+    status, out, err = uav_dc("check", file)
+    assert (status, out, len(err.splitlines())) == (2, "", 2)
 
 
 def test_an_unknown_verb_is_one_line(tmp_path: Path) -> None:

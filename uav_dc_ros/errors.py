@@ -9,7 +9,18 @@ class UavDcError(Exception):
 
 
 class ScenarioError(UavDcError):
-    """A scenario that cannot be found or read, or is invalid."""
+    """A scenario that cannot be found or read, or is invalid.
+
+    `path` holds the names and indices that lead to the invalid value, `()` without one.
+    """
+
+    def __init__(self, message: str, path: tuple[str | int, ...] = ()) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class UnknownKeyError(ScenarioError):
+    """A key that no scenario has."""
 
 
 class MessageError(UavDcError):

@@ -35,15 +35,21 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         from uav_dc_ros import scenarios
         from uav_dc_ros.agents import policy as policies
         from uav_dc_ros.errors import PolicyError
+        from uav_dc_ros.scenarios import problems
 
         if options.verb == "list":
             for name in scenarios.names():
                 print(f"{name}: {_description(scenarios.load(name))}")
             return 0
-        scenario = scenarios.load(options.scenario)
         if options.verb == "show":
+            scenarios.load(options.scenario)
             print(scenarios.find(options.scenario).read_text("utf-8"), end="")
             return 0
+        scenario, found = problems.find(scenarios.read(options.scenario))
+        for problem in found:
+            cli.print_error(problem.within(options.scenario))
+        if scenario is None:
+            return cli.FAILED
         print(f"{options.scenario}: {_description(scenario)}")
         fitting = []
         for name in policies.names():

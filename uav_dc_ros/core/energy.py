@@ -143,6 +143,7 @@ class EnergySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
                 f"energy.descent_mps = {descent_mps:g}; expected at most {max_mps:g}, twice the induced "
                 "velocity in hover, where the model of descents ends"
             )
+            return  # no step has an energy
         if self.ends == "steps":
             return
         energies_j = self.step_energies_j(grid, step_s)

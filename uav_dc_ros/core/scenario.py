@@ -12,7 +12,7 @@ import re
 import reprlib
 import tomllib
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
 import msgspec
@@ -28,7 +28,7 @@ from uav_dc_ros.core.obstacles import Buildings, Moves, Obstacle, moves_to_dock,
 from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.core.users.settings import UserSettings
-from uav_dc_ros.errors import ScenarioError
+from uav_dc_ros.errors import ScenarioError, UnknownKeyError
 
 EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
 
@@ -219,19 +219,33 @@ def read_values(text: str, source: str) -> dict[str, Any]:
 
 def from_values(values: dict[str, Any], source: str) -> Scenario:
     """A scenario from plain values, as TOML or JSON hold them; see `parse`."""
+    scenario = with_types(values, source)
+    if (error_text := next(inconsistencies(scenario), None)) is not None:
+        raise ScenarioError(f"{source}: {error_text}", path_of(error_text))
+    return scenario
+
+
+def with_types(values: dict[str, Any], source: str) -> Scenario:
+    """A scenario whose keys, types and ranges are right, but whose values need not fit together."""
     values = with_radio_model(values)
     _check_keys(values, Scenario, source)
     try:
         scenario = msgspec.convert(values, Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{source}: {_explain(str(error), values)}") from None
+        explained = _explain(str(error), values)
+        raise ScenarioError(f"{source}: {explained}", path_of(explained)) from None
     for key, value in leaves(msgspec.to_builtins(scenario)):
         # TOML's `nan` and `inf`, which no range of the types excludes
         if isinstance(value, float) and not math.isfinite(value):
-            raise ScenarioError(f"{source}: {key} = {value}; expected a finite number")
-    if (error_text := next(_inconsistencies(scenario), None)) is not None:
-        raise ScenarioError(f"{source}: {error_text}")
+            raise ScenarioError(f"{source}: {key} = {value}; expected a finite number", path_of(key))
     return scenario
+
+
+def path_of(text: str) -> tuple[str | int, ...]:
+    """Names and indices of the key that an error begins with: `missing key ...`, `grid.n_x = ...`."""
+    key = re.match(r"[\w.\[\]]*", re.sub("^missing (key|table) ", "", text))
+    assert key is not None, "the pattern matches any text"
+    return tuple(int(part) if part.isdecimal() else part for part in re.findall(r"\w+", key[0]))
 
 
 def with_radio_model(values: Any) -> Any:
@@ -252,13 +266,15 @@ def _check_keys(values: Any, struct: type, source: str, table: str = "") -> None
         if key not in known:
             close = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(known)}"
-            raise ScenarioError(f"{source}: unknown key {name} = {reprlib.repr(value)}; {hint}")
+            message = f"{source}: unknown key {name} = {reprlib.repr(value)}; {hint}"
+            raise UnknownKeyError(message, (*path_of(table), key))
         if (inner := _table(known[key], value)) is not None:
             entries = {f"{name}[{i}].": one for i, one in enumerate(value)} if isinstance(value, list) else {}
             for path, entry in (entries or {f"{name}.": value}).items():
                 _check_keys(entry, inner, source, path)
 
 
+@cache
 def _keys(struct: type) -> dict[str, Any]:
     """Keys of a table and their types; `model` comes first, where there are several."""
     tag_field = struct.__struct_config__.tag_field  # type: ignore[attr-defined]
@@ -323,24 +339,26 @@ def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-def _inconsistencies(scenario: Scenario) -> Iterator[str]:
-    """Errors of combined values, lazily: a later check relies on the earlier ones."""
+def inconsistencies(scenario: Scenario) -> Iterator[str]:
+    """Errors of combined values, each beginning with its key, lazily."""
     grid, mission = scenario.grid, scenario.mission
-    yield from scenario.users.inconsistencies()
+    of_users = list(scenario.users.inconsistencies())
+    yield from of_users
     top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
     extent = (
         f"x 0 to {(grid.n_x - 1) * grid.cell_m:g} and y 0 to {(grid.n_y - 1) * grid.cell_m:g} m "
         f"in steps of {grid.cell_m:g}"
     )
-    if grid.cell_at(mission.start_m) is None:
+    start, dock = grid.cell_at(mission.start_m), grid.cell_at((*mission.dock_m, grid.altitude_min_m))
+    if start is None:
         yield (
             f"mission.start_m = {list(mission.start_m)}; expected the centre of a cell: "
             f"{extent}, altitude {grid.altitude_min_m:g} to {top_m:g} m in steps of {grid.altitude_step_m:g}"
         )
-    if grid.cell_at((*mission.dock_m, grid.altitude_min_m)) is None:
+    if dock is None:
         yield f"mission.dock_m = {list(mission.dock_m)}; expected the centre of a cell: {extent}"
-    moves = sum(abs(a - b) for a, b in zip(scenario.start_cell[:2], scenario.dock_cell, strict=True))
-    if scenario.obstacles:
+    moves = abs(start[0] - dock[0]) + abs(start[1] - dock[1]) if start and dock else 0
+    if scenario.obstacles and start and dock:
         yield from problems(scenario)
         moves = moves_to_dock(scenario)
     if moves > mission.max_steps:
@@ -357,9 +375,9 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
             f"grid.altitude_min_m = {grid.altitude_min_m:g}, or no user can be served"
         )
     yield from scenario.users.outside(grid)
-    for disc in scenario.users.start_discs():
+    for disc in () if of_users else scenario.users.start_discs():
         distance_m = grid.distance_m(disc.centre_m, disc.radius_m)
-        if distance_m > mission.d_cons_m:
+        if distance_m > max(mission.d_cons_m, grid.altitude_min_m):
             yield (
                 f"{disc.key} = {list(disc.centre_m)}: its disc is {distance_m:.1f} m from the "
                 f"nearest cell; expected at most mission.d_cons_m = {mission.d_cons_m:g}, or its users are "
@@ -367,7 +385,7 @@ def _inconsistencies(scenario: Scenario) -> Iterator[str]:
             )
     if scenario.energy is not None:
         yield from scenario.energy.inconsistencies(grid, mission.step_s, mission.max_steps, moves)
-    if isinstance(scenario.radio, AerialVehicle):
+    if isinstance(scenario.radio, AerialVehicle) and not of_users:
         yield from _out_of_range(scenario, scenario.radio.environment, top_m)
 
 

@@ -1,6 +1,7 @@
 """The shipped scenario files, and the loader of any scenario."""
 
 from pathlib import Path
+from typing import Any
 
 from uav_dc_ros.core.scenario import Scenario, from_values, read_values
 from uav_dc_ros.errors import ScenarioError
@@ -34,11 +35,19 @@ def load(name_or_path: str | Path) -> Scenario:
         ScenarioError: no such name or file, or a file that `core.scenario.parse`, `user_files` or
             `zone_files` rejects.
     """
+    source = str(name_or_path)
+    values = read_values(read(name_or_path), source)
+    return from_values(with_files(values, find(name_or_path).parent, source), source)
+
+
+def with_files(values: dict[str, Any], folder: Path, source: str) -> dict[str, Any]:
+    """Plain values of a scenario with what is in its files, relative to `folder`; raises ScenarioError."""
+    return with_users(with_zones(values, folder, source), folder, source)
+
+
+def read(name_or_path: str | Path) -> str:
+    """The text of a scenario's TOML file; raises ScenarioError for one that cannot be found or read."""
     try:
-        path = find(name_or_path)
-        text = path.read_text("utf-8")
+        return find(name_or_path).read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{name_or_path}: cannot be read: {error}") from None
-    source = str(name_or_path)
-    values = with_zones(read_values(text, source), path.parent, source)
-    return from_values(with_users(values, path.parent, source), source)

@@ -159,9 +159,9 @@ class UserSettings(
                 f"users.users_per_cluster = {list(each)}; expected a number, or {len(centres_m)}: one for "
                 "each of users.cluster_centres_m"
             )
-        if len(self.sizes) > CLUSTERS_MAX:
+        if len(self.listed) > CLUSTERS_MAX:
             yield (
-                f"users.user: {len(self.sizes)} clusters; expected at most {CLUSTERS_MAX}: give users of one "
+                f"users.user: {len(self.listed)} clusters; expected at most {CLUSTERS_MAX}: give users of one "
                 "place the same `cluster`"
             )
         seen: dict[str, int] = {}
