@@ -105,7 +105,7 @@ def test_every_command_parses(where: str, words: list[str], monkeypatch: pytest.
 
 def test_there_are_commands_of_every_kind() -> None:
     modules = {words[0].removeprefix("uav_dc_ros.") for _, words in COMMANDS}
-    assert {"run_all", "train", "evaluate", "paper", "bag", "nodes.world"} <= modules
+    assert {"run_all", "train", "evaluate", "paper", "bag", "scenario", "nodes.world"} <= modules
     verbs = {words[1] for _, words in COMMANDS if words[0] == "uav_dc_ros.bag"}
     assert verbs == set(bag.VERBS)
 
@@ -142,6 +142,8 @@ def helps() -> Iterator[tuple[str, list[str]]]:
         yield module, ["--help"]
     for verb in bag.VERBS:
         yield "bag", [verb, "--help"]
+    for verb in ("list", "show", "new", "random", "check", "draw"):
+        yield "scenario", [verb, "--help"]
 
 
 @pytest.mark.parametrize(("module", "arguments"), list(helps()), ids=str)

@@ -15,7 +15,7 @@ VERBS = {
     "evaluate": ("uav_dc_ros.experiments.evaluate.cli", "fly policies over many missions, and compare them"),
     "paper": ("uav_dc_ros.experiments.paper.cli", "reproduce every figure of the paper, and test its claims"),
     "bag": ("uav_dc_ros.bag", "record, play, recover, verify and explain bags"),
-    "scenario": ("uav_dc_ros.scenario", "list, show and check scenarios"),
+    "scenario": ("uav_dc_ros.scenario", "make, check and draw scenarios"),
 }
 
 

@@ -1,26 +1,27 @@
 """Every problem of a scenario file at once, each with its line."""
 
 import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core.scenario import leaves, parse, path_of, plain_values
+from uav_dc_ros.core.scenario import leaves, parse, path_of, read_values
 from uav_dc_ros.errors import ScenarioError
 from uav_dc_ros.scenarios import problems
 from uav_dc_ros.scenarios.lines import Lines
 
 TEXT = scenarios.find("five_clusters").read_text("utf-8")
-KEYS = [key for key, _ in leaves(plain_values(TEXT, "")) if not key.startswith("the number of ")]
+KEYS = [key for key, _ in leaves(read_values(TEXT, "")) if not key.startswith("the number of ")]
 TABLES = ("grid", "users", "mission", "radio", "reward")
 ENERGY = TEXT + "\n[energy]\nbattery_j = 90e3\n"
 
 
 def lines_of(text: str) -> list[tuple[int | None, str]]:
     """Line and key of each problem."""
-    scenario, found = problems.find(text)
+    scenario, found = problems.find(text, Path())
     assert scenario is None
     return [(problem.line, problem.text.partition(" = ")[0].partition(":")[0]) for problem in found]
 
@@ -153,7 +154,9 @@ def test_a_table_that_is_none_hides_what_it_lacks() -> None:
 
 def test_of_very_many_problems_the_first() -> None:
     centres = "[" + ",\n".join("[1.0]" for _ in range(500)) + "]"
-    _, found = problems.find(f"{TEXT[: TEXT.index('cluster_centres_m')]}cluster_centres_m = {centres}")
+    _, found = problems.find(
+        f"{TEXT[: TEXT.index('cluster_centres_m')]}cluster_centres_m = {centres}", Path()
+    )
     assert len(found) == problems.PROBLEMS_MAX
 
 
@@ -161,7 +164,7 @@ def test_of_very_many_problems_the_first() -> None:
 @given(start=st.integers(0, len(TEXT)), length=st.integers(0, 40), junk=st.text(max_size=12))
 def test_a_damaged_file_has_problems_where_parse_has_an_error(start: int, length: int, junk: str) -> None:
     text = TEXT[:start] + junk + TEXT[start + length :]
-    scenario, found = problems.find(text)
+    scenario, found = problems.find(text, Path())
     if scenario is not None:
         assert found == []
         assert parse(text, "f.toml") == scenario

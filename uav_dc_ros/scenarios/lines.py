@@ -21,11 +21,12 @@ class Lines:
     def of(self, path: Sequence[str | int]) -> int | None:
         """The line of a key, or of the innermost table or array around it; None if there is none."""
         for length in range(len(path), 0, -1):
-            if (line := self._line(path[:length])) is not None:
+            if (line := self.exactly(path[:length])) is not None:
                 return line
         return None
 
-    def _line(self, path: Sequence[str | int]) -> int | None:
+    def exactly(self, path: Sequence[str | int]) -> int | None:
+        """The line of a key; None if there is none."""
         low, high = 0, len(self._lines)  # the key is not in the first `low` lines, but in the first `high`
         if not _has(self._values(high), path):
             return None

@@ -52,6 +52,13 @@ def find(text: str, folder: Path) -> tuple[Scenario | None, list[Problem]]:
     return None, sorted(found, key=lambda problem: problem.line or 0)
 
 
+def line_of(lines: Lines, path: Key) -> int | None:
+    """The line of a key; for users of a file, that of `users.file`."""
+    if path[:2] == ("users", "user") and lines.exactly(path[:2]) is None:
+        path = ("users", "file")
+    return lines.of(path)
+
+
 def _problems(text: str, folder: Path) -> Iterator[Problem]:
     try:
         values = core.read_values(text, "")
@@ -84,14 +91,14 @@ def _problems(text: str, folder: Path) -> Iterator[Problem]:
             continue
         if not any(path[: len(table)] == table for table in hidden):
             fit = fit and path[0] in _APART
-            yield Problem(lines.of(meant.get(path, path)), problem)
+            yield Problem(line_of(lines, meant.get(path, path)), problem)
         if is_unknown:
             unknown[path] = _around(values, path).pop(path[-1])
         elif not _repair(values, path, hidden):
             return
     if fit:
         for problem in core.inconsistencies(scenario):
-            yield Problem(lines.of(core.path_of(problem)), problem)
+            yield Problem(line_of(lines, core.path_of(problem)), problem)
 
 
 def _text(error: ScenarioError) -> str:

@@ -161,8 +161,8 @@ class UserSettings(
             )
         if len(self.listed) > CLUSTERS_MAX:
             yield (
-                f"users.user: {len(self.listed)} clusters; expected at most {CLUSTERS_MAX}: give users of one "
-                "place the same `cluster`"
+                f"users.user: {len(self.listed)} clusters; expected at most {CLUSTERS_MAX}: give users of "
+                "one place the same `cluster`"
             )
         seen: dict[str, int] = {}
         for i, user in enumerate(self.user):

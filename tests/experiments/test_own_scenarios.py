@@ -1,0 +1,432 @@
+"""Making, checking and drawing scenarios."""
+
+import json
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.conftest import ROOT
+from tests.support.worlds import changed, tiny
+from uav_dc_ros import scenario as command
+from uav_dc_ros import scenarios
+from uav_dc_ros.core import world
+from uav_dc_ros.core.scenario import Scenario, leaves, parse, read_values
+from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.experiments.evaluate.rollout import roll_out
+from uav_dc_ros.experiments.scenarios import document, field, flyable
+from uav_dc_ros.experiments.scenarios.rate_map import rate_map, scale_bar_m
+from uav_dc_ros.planners import PLANNERS
+
+FIVE = scenarios.find("five_clusters").read_text("utf-8")
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Runs `scenario`; exit status, standard output, and standard error."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        command.main([str(one) for one in arguments])
+    assert isinstance(ended.value.code, int)
+    return ended.value.code, *capsys.readouterr()
+
+
+def check_random_field(seed: int) -> None:
+    """Valid, apart and within the grid; flyable by other missions than those that its budget was set with."""
+    scenario = field.at_random(seed)
+    assert parse(document.text(scenario), "") == scenario
+    assert flyable.examine(scenario).problems == ()
+    missions = roll_out(scenario, PLANNERS["tour"](scenario), range(100, 105))
+    assert missions.landed.all(), seed
+    assert missions.users_collected.mean() > 0.8 * scenario.n_users, seed
+    centres_m, radius_m = scenario.cluster_centres_m, scenario.users.clusters[0].radius_m
+    apart_m = [math.dist(a, b) for i, a in enumerate(centres_m) for b in centres_m[:i]]
+    assert min(apart_m, default=math.inf) > 2.0 * radius_m, seed
+    grid = scenario.grid
+    for at_m, n in (
+        (at_m, n) for centre_m in centres_m for at_m, n in zip(centre_m, grid.shape, strict=False)
+    ):
+        assert radius_m <= at_m <= (n - 1) * grid.cell_m - radius_m, seed
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_random_field_can_be_flown(seed: int) -> None:
+    check_random_field(seed)
+
+
+@pytest.mark.long
+def test_two_hundred_random_fields_can_be_flown() -> None:
+    for seed in range(200):
+        check_random_field(seed)
+
+
+def test_equal_seeds_give_equal_bytes_and_others_other_fields() -> None:
+    made = [
+        subprocess.run(
+            [sys.executable, "-m", "uav_dc_ros.scenario", "random", "--seed", str(seed)],
+            capture_output=True, check=True, cwd=ROOT,
+        ).stdout
+        for seed in (5, 5)
+    ]  # fmt: skip
+    assert made[0] == made[1]
+    text = made[0].decode()
+    assert text.startswith("# Made by: uav-dc scenario random --seed 5\n")
+    assert parse(text, "") == field.at_random(5)
+    assert len({field.at_random(seed).fingerprint for seed in range(5)}) == 5
+
+
+def test_what_is_given_is_not_drawn() -> None:
+    scenario = field.at_random(3, n_clusters=4, users_per_cluster=7, size_m=(1500.0, 800.0), name="mine")
+    grid = scenario.grid
+    assert (scenario.name, scenario.n_clusters, scenario.n_users) == ("mine", 4, 28)
+    assert ((grid.n_x - 1) * grid.cell_m, (grid.n_y - 1) * grid.cell_m) == (1500.0, 800.0)
+
+
+@settings(derandomize=True, deadline=None, max_examples=6)
+@given(
+    clusters=st.integers(1, 12),
+    users=st.sampled_from([1, 2, 10, 40]),
+    size_m=st.tuples(st.floats(100.0, 5000.0), st.floats(100.0, 5000.0)),
+)
+def test_an_even_field_can_be_flown_or_has_no_room(
+    clusters: int, users: int, size_m: tuple[float, float]
+) -> None:
+    try:
+        scenario = field.even("even", clusters, users, size_m)
+    except ParameterError as error:
+        message = str(error)
+    else:
+        message = ""
+    if message:
+        assert re.match(rf"{clusters} clusters in .* m; expected fewer", message)
+        return
+    assert (scenario.n_clusters, scenario.users.users_per_cluster) == (clusters, users)
+    assert flyable.examine(scenario).problems == ()
+    grid = scenario.grid
+    for given_m, n in zip(size_m, grid.shape, strict=False):
+        assert abs(given_m - (n - 1) * grid.cell_m) <= grid.cell_m
+
+
+ENERGY = {"battery_j": 9e4, "ends": "both", "cruise_mps": 12.5}
+URBAN = {"model": "air_to_ground", "bandwidth_hz": 1e6, "tx_power_w": 0.1, "noise_power_dbm": -110.0}
+URBAN |= {"carrier_hz": 2e9, "environment": "urban", "line_of_sight": "mean_gain", "interference": "none"}
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        *map(scenarios.load, scenarios.names()),
+        changed("five_clusters", energy=ENERGY),
+        tiny(mission={"r_min_bits": 1e-7 / 3}),
+    ],
+    ids=lambda scenario: scenario.name,
+)
+def test_the_text_of_a_scenario_is_the_scenario_and_explains_each_key(scenario: Scenario) -> None:
+    text = document.text(scenario, "a header\nof two lines")
+    assert text.startswith("# a header\n# of two lines\n\nname = ")
+    assert parse(text, "") == scenario
+    assert parse(text, "").fingerprint == scenario.fingerprint
+    keys = {key.partition("[")[0] for key, _ in leaves(read_values(text, "")) if " " not in key}
+    assert {key for key in keys if not key.startswith("energy.")} <= set(document.COMMENTS)
+    assert max(map(len, text.splitlines())) <= document.WIDTH
+
+
+def test_the_commented_battery_is_valid() -> None:
+    text = document.text(scenarios.load("five_clusters"))
+    with_battery = (
+        text.replace("# [energy]", "[energy]").replace("# battery_j", "battery_j").replace("# ends", "ends")
+    )
+    scenario = parse(with_battery, "")
+    assert scenario.energy is not None
+    assert flyable.examine(scenario).problems == ()
+
+
+def test_tables_and_texts_of_any_kind_can_be_written() -> None:
+    values = {"a": 'x"\n\x7fü', "b": {"c": True, "d": {"e": 1e-9}}, "f": [{"g": [[1.5, 2.0]]}, {"g": []}]}
+    lines = document._table(values, ())
+    assert read_values("\n".join(lines), "") == values
+
+
+def test_new_writes_the_shipped_field_or_one_of_other_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "My Field-2.toml"
+    status, out, err = run(capsys, "new", path)
+    assert (status, err) == (0, "")
+    assert out.startswith(f"{path}: 50 users in 5 clusters")
+    made = scenarios.load(path)
+    assert made.name == "my_field_2"
+    shipped = scenarios.load("five_clusters")
+    assert (made.grid, made.users, made.mission, made.radio) == (
+        *(shipped.grid, shipped.users, shipped.mission, shipped.radio),
+    )
+    assert run(capsys, "check", path)[0] == 0
+    status, _, err = run(capsys, "new", path)
+    assert (status, err) == (2, f"python -m uav_dc_ros.scenario: {path} exists; expected a new file\n")
+    status, out, _ = run(capsys, "new", "--clusters", "3", "--size", "900x600")
+    made = parse(out, "")
+    assert out.startswith("# Made by: uav-dc scenario new --clusters 3 --size 900x600\n")
+    assert (made.name, made.n_clusters, made.users.users_per_cluster) == ("my_field", 3, 10)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("new", "--clusters", "0"), "argument --clusters: '0'; expected 1 to 50"),
+        (("new", "--users", "1001"), "argument --users: '1001'; expected 1 to 1000"),
+        (("new", "--size", "50"), "argument --size: '50'; expected metres from 100 to 100000"),
+        (("new", "--size", "800x"), "argument --size: '800x'; expected metres"),
+        (("new", "--size", "nan"), "argument --size: 'nan'; expected metres"),
+        (("new", "--clusters", "50", "--size", "500x100"), "50 clusters in 500 x 100 m; expected fewer"),
+        (("random",), "the following arguments are required: --seed"),
+        (("random", "--seed", "1", "--clusters", "50", "--size", "5000x100"), "50 clusters in 5000 x 100 m;"),
+        (("random", "--seed", "1", "no/folder.toml"), "no/folder.toml cannot be written: No such file"),
+        (("check", "nowhere.toml"), "scenario 'nowhere.toml': no such name or file"),
+        (("draw", "five_clusters", "--out", "a.gif"), "--out a.gif; expected a name that ends in .png"),
+        (("draw", "five_clusters", "--out", "no/map.png"), "no/map.png cannot be written"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_line_and_status_2(
+    arguments: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, *arguments)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert expected in err
+
+
+def line_of(text: str, start: str) -> int:
+    """The only line that starts so, counted from 1."""
+    (line,) = [i for i, one in enumerate(text.split("\n"), 1) if one.lstrip().startswith(start)]
+    return line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "problem"),
+    [
+        (
+            "[800.0, 700.0]",
+            "[1150.0, 700.0]",
+            "[1150.0",
+            r"users\.cluster_centres_m\[4\] = \[1150\.0, 700\.0\]: 88% of its disc is in reach of a cell "
+            r"with mission\.d_cons_m = 250; expected all of it, as with 288$",
+        ),
+        (
+            "max_steps = 60",
+            "max_steps = 22",
+            "max_steps",
+            r"mission\.max_steps = 22: a tour collects no user of users\.cluster_centres_m\[0\], .*; "
+            r"expected at least 5\d, the steps of a tour of all clusters$",
+        ),
+        (
+            "r_min_bits = 6e6",
+            "r_min_bits = 6e9",
+            "r_min_bits",
+            r"mission\.r_min_bits = 6e\+09: even flights to one cluster alone collect no user of "
+            r"users\.cluster_centres_m\[0\], .*; expected at most \d\.?\d*e\+08, what one of its users",
+        ),
+        (
+            "[reward]",
+            "[energy]\nbattery_j = 90e3\n[reward]",
+            "battery_j",
+            r"energy\.battery_j = 90000: a mission takes 1\d{5}(\.\d+)? J; expected at least that, or "
+            r"energy\.ends = 'both'$",
+        ),
+    ],
+    ids=["coverage", "steps", "data", "battery"],
+)
+def test_a_problem_of_each_kind_has_its_line(
+    old: str, new: str, line: str, problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, text = tmp_path / "own.toml", FIVE.replace(old, new, 1)
+    path.write_text(text, "utf-8")
+    status, out, err = run(capsys, "check", path)
+    assert status == 1
+    assert out.startswith(f"{path}: 50 users in 5 clusters")
+    assert "\ntour: lands in 10 of 10 missions, collects " in out
+    prefix = f"{path}:{line_of(text, line)}: "
+    assert any(
+        one.startswith(prefix) and re.match(problem, one[len(prefix) :]) for one in err.splitlines()
+    ), err
+    assert f"problems: {err.count(chr(10))}\n" in out
+
+
+LISTED = (
+    FIVE[: FIVE.index("[users]")]
+    + "[users]\nfile = 'users.csv'\nv_max_mps = 1.0\n"
+    + FIVE[FIVE.index("[mission]") :]
+)
+
+
+def test_users_of_a_file_are_checked_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, users = tmp_path / "own.toml", tmp_path / "users.csv"
+    path.write_text(LISTED, "utf-8")
+    users.write_text(
+        "x_m,y_m,name,cluster,radius_m\n200,300,a,east,30\n250,300,,east,\n1040,500,far,,300\n", "utf-8"
+    )
+    line = line_of(LISTED, "file = ")
+    status, out, err = run(capsys, "check", path)
+    assert (status, err.count("\n")) == (1, 1)
+    assert "3 users in 2 clusters" in out
+    assert re.match(
+        rf"{path}:{line}: users\.user\[2\] \(far\) = \[1040\.0, 500\.0\]: 87% of its disc is in", err
+    )
+    assert run(capsys, "draw", path, "--out", tmp_path / "map.png")[0] == 0
+    assert run(capsys, "draw", path, "--out", tmp_path / "map.html")[0] == 0
+    users.write_text("x_m,y_m\n200,east\n", "utf-8")
+    path.write_text(LISTED.replace("beta = 1.0", "beta = -1.0"), "utf-8")
+    status, out, err = run(capsys, "check", path)
+    assert (status, out) == (2, "")
+    assert err.splitlines() == [
+        f"{path}:{line}: {users}, line 2: y_m = 'east'; expected a finite number, such as 12.5",
+        f"{path}:{line_of(LISTED, 'beta = ')}: reward.beta = -1.0; expected float >= 0.0",
+    ]
+    listed = changed(
+        "five_clusters",
+        users={"user": [{"x_m": 1.0, "y_m": 2.0, "name": "a"}]}
+        | dict.fromkeys(("cluster_centres_m", "users_per_cluster", "cluster_radius_m")),
+    )
+    assert parse(document.text(listed), "") == listed
+
+
+def test_a_check_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys, "check", "three_clusters", "--json")
+    found = json.loads(out)
+    assert (status, err, found["problems"], found["valid"]) == (0, "", [], True)
+    assert found["fingerprint"] == scenarios.load("three_clusters").fingerprint
+    assert "three_clusters_dueling" in found["policies"]
+    assert (found["tour"]["landed"], found["tour"]["missions"]) == (10, 10)
+    assert sum(cluster["collected"] for cluster in found["clusters"]) == pytest.approx(
+        found["tour"]["collected"]
+    )
+    path = tmp_path / "own.toml"
+    path.write_text(FIVE.replace("max_steps = 60", "max_steps = 0"), "utf-8")
+    status, out, err = run(capsys, "check", path, "--json", tmp_path / "found.json")
+    assert (status, out) == (2, "")
+    line = line_of(FIVE, "max_steps = ")
+    assert err == f"{path}:{line}: mission.max_steps = 0; expected int >= 1\n"
+    assert json.loads((tmp_path / "found.json").read_bytes()) == {
+        "file": str(path),
+        "valid": False,
+        "problems": [{"line": line, "text": "mission.max_steps = 0; expected int >= 1"}],
+    }
+
+
+def test_what_a_tour_collects_is_what_evaluate_reports() -> None:
+    for scenario in (
+        scenarios.load("five_clusters"),
+        changed("five_clusters", mission={"episode_end": "on_arrival"}),
+        changed("five_clusters", energy={"battery_j": 1e5, "ends": "both"}),
+    ):
+        found = flyable.examine(scenario, range(5)).tour
+        missions = roll_out(scenario, PLANNERS["tour"](scenario), range(5))
+        assert (found.missions, found.landed) == (5, missions.landed.sum())
+        assert found.collected == pytest.approx(missions.users_collected.mean())
+        assert found.docked_step == pytest.approx(np.nanmean(missions.arrival_step))
+        if missions.energy_used_j is not None:
+            assert found.energy_used_j == missions.energy_used_j.max()
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(
+    points=st.lists(st.tuples(st.floats(-900, 1900), st.floats(-900, 1900)), min_size=1, max_size=20),
+    n_x=st.integers(1, 11),
+)
+def test_the_nearest_cell_is_the_nearest_of_all(points: list[tuple[float, float]], n_x: int) -> None:
+    scenario = tiny(
+        grid={"n_x": n_x + 2, "n_y": 4, "n_z": 2, "cell_m": 70.0}, mission={"dock_m": [140.0, 140.0]}
+    )
+    grid = scenario.grid
+    cells = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    centres_m = grid.centre_m(cells, like=np.zeros(1))
+    ground_m = np.asarray([(x, y, 0.0) for x, y in points])
+    expected = np.linalg.norm(ground_m[:, None] - centres_m, axis=-1).min(axis=1)
+    np.testing.assert_allclose(flyable.nearest_cell_m(scenario, ground_m[:, :2]), expected, rtol=1e-12)
+
+
+def test_half_of_a_disc_is_in_reach() -> None:
+    """A chord through its centre divides it: the reach ends 100 m beyond the edge, where the centre is."""
+    edge_m, radius_m = 1000.0, 5.0
+    centre_m = (edge_m + 100.0, 500.0)
+    mission = {"d_cons_m": math.hypot(100.0, 100.0)}
+    users = {"cluster_centres_m": [centre_m], "cluster_radius_m": radius_m}
+    share, needed_m = flyable.reach(
+        changed("five_clusters", users=users, mission=mission), centre_m, radius_m
+    )
+    assert share == pytest.approx(0.5, abs=0.03)
+    assert needed_m == pytest.approx(math.hypot(105.0, 100.0), abs=0.01)
+
+
+def test_a_cluster_that_cannot_be_collected_has_no_tour_without_a_limit() -> None:
+    assert flyable.steps_of_tour(scenarios.load("five_clusters"), range(5)) == pytest.approx(50.0, abs=1.5)
+    assert flyable.steps_of_tour(changed("five_clusters", mission={"r_min_bits": 1e10}), range(2)) is None
+
+
+def test_the_rate_over_a_cell_is_that_of_the_world() -> None:
+    scenario = changed("five_clusters", users={"users_per_cluster": 3})
+    rates = rate_map(scenario)
+    states = [
+        world.initial(scenario, np.random.default_rng(seed).random(scenario.draws_shape))
+        for seed in range(rates.missions)
+    ]
+    uav_m = np.asarray([300.0, 200.0, 150.0])
+    expected = [world.measure(scenario, uav_m, one.users_m, one.collected).sum_rate_bps for one in states]
+    layer = rates.layers[1]
+    east, north = list(rates.east_m).index(300.0), list(rates.north_m).index(200.0)
+    assert layer.altitude_m == 150.0
+    assert layer.sum_rate_bps[east, north] == pytest.approx(np.mean(expected), rel=1e-12)
+    assert layer.reach_m == pytest.approx(200.0)
+    np.testing.assert_array_equal(rates.users_m, states[0].users_m)
+
+
+def test_of_a_large_field_some_cells_are_drawn_with_both_edges() -> None:
+    scenario = tiny(
+        grid={"n_x": 300, "n_y": 2, "n_z": 20, "altitude_step_m": 1.0}, mission={"dock_m": [200.0, 100.0]}
+    )
+    rates = rate_map(scenario)
+    assert (len(rates.east_m), len(rates.north_m), len(rates.layers)) == (60, 2, 6)
+    assert (rates.east_m[0], rates.east_m[-1]) == (0.0, 29_900.0)
+    assert rates.layers[-1].altitude_m == 119.0
+
+
+@given(st.floats(1e-3, 1e7))
+def test_a_scale_bar_is_round_and_fits(wide_m: float) -> None:
+    length_m = scale_bar_m(wide_m)
+    assert wide_m / 12 < length_m <= wide_m / 4 * (1 + 1e-9)
+    assert f"{length_m:.0e}"[0] in "125"
+
+
+def test_equal_scenarios_give_equal_pictures_and_pages(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = tiny(users={"cluster_centres_m": [[450.0, 0.0]]})  # part of it is out of reach
+    (tmp_path / "own.toml").write_text(document.text(scenario), "utf-8")
+    for name, start in (("map.png", b"\x89PNG"), ("map.html", b"<!doctype html>")):
+        out = tmp_path / name
+        contents = []
+        for _ in range(2):
+            assert run(capsys, "draw", tmp_path / "own.toml", "--out", out) == (0, f"{out}\n", "")
+            contents.append(out.read_bytes())
+        assert contents[0] == contents[1]
+        assert contents[0].startswith(start)
+
+
+@pytest.mark.parametrize(("library", "out"), [("matplotlib", "map.png"), ("plotly", "map.html")])
+def test_drawing_names_the_library_that_is_missing(library: str, out: str, tmp_path: Path) -> None:
+    program = (
+        f"import sys; sys.modules[{library!r}] = None\n"
+        "from uav_dc_ros import scenario\n"
+        f"scenario.main(['draw', 'three_clusters', '--out', {out!r}])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert library in done.stderr
+    assert "pip install" in done.stderr
+    assert done.stderr.count("\n") == 1

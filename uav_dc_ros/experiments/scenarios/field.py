@@ -1,0 +1,216 @@
+"""Fields made from a few numbers: laid out evenly, or at random.
+
+What the numbers leave open is as in the shipped scenario `five_clusters`: layers, speed, channel and reward.
+The rest follows by rule:
+
+- A cell is about a tenth of the longer side, and the sides are whole cells.
+- `r_min_bits` takes a user of a cluster of K about as many steps as there: with K - 1 others as near as the
+  user, its SINR is 1 / (K - 1).
+- `d_cons_m` has whole discs in reach of a cell, and of the UAV above their centres in every layer, with room
+  for the way that a user walks.
+- `max_steps` is a fifth more than a tour without a limit takes (`flyable.steps_of_tour`).
+"""
+
+import itertools
+import math
+from typing import NamedTuple, TypeAlias
+
+import msgspec
+import numpy as np
+
+from uav_dc_ros import scenarios
+from uav_dc_ros.core.scenario import Scenario, from_values
+from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.experiments.scenarios import flyable
+
+SHIPPED = "five_clusters"
+CLUSTERS_MAX, USERS_MAX = 50, 1000  # clusters, and users of one
+SIDE_MIN_M, SIDE_MAX_M = 100.0, 100_000.0
+CELLS = 10  # along the longer side, about
+SPEED_MPS = 100.0 / 15.0
+COLLECT_STEPS = 2.6  # that a user needs
+DRIFT_STEPS = 4.5  # root mean square of a user's way after 60 steps, in steps at its maximum speed
+COLLECTED_MIN = 0.8  # share of the users that a tour of a random field collects
+RESERVE = 1.2  # times the steps of a tour
+RADIUS_CELLS = 1.2  # of a disc, if there is room
+RADIUS_MIN_CELLS = 0.2
+APART_RADII = 3.0  # between the centres of two discs
+DARTS = 100  # positions that are tried for a disc, before all discs become smaller
+TRIES = 20  # layouts that are tried for a seed
+
+Point: TypeAlias = tuple[float, float]
+
+
+class Layout(NamedTuple):
+    """Where everything is, metres."""
+
+    cell_m: float
+    n_cells: tuple[int, int]  # between the edges of the grid, east and north
+    centres_m: list[Point]
+    radius_m: float
+    start_m: Point
+    dock_m: Point
+
+
+def even(name: str, n_clusters: int, users_per_cluster: int, size_m: Point) -> Scenario:
+    """A field with its clusters in rows, a start in the south-west and a dock in the north-east.
+
+    Raises:
+        ParameterError: more clusters than the field has room for.
+    """
+    cell_m, (n_x, n_y) = cells = _cells(size_m)
+    wide_m, high_m = _metres(cell_m, n_x), _metres(cell_m, n_y)
+    n_rows = max(1, min(n_clusters, round(math.sqrt(n_clusters * high_m / wide_m))))
+    in_row = [n_clusters // n_rows + (row < n_clusters % n_rows) for row in range(n_rows)]
+    centres_m = [
+        (_metres(cell_m, (i + 0.5) / n * n_x), _metres(cell_m, (row + 0.5) / n_rows * n_y))
+        for row, n in enumerate(in_row)
+        for i in range(n)
+    ]
+    apart_m = min((math.dist(a, b) for a, b in itertools.combinations(centres_m, 2)), default=math.inf)
+    radius_m = round(min(RADIUS_CELLS * cell_m, apart_m / APART_RADII), 1)
+    if radius_m < RADIUS_MIN_CELLS * cell_m:
+        raise _too_many(n_clusters, size_m)
+    made = _complete(
+        name, users_per_cluster, 1.0, Layout(*cells, centres_m, radius_m, (0.0, 0.0), (wide_m, high_m))
+    )
+    if made is None:
+        raise ParameterError(
+            f"{users_per_cluster} users a cluster: a tour cannot collect them; expected fewer"
+        )
+    return made
+
+
+def at_random(
+    seed: int,
+    *,
+    name: str = "",
+    n_clusters: int | None = None,
+    users_per_cluster: int | None = None,
+    size_m: Point | None = None,
+) -> Scenario:
+    """The random field of a seed, named `random_SEED`; what is given is not drawn.
+
+    Drawn are 2 to 7 clusters of 4 to 15 users, sides of 600 to 1400 m, discs of 0.6 to 1.4 cells that do not
+    touch, users' speeds up to 1 m/s, and a start and a dock on the edge, far from one another.
+
+    Raises:
+        ParameterError: more clusters than the field has room for.
+    """
+    rng = np.random.default_rng(seed)
+    for _ in range(TRIES):
+        drawn_m = rng.integers(6, 15, 2) * 100.0
+        clusters, users = int(rng.integers(2, 8)), int(rng.integers(4, 16))
+        layout = _random_layout(rng, n_clusters or clusters, size_m or (float(drawn_m[0]), float(drawn_m[1])))
+        speed_mps = round(float(rng.uniform(0.0, 1.0)), 1)
+        made = _complete(name or f"random_{seed}", users_per_cluster or users, speed_mps, layout)
+        if made is None:
+            continue
+        found = flyable.examine(made)
+        if not found.problems and found.tour.collected >= COLLECTED_MIN * made.n_users:
+            return made
+    raise ParameterError(
+        f"seed {seed}, {n_clusters or 'any'} clusters, {users_per_cluster or 'any'} users a cluster: none of "
+        f"{TRIES} fields can be flown; expected fewer of them, or a larger field"
+    )
+
+
+def _random_layout(rng: np.random.Generator, n_clusters: int, size_m: Point) -> Layout:
+    cell_m, n_cells = _cells(size_m)
+    radius_m = round(float(rng.uniform(0.6, 1.4)) * cell_m, 1)
+    while (centres_m := _scattered(rng, n_clusters, cell_m, n_cells, radius_m)) is None:
+        radius_m = round(0.8 * radius_m, 1)
+        if radius_m < RADIUS_MIN_CELLS * cell_m:
+            raise _too_many(n_clusters, size_m)
+    n_x, n_y = n_cells
+    edge = np.asarray(
+        [(i, j) for i in range(n_x + 1) for j in range(n_y + 1) if i in (0, n_x) or j in (0, n_y)]
+    )
+    start = edge[rng.integers(len(edge))]
+    moves = np.abs(edge - start).sum(axis=1)
+    far = edge[moves >= 0.75 * moves.max()]
+    dock = far[rng.integers(len(far))]
+    start_m, dock_m = ((_metres(cell_m, int(x)), _metres(cell_m, int(y))) for x, y in (start, dock))
+    return Layout(cell_m, n_cells, centres_m, radius_m, start_m, dock_m)
+
+
+def _scattered(
+    rng: np.random.Generator, n: int, cell_m: float, n_cells: tuple[int, int], radius_m: float
+) -> list[Point] | None:
+    """Centres of discs that are within the grid and apart, in tenths of a cell; None: no room was found."""
+    margin = [min(math.ceil(10.0 * radius_m / cell_m), 5 * side) for side in n_cells]
+    centres_m: list[Point] = []
+    for _ in range(n):
+        for _ in range(DARTS):
+            x, y = (
+                int(rng.integers(low, 10 * side - low + 1)) for low, side in zip(margin, n_cells, strict=True)
+            )
+            here = _metres(cell_m, x / 10), _metres(cell_m, y / 10)
+            if all(math.dist(here, other) >= APART_RADII * radius_m for other in centres_m):
+                centres_m.append(here)
+                break
+        else:
+            return None
+    return centres_m
+
+
+def _complete(name: str, users_per_cluster: int, v_max_mps: float, layout: Layout) -> Scenario | None:
+    """The scenario of a layout; None: a tour cannot collect its users."""
+    values = msgspec.to_builtins(scenarios.load(SHIPPED))
+    grid, limits, radio = values["grid"], values["mission"], values["radio"]
+    cell_m, (n_x, n_y) = layout.cell_m, layout.n_cells
+    top_m = grid["altitude_min_m"] + (grid["n_z"] - 1) * grid["altitude_step_m"]
+    grid |= {"n_x": n_x + 1, "n_y": n_y + 1, "cell_m": cell_m}
+    step_s = round(cell_m / SPEED_MPS, 2)
+    step_bits = step_s * radio["bandwidth_hz"] * math.log2(1.0 + 1.0 / max(users_per_cluster - 1, 1))
+    r_min_bits = float(f"{COLLECT_STEPS * step_bits:.1e}")
+    limits |= {
+        "start_m": (*layout.start_m, top_m),
+        "dock_m": layout.dock_m,
+        "step_s": step_s,
+        "max_steps": 1_000_000,
+        "d_cons_m": 1e6,
+        "r_min_bits": r_min_bits,
+    }
+    values["users"] = {
+        "cluster_centres_m": layout.centres_m,
+        "users_per_cluster": users_per_cluster,
+        "cluster_radius_m": layout.radius_m,
+        "v_max_mps": v_max_mps,
+    }
+    values["reward"]["data_scale_bits"] = r_min_bits
+    draft = from_values(values | {"name": name}, name)
+    farthest_m = max(flyable.reach(draft, centre_m, layout.radius_m)[1] for centre_m in layout.centres_m)
+    low_m = grid["altitude_min_m"]
+    ground_m = math.sqrt(farthest_m**2 - low_m**2) + DRIFT_STEPS * v_max_mps * step_s
+    above_m = math.hypot(layout.radius_m, top_m)
+    limits["d_cons_m"] = 10.0 * math.ceil(max(math.hypot(ground_m, low_m), above_m) / 10.0)
+    steps = flyable.steps_of_tour(from_values(values | {"name": name}, name))
+    if steps is None:
+        return None
+    limits["max_steps"] = math.ceil(RESERVE * steps)
+    return from_values(values | {"name": name}, name)
+
+
+def _cells(size_m: Point) -> tuple[float, tuple[int, int]]:
+    """Length of a cell, and cells along each side: both sides as exact as possible, with about `CELLS`."""
+    choices = [round(max(size_m) / n, 1) for n in range(CELLS // 2, 2 * CELLS + 1)]
+
+    def cost(cell_m: float) -> float:
+        errors = [abs(side_m / cell_m - max(1, round(side_m / cell_m))) for side_m in size_m]
+        return max(errors) + 0.1 * abs(math.log(max(size_m) / cell_m / CELLS))
+
+    cell_m = min(choices, key=cost)
+    n_x, n_y = (max(1, round(side_m / cell_m)) for side_m in size_m)
+    return cell_m, (n_x, n_y)
+
+
+def _metres(cell_m: float, cells: float) -> float:
+    return round(cell_m * cells, 3)
+
+
+def _too_many(n_clusters: int, size_m: Point) -> ParameterError:
+    return ParameterError(
+        f"{n_clusters} clusters in {size_m[0]:g} x {size_m[1]:g} m; expected fewer, or a larger field: "
+        "their discs would touch"
+    )

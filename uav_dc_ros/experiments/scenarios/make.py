@@ -1,0 +1,100 @@
+"""The verbs `new` and `random`: files of scenarios to begin with."""
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from uav_dc_ros import cli, files, scenarios
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.experiments.scenarios import document, field, listing
+
+CLUSTERS, USERS, SIZE_M = 5, 10, (1000.0, 1000.0)  # those of the shipped field
+UNITS = "x is east, y is north, altitude is above the users. A key ends in its unit. Every key is checked."
+
+
+def add_new(parser: argparse.ArgumentParser) -> None:
+    """Options of `new`."""
+    _add_options(parser, f"{CLUSTERS} clusters of {USERS} users in {SIZE_M[0]:g} m")
+    parser.set_defaults(run=new)
+
+
+def add_random(parser: argparse.ArgumentParser) -> None:
+    """Options of `random`."""
+    seed = "equal seeds give equal files"
+    parser.add_argument("--seed", type=cli.whole_number(0), required=True, metavar="N", help=seed)
+    _add_options(parser, "drawn")
+    parser.set_defaults(run=random)
+
+
+def _add_options(parser: argparse.ArgumentParser, default: str) -> None:
+    add = parser.add_argument
+    add("file", type=Path, nargs="?", metavar="FILE", help="the new file (default: to standard output)")
+    clusters, users = f"1 to {field.CLUSTERS_MAX}", f"1 to {field.USERS_MAX}"
+    number = cli.whole_number(1, field.CLUSTERS_MAX, clusters)
+    add("--clusters", type=number, metavar="M", help=f"{clusters} clusters (default: {default})")
+    number = cli.whole_number(1, field.USERS_MAX, users)
+    add("--users", type=number, metavar="K", help=f"{users} users in each cluster (likewise)")
+    sides = f"sides in metres, {field.SIDE_MIN_M:g} to {field.SIDE_MAX_M:g}, east and north (likewise)"
+    add("--size", type=_size, metavar="SIDE|EASTxNORTH", help=sides)
+
+
+def new(options: argparse.Namespace) -> int:
+    """Write the shipped field under a new name or, with options, an even field; the exit status."""
+    name = _name(options.file) or "my_field"
+    if not _given(options):
+        shipped = scenarios.load(field.SHIPPED)
+        return _write(options, lambda: msgspec.structs.replace(shipped, name=name))
+    numbers = options.clusters or CLUSTERS, options.users or USERS, options.size or SIZE_M
+    return _write(options, lambda: field.even(name, *numbers))
+
+
+def random(options: argparse.Namespace) -> int:
+    """Write the random field of a seed; the exit status."""
+    sizes = {"n_clusters": options.clusters, "users_per_cluster": options.users, "size_m": options.size}
+    return _write(options, lambda: field.at_random(options.seed, name=_name(options.file), **sizes))
+
+
+def _write(options: argparse.Namespace, make: Callable[[], Scenario]) -> int:
+    path: Path | None = options.file
+    if path is not None:
+        if path.is_file() and files.is_replaced(path):
+            raise ParameterError(f"{path} exists; expected a new file")
+        files.check_writable(path)
+    scenario = make()
+    seed = f" --seed {options.seed}" if options.verb == "random" else ""
+    header = f"Made by: uav-dc scenario {options.verb}{seed}{_given(options)}\n{UNITS}"
+    text = document.text(scenario, header)
+    if path is None:
+        sys.stdout.write(text)
+    else:
+        files.write(path, text.encode())
+        print(f"{path}: {listing.description(scenario)}")
+    return 0
+
+
+def _given(options: argparse.Namespace) -> str:
+    """The options of a field's size that a command line has."""
+    size = options.size and "x".join(f"{side_m:g}" for side_m in options.size)
+    values = {"clusters": options.clusters, "users": options.users, "size": size}
+    return "".join(f" --{option} {value}" for option, value in values.items() if value)
+
+
+def _name(path: Path | None) -> str:
+    """The file's name as that of a scenario; empty where it has no letter."""
+    return re.sub(r"[^a-z0-9]+", "_", path.stem.lower()).lstrip("_0123456789")[:64] if path else ""
+
+
+def _size(text: str) -> tuple[float, float]:
+    """The type of `--size`: one number, or two with an x between."""
+    expected = f"metres from {field.SIDE_MIN_M:g} to {field.SIDE_MAX_M:g}, such as 800 or 1500x800"
+    side = cli.number(field.SIDE_MIN_M, field.SIDE_MAX_M, expected)
+    try:
+        east_m, *north_m = map(side, text.split("x", 1))
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}") from None
+    return east_m, north_m[0] if north_m else east_m
