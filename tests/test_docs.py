@@ -142,7 +142,7 @@ def helps() -> Iterator[tuple[str, list[str]]]:
         yield module, ["--help"]
     for verb in bag.VERBS:
         yield "bag", [verb, "--help"]
-    for verb in ("list", "show", "new", "random", "check", "draw"):
+    for verb in ("list", "show", "new", "random", "import", "check", "draw"):
         yield "scenario", [verb, "--help"]
 
 

@@ -27,6 +27,7 @@ def parser() -> cli.Parser:
     shown.set_defaults(run=listing.show)
     make.add_new(verb("new", "write a scenario with a comment for each key"))
     make.add_random(verb("random", "write a scenario of a random field that can be flown"))
+    make.add_import(verb("import", "write a scenario around the users of a file"))
     check.add_options(verb("check", "check that a scenario can be flown, and list the policies that fit"))
     draw.add_options(verb("draw", "draw a scenario: users, what is in reach, and rates"))
     return options

@@ -293,6 +293,68 @@ def test_users_of_a_file_are_checked_and_drawn(tmp_path: Path, capsys: pytest.Ca
     assert parse(document.text(listed), "") == listed
 
 
+def csv_of_users(degrees: bool) -> str:
+    """Thirty users: four clusters of six, and six alone."""
+    rng = np.random.default_rng(4)
+    rows = [("name", "latitude", "longitude") if degrees else ("name", "y_m", "x_m")]
+    for i in range(30):
+        north, east = rng.random(2) if i >= 24 else 0.1 + 0.2 * (i % 4) + 0.05 * rng.random(2)
+        at = (47.39 + 0.008 * north, 8.53 + 0.012 * east) if degrees else (900.0 * north, 900.0 * east)
+        rows.append((f"u{i}", *(f"{value:.6f}" for value in at)))
+    clusters = ["cluster", *(f"c{i % 4}" if i < 24 else "" for i in range(30))]
+    return "".join(f"{','.join(row)},{cluster}\n" for row, cluster in zip(rows, clusters, strict=True))
+
+
+@pytest.mark.parametrize("degrees", [True, False], ids=["degrees", "metres"])
+def test_a_field_around_the_users_of_a_file(
+    degrees: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    users, path = tmp_path / "data" / "users.csv", tmp_path / "own.toml"
+    users.parent.mkdir()
+    users.write_text(csv_of_users(degrees), "utf-8")
+    status, out, err = run(capsys, "import", users, "--out", path)
+    assert (status, err) == (0, "")
+    assert out.startswith(f"{path}: 30 users in 10 clusters, ")
+    text = path.read_text("utf-8")
+    assert 'file = "data/users.csv"' in text
+    scenario = scenarios.load(path)
+    assert (scenario.datum_deg is not None) is degrees
+    centres_m = np.asarray(scenario.user_centres_m)
+    assert centres_m.min() >= 0.0
+    assert centres_m.min() < 2.0 or not degrees, "the grid begins where the users do"
+    assert flyable.examine(scenario).problems == ()
+    assert run(capsys, "check", path)[0] == 0
+    missions = roll_out(scenario, PLANNERS["tour"](scenario), range(2))
+    assert missions.landed.all()
+    assert missions.users_collected.mean() >= 27.0
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("x_m,y_m\n-5,3\n", "x_m from -5 to -5; expected 0 to 100000 m from the west edge"),
+        ("x_m,y_m\n5,3e6\n", "y_m from 3e+06 to 3e+06; expected 0 to 100000 m from the south edge"),
+        (
+            "x_m,y_m,data_bits\n5,3,1e12\n",
+            "a tour cannot collect these users; expected fewer, or less data_bits",
+        ),
+        ("latitude,longitude\n47,8\n-47,8\n", "y_m from "),
+        ("x_m\n5\n", "line 1: no column y_m; expected x_m and y_m, or latitude and longitude"),
+        ("", "no header; expected the columns x_m and y_m"),
+    ],
+)
+def test_users_around_which_there_is_no_field(
+    content: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    users = tmp_path / "users.csv"
+    users.write_text(content, "utf-8")
+    status, out, err = run(capsys, "import", users, "--out", tmp_path / "own.toml")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert f"{users}" in err
+    assert expected in err
+    assert not (tmp_path / "own.toml").exists()
+
+
 def test_a_check_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys, "check", "three_clusters", "--json")
     found = json.loads(out)

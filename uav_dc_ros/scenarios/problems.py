@@ -43,7 +43,7 @@ class Problem(NamedTuple):
 def find(text: str, folder: Path) -> tuple[Scenario | None, list[Problem]]:
     """The scenario in a text; or None, and the first `PROBLEMS_MAX` problems in the order of their lines.
 
-    A file of users is relative to `folder`.
+    Files that it names are relative to `folder`.
     """
     try:
         return core.from_values(with_users(core.read_values(text, ""), folder, ""), ""), []
@@ -77,6 +77,7 @@ def _problems(text: str, folder: Path) -> Iterator[Problem]:
     except ScenarioError as error:
         yield Problem(lines.of(("users", "file")), _text(error))
         del values["users"]["file"]
+        hidden.append(("users",))
         fit = False
     while True:
         try:

@@ -63,16 +63,7 @@ def read(path: Path, datum: Datum | None) -> list[dict[str, Any]]:
         ScenarioError: a file that cannot be read or has no users; a column, a number or a position that is
             not as expected.
     """
-    try:
-        text = path.read_text("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: cannot be read: {error}") from None
-    is_csv = path.suffix.lower() == ".csv"
-    if not is_csv and path.suffix.lower() not in (".geojson", ".json"):
-        raise ScenarioError(f"{path}: a file of users; expected a name that ends in .csv, .geojson or .json")
-    rows = list(_csv_rows(text, path) if is_csv else _geojson_rows(text, path))
-    if not rows:
-        raise ScenarioError(f"{path}: no users; expected at least one")
+    rows = _rows(path)
     if DEGREES[0] in rows[0].values:
         rows = list(_in_metres(rows, datum, path))
     for row in rows:
@@ -83,6 +74,26 @@ def read(path: Path, datum: Datum | None) -> list[dict[str, Any]]:
             value, expected = row.values.get(key), expected.removeprefix("Expected ").replace(" | null", "")
             raise ScenarioError(f"{row.where}: {key} = {value!r}; expected {expected}") from None
     return [row.values for row in rows]
+
+
+def corner_deg(path: Path) -> Datum | None:
+    """South-west corner of the positions in a file with degrees; None: it has metres. Raises as `read`."""
+    at = [[row.values[name] for name in DEGREES] for row in _rows(path) if DEGREES[0] in row.values]
+    return (min(one[0] for one in at), min(one[1] for one in at)) if at else None
+
+
+def _rows(path: Path) -> list[_Row]:
+    try:
+        text = path.read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+    is_csv = path.suffix.lower() == ".csv"
+    if not is_csv and path.suffix.lower() not in (".geojson", ".json"):
+        raise ScenarioError(f"{path}: a file of users; expected a name that ends in .csv, .geojson or .json")
+    rows = list(_csv_rows(text, path) if is_csv else _geojson_rows(text, path))
+    if not rows:
+        raise ScenarioError(f"{path}: no users; expected at least one")
+    return rows
 
 
 def _csv_rows(text: str, path: Path) -> Iterator[_Row]:

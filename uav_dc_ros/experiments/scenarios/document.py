@@ -19,7 +19,9 @@ COMMENTS = {
     "grid.cell_m": "from cell to cell",
     "grid.altitude_min_m": "of the lowest layer, above the users",
     "grid.altitude_step_m": "from layer to layer",
-    "users": "The users on the ground: each cluster is a disc of them.",
+    "datum_deg": "latitude and longitude of x = 0, y = 0 on WGS 84",
+    "users": "The users on the ground, see docs/users.md.",
+    "users.file": "relative to this file",
     "users.cluster_centres_m": "x, y of each",
     "users.users_per_cluster": "in each cluster",
     "users.cluster_radius_m": "of the disc in which they start",
@@ -62,10 +64,17 @@ ENERGY = """
 """
 
 
-def text(scenario: Scenario, header: str = "") -> str:
-    """The file's text, which `scenario.parse` reads as the same scenario; `header` is its first comment."""
+def text(scenario: Scenario, header: str = "", users_file: str | None = None) -> str:
+    """The file's text, which `scenario.parse` reads as the same scenario; `header` is its first comment.
+
+    With `users_file` the text names that file instead of the list of users in it.
+    """
+    values = msgspec.to_builtins(scenario)
+    if users_file is not None:
+        others = {key: value for key, value in values["users"].items() if key != "user"}
+        values["users"] = {"file": users_file, **others}
     lines = [*(f"# {line}".rstrip() for line in header.splitlines()), *([""] if header else [])]
-    lines += _table(msgspec.to_builtins(scenario), ())
+    lines += _table(values, ())
     return "\n".join(lines) + "\n" + ("" if scenario.energy else ENERGY)
 
 

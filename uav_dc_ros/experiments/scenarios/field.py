@@ -13,7 +13,7 @@ The rest follows by rule:
 
 import itertools
 import math
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -42,12 +42,10 @@ Point: TypeAlias = tuple[float, float]
 
 
 class Layout(NamedTuple):
-    """Where everything is, metres."""
+    """The grid, and where a mission starts and ends, metres."""
 
     cell_m: float
     n_cells: tuple[int, int]  # between the edges of the grid, east and north
-    centres_m: list[Point]
-    radius_m: float
     start_m: Point
     dock_m: Point
 
@@ -71,9 +69,8 @@ def even(name: str, n_clusters: int, users_per_cluster: int, size_m: Point) -> S
     radius_m = round(min(RADIUS_CELLS * cell_m, apart_m / APART_RADII), 1)
     if radius_m < RADIUS_MIN_CELLS * cell_m:
         raise _too_many(n_clusters, size_m)
-    made = _complete(
-        name, users_per_cluster, 1.0, Layout(*cells, centres_m, radius_m, (0.0, 0.0), (wide_m, high_m))
-    )
+    users = _clusters(centres_m, users_per_cluster, radius_m, 1.0)
+    made = _complete(name, users, Layout(*cells, (0.0, 0.0), (wide_m, high_m)))
     if made is None:
         raise ParameterError(
             f"{users_per_cluster} users a cluster: a tour cannot collect them; expected fewer"
@@ -101,9 +98,18 @@ def at_random(
     for _ in range(TRIES):
         drawn_m = rng.integers(6, 15, 2) * 100.0
         clusters, users = int(rng.integers(2, 8)), int(rng.integers(4, 16))
-        layout = _random_layout(rng, n_clusters or clusters, size_m or (float(drawn_m[0]), float(drawn_m[1])))
+        sides_m = size_m or (float(drawn_m[0]), float(drawn_m[1]))
+        cell_m, n_cells = _cells(sides_m)
+        radius_m = round(float(rng.uniform(0.6, 1.4)) * cell_m, 1)
+        n = n_clusters or clusters
+        while (centres_m := _scattered(rng, n, cell_m, n_cells, radius_m)) is None:
+            radius_m = round(0.8 * radius_m, 1)
+            if radius_m < RADIUS_MIN_CELLS * cell_m:
+                raise _too_many(n, sides_m)
         speed_mps = round(float(rng.uniform(0.0, 1.0)), 1)
-        made = _complete(name or f"random_{seed}", users_per_cluster or users, speed_mps, layout)
+        table = _clusters(centres_m, users_per_cluster or users, radius_m, speed_mps)
+        start_m, dock_m = _far_apart(rng, cell_m, n_cells)
+        made = _complete(name or f"random_{seed}", table, Layout(cell_m, n_cells, start_m, dock_m))
         if made is None:
             continue
         found = flyable.examine(made)
@@ -115,13 +121,18 @@ def at_random(
     )
 
 
-def _random_layout(rng: np.random.Generator, n_clusters: int, size_m: Point) -> Layout:
-    cell_m, n_cells = _cells(size_m)
-    radius_m = round(float(rng.uniform(0.6, 1.4)) * cell_m, 1)
-    while (centres_m := _scattered(rng, n_clusters, cell_m, n_cells, radius_m)) is None:
-        radius_m = round(0.8 * radius_m, 1)
-        if radius_m < RADIUS_MIN_CELLS * cell_m:
-            raise _too_many(n_clusters, size_m)
+def _clusters(centres_m: list[Point], users: int, radius_m: float, v_max_mps: float) -> dict[str, Any]:
+    """A table `users` of equal clusters."""
+    return {
+        "cluster_centres_m": centres_m,
+        "users_per_cluster": users,
+        "cluster_radius_m": radius_m,
+        "v_max_mps": v_max_mps,
+    }
+
+
+def _far_apart(rng: np.random.Generator, cell_m: float, n_cells: tuple[int, int]) -> tuple[Point, Point]:
+    """A start and a dock on the edge of the grid, metres."""
     n_x, n_y = n_cells
     edge = np.asarray(
         [(i, j) for i in range(n_x + 1) for j in range(n_y + 1) if i in (0, n_x) or j in (0, n_y)]
@@ -129,9 +140,11 @@ def _random_layout(rng: np.random.Generator, n_clusters: int, size_m: Point) -> 
     start = edge[rng.integers(len(edge))]
     moves = np.abs(edge - start).sum(axis=1)
     far = edge[moves >= 0.75 * moves.max()]
-    dock = far[rng.integers(len(far))]
-    start_m, dock_m = ((_metres(cell_m, int(x)), _metres(cell_m, int(y))) for x, y in (start, dock))
-    return Layout(cell_m, n_cells, centres_m, radius_m, start_m, dock_m)
+    (start_x, start_y), (dock_x, dock_y) = start.tolist(), far[rng.integers(len(far))].tolist()
+    return (
+        (_metres(cell_m, start_x), _metres(cell_m, start_y)),
+        (_metres(cell_m, dock_x), _metres(cell_m, dock_y)),
+    )
 
 
 def _scattered(
@@ -154,42 +167,59 @@ def _scattered(
     return centres_m
 
 
-def _complete(name: str, users_per_cluster: int, v_max_mps: float, layout: Layout) -> Scenario | None:
-    """The scenario of a layout; None: a tour cannot collect its users."""
-    values = msgspec.to_builtins(scenarios.load(SHIPPED))
+def around(name: str, users: list[dict[str, Any]], datum_deg: Point | None) -> Scenario:
+    """A field around users that stay where they are: plain values of `core.users.settings.User`.
+
+    The grid begins at x = 0, y = 0, where the mission starts, and the dock is at its opposite corner.
+
+    Raises:
+        ParameterError: users west or south of the grid's corner, or too far apart; users that a tour cannot
+            collect.
+    """
+    for key, side in (("x_m", "west"), ("y_m", "south")):
+        low_m, high_m = min(user[key] for user in users), max(user[key] for user in users)
+        if low_m < 0.0 or high_m > SIDE_MAX_M:
+            raise ParameterError(
+                f"{key} from {low_m:g} to {high_m:g}; expected 0 to {SIDE_MAX_M:g} m from the {side} edge"
+            )
+    size_m = [max(SIDE_MIN_M, *(user[key] for user in users)) for key in ("x_m", "y_m")]
+    cell_m, (n_x, n_y) = _cells((size_m[0], size_m[1]))
+    layout = Layout(cell_m, (n_x, n_y), (0.0, 0.0), (_metres(cell_m, n_x), _metres(cell_m, n_y)))
+    table = {"user": users, "mobility": {"model": "static"}}
+    made = _complete(name, table, layout, {"datum_deg": datum_deg} if datum_deg else {})
+    if made is None:
+        raise ParameterError("a tour cannot collect these users; expected fewer, or less data_bits of each")
+    return made
+
+
+def _complete(
+    name: str, users: dict[str, Any], layout: Layout, more: dict[str, Any] | None = None
+) -> Scenario | None:
+    """The scenario of a table `users` in a layout; None: a tour cannot collect its users."""
+    values = msgspec.to_builtins(scenarios.load(SHIPPED)) | {"name": name, "users": users} | (more or {})
     grid, limits, radio = values["grid"], values["mission"], values["radio"]
     cell_m, (n_x, n_y) = layout.cell_m, layout.n_cells
-    top_m = grid["altitude_min_m"] + (grid["n_z"] - 1) * grid["altitude_step_m"]
+    low_m = grid["altitude_min_m"]
+    top_m = low_m + (grid["n_z"] - 1) * grid["altitude_step_m"]
     grid |= {"n_x": n_x + 1, "n_y": n_y + 1, "cell_m": cell_m}
     step_s = round(cell_m / SPEED_MPS, 2)
-    step_bits = step_s * radio["bandwidth_hz"] * math.log2(1.0 + 1.0 / max(users_per_cluster - 1, 1))
+    limits |= {"start_m": (*layout.start_m, top_m), "dock_m": layout.dock_m, "step_s": step_s}
+    limits |= {"max_steps": 1_000_000, "d_cons_m": 1e6}
+    placed = from_values(values, name).users
+    step_bits = step_s * radio["bandwidth_hz"] * math.log2(1.0 + 1.0 / max(max(placed.sizes) - 1, 1))
     r_min_bits = float(f"{COLLECT_STEPS * step_bits:.1e}")
-    limits |= {
-        "start_m": (*layout.start_m, top_m),
-        "dock_m": layout.dock_m,
-        "step_s": step_s,
-        "max_steps": 1_000_000,
-        "d_cons_m": 1e6,
-        "r_min_bits": r_min_bits,
-    }
-    values["users"] = {
-        "cluster_centres_m": layout.centres_m,
-        "users_per_cluster": users_per_cluster,
-        "cluster_radius_m": layout.radius_m,
-        "v_max_mps": v_max_mps,
-    }
-    values["reward"]["data_scale_bits"] = r_min_bits
-    draft = from_values(values | {"name": name}, name)
-    farthest_m = max(flyable.reach(draft, centre_m, layout.radius_m)[1] for centre_m in layout.centres_m)
-    low_m = grid["altitude_min_m"]
-    ground_m = math.sqrt(farthest_m**2 - low_m**2) + DRIFT_STEPS * v_max_mps * step_s
-    above_m = math.hypot(layout.radius_m, top_m)
+    limits["r_min_bits"] = values["reward"]["data_scale_bits"] = r_min_bits
+    draft = from_values(values, name)
+    discs = list(placed.start_discs())
+    farthest_m = max(flyable.reach(draft, disc.centre_m, disc.radius_m)[1] for disc in discs)
+    ground_m = math.sqrt(farthest_m**2 - low_m**2) + DRIFT_STEPS * (placed.v_max_mps or 0.0) * step_s
+    above_m = math.hypot(max(disc.radius_m for disc in discs), top_m)
     limits["d_cons_m"] = 10.0 * math.ceil(max(math.hypot(ground_m, low_m), above_m) / 10.0)
-    steps = flyable.steps_of_tour(from_values(values | {"name": name}, name))
+    steps = flyable.steps_of_tour(from_values(values, name))
     if steps is None:
         return None
     limits["max_steps"] = math.ceil(RESERVE * steps)
-    return from_values(values | {"name": name}, name)
+    return from_values(values, name)
 
 
 def _cells(size_m: Point) -> tuple[float, tuple[int, int]]:

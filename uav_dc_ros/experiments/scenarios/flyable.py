@@ -21,7 +21,7 @@ from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
 SEEDS = range(10)
 DISC_POINTS = 500  # of a disc, of equal area each
 EDGE_POINTS = 72
-HOVERS_MAX = 20  # steps over each cluster after which a tour without a limit goes home
+HOVERS_MAX = 20  # steps for each cluster, beside the way, after which a tour without a limit ends
 
 
 Point: TypeAlias = tuple[float, float]
@@ -147,23 +147,21 @@ def by_cluster(scenario: Scenario, collected: Array) -> Array:
 def steps_of_tour(scenario: Scenario, seeds: Sequence[int] = SEEDS) -> float | None:
     """Steps of a tour that has no limit: it stays until `planners.ENOUGH` of each cluster is collected.
 
-    The mean over missions of the step at which it is home; None: not all of a cluster can be collected.
+    The mean step at which it is home, over the missions that collect so much; None: fewer than half do.
     """
     grid = scenario.grid
     longest = (grid.n_x + grid.n_y + HOVERS_MAX) * (scenario.n_clusters + 1) + grid.n_z
     limits = msgspec.structs.replace(scenario.mission, max_steps=longest, episode_end="at_time_limit")
     free = msgspec.structs.replace(scenario, mission=limits, energy=None)
-
     enough = planners.ENOUGH * np.asarray(scenario.users.sizes)
 
     def is_home(state: world.State) -> bool:
-        docked = mission.at_dock(state.cell, scenario.dock_cell)
-        served = by_cluster(free, state.collected) >= enough
-        return bool((docked & served.all(axis=-1)).all())
+        served = (by_cluster(free, state.collected) >= enough).all(axis=-1)
+        return bool((served & mission.at_dock(state.cell, scenario.dock_cell)).all())
 
     flown = fly(free, planners.tour(free), seeds, until=is_home)
-    steps = float(flown.docked_step.mean())
-    return None if math.isnan(steps) or steps > longest - HOVERS_MAX else steps
+    complete = (flown.collected >= enough).all(axis=-1)
+    return float(flown.docked_step[complete].mean()) if 2 * complete.sum() >= len(seeds) else None
 
 
 def reach(scenario: Scenario, centre_m: Point, radius_m: float) -> tuple[float, float]:

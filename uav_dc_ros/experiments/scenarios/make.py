@@ -1,6 +1,8 @@
-"""The verbs `new` and `random`: files of scenarios to begin with."""
+"""The verbs `new`, `random` and `import`: files of scenarios to begin with."""
 
 import argparse
+import math
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.experiments.scenarios import document, field, listing
+from uav_dc_ros.scenarios import user_files
 
 CLUSTERS, USERS, SIZE_M = 5, 10, (1000.0, 1000.0)  # those of the shipped field
 UNITS = "x is east, y is north, altitude is above the users. A key ends in its unit. Every key is checked."
@@ -31,6 +34,15 @@ def add_random(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=random)
 
 
+def add_import(parser: argparse.ArgumentParser) -> None:
+    """Options of `import`."""
+    users = "a CSV or GeoJSON file of users, see docs/users.md"
+    parser.add_argument("users", type=Path, metavar="USERS", help=users)
+    out = "the new file, which names the file of users relative to itself"
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", dest="file", help=out)
+    parser.set_defaults(run=import_users)
+
+
 def _add_options(parser: argparse.ArgumentParser, default: str) -> None:
     add = parser.add_argument
     add("file", type=Path, nargs="?", metavar="FILE", help="the new file (default: to standard output)")
@@ -48,27 +60,48 @@ def new(options: argparse.Namespace) -> int:
     name = _name(options.file) or "my_field"
     if not _given(options):
         shipped = scenarios.load(field.SHIPPED)
-        return _write(options, lambda: msgspec.structs.replace(shipped, name=name))
+        return _write(options, lambda: msgspec.structs.replace(shipped, name=name), "")
     numbers = options.clusters or CLUSTERS, options.users or USERS, options.size or SIZE_M
-    return _write(options, lambda: field.even(name, *numbers))
+    return _write(options, lambda: field.even(name, *numbers), _given(options))
 
 
 def random(options: argparse.Namespace) -> int:
     """Write the random field of a seed; the exit status."""
     sizes = {"n_clusters": options.clusters, "users_per_cluster": options.users, "size_m": options.size}
-    return _write(options, lambda: field.at_random(options.seed, name=_name(options.file), **sizes))
+    given = f" --seed {options.seed}{_given(options)}"
+    return _write(options, lambda: field.at_random(options.seed, name=_name(options.file), **sizes), given)
 
 
-def _write(options: argparse.Namespace, make: Callable[[], Scenario]) -> int:
+def import_users(options: argparse.Namespace) -> int:
+    """Write a field around the users of a file; the exit status."""
+    users: Path = options.users
+    if not str(users).isprintable():  # it becomes text of the file
+        raise ParameterError(f"{str(users)!r}; expected a name of printable characters")
+
+    def make() -> Scenario:
+        corner = user_files.corner_deg(users)
+        # Rounded down by a metre at most, so that no user is west or south of it.
+        datum = corner and (math.floor(corner[0] * 1e5) / 1e5, math.floor(corner[1] * 1e5) / 1e5)
+        try:
+            return field.around(_name(options.file) or "my_field", user_files.read(users, datum), datum)
+        except ParameterError as error:
+            raise ParameterError(f"{users}: {error}") from None
+
+    folder = options.file.absolute().parent
+    return _write(options, make, f" {users}", os.path.relpath(users.absolute(), folder))
+
+
+def _write(
+    options: argparse.Namespace, make: Callable[[], Scenario], given: str, users_file: str | None = None
+) -> int:
     path: Path | None = options.file
     if path is not None:
         if path.is_file() and files.is_replaced(path):
             raise ParameterError(f"{path} exists; expected a new file")
         files.check_writable(path)
     scenario = make()
-    seed = f" --seed {options.seed}" if options.verb == "random" else ""
-    header = f"Made by: uav-dc scenario {options.verb}{seed}{_given(options)}\n{UNITS}"
-    text = document.text(scenario, header)
+    header = f"Made by: uav-dc scenario {options.verb}{given}\n{UNITS}"
+    text = document.text(scenario, header, users_file)
     if path is None:
         sys.stdout.write(text)
     else:
