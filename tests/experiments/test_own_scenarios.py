@@ -17,7 +17,8 @@ from tests.support.worlds import changed, tiny
 from uav_dc_ros import scenario as command
 from uav_dc_ros import scenarios
 from uav_dc_ros.core import world
-from uav_dc_ros.core.scenario import Scenario, leaves, parse, read_values
+from uav_dc_ros.core.keys import leaves
+from uav_dc_ros.core.scenario import Scenario, parse, read_values
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.experiments.scenarios import document, field, flyable

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core.scenario import leaves, parse, path_of, read_values
+from uav_dc_ros.core.keys import leaves, path_of
+from uav_dc_ros.core.scenario import parse, read_values
 from uav_dc_ros.errors import ScenarioError
 from uav_dc_ros.scenarios import problems
 from uav_dc_ros.scenarios.lines import Lines

@@ -23,6 +23,7 @@ from uav_dc_ros.core.arrays import Array, constant
 from uav_dc_ros.core.channel import AERIAL, AERIAL_MAX_HEIGHT_M, AerialVehicle, FreeSpace, Radio
 from uav_dc_ros.core.energy import EnergySettings, StepEnergies
 from uav_dc_ros.core.grid import Grid
+from uav_dc_ros.core.keys import leaves, path_of
 from uav_dc_ros.core.mobility import RandomWalk
 from uav_dc_ros.core.obstacles import Buildings, Moves, Obstacle, moves_to_dock, problems
 from uav_dc_ros.core.pace import TIME_MAX_S
@@ -241,13 +242,6 @@ def with_types(values: dict[str, Any], source: str) -> Scenario:
     return scenario
 
 
-def path_of(text: str) -> tuple[str | int, ...]:
-    """Names and indices of the key that an error begins with: `missing key ...`, `grid.n_x = ...`."""
-    key = re.match(r"[\w.\[\]]*", re.sub("^missing (key|table) ", "", text))
-    assert key is not None, "the pattern matches any text"
-    return tuple(int(part) if part.isdecimal() else part for part in re.findall(r"\w+", key[0]))
-
-
 def with_radio_model(values: Any) -> Any:
     """Plain values of a scenario with `radio.model`; those of version 0.2.0 lack it: free space."""
     if isinstance(values, dict) and isinstance(radio := values.get("radio"), dict):
@@ -324,19 +318,6 @@ def _explain(message: str, values: Any) -> str:
     expected = expected.replace("`", "").removeprefix("Expected ").replace("object", "table")
     expected = expected.replace(" | null", "")  # what TOML does not have
     return f"{path or 'scenario'} = {reprlib.repr(values)}; expected {expected}"
-
-
-def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Key and value of every leaf of nested dicts and lists; a list yields its length first."""
-    if isinstance(value, dict):
-        for name, entry in value.items():
-            yield from leaves(entry, f"{key}.{name}" if key else name)
-    elif isinstance(value, list | tuple):
-        yield f"the number of {key}", len(value)
-        for i, entry in enumerate(value):
-            yield from leaves(entry, f"{key}[{i}]")
-    else:
-        yield key, value
 
 
 def inconsistencies(scenario: Scenario) -> Iterator[str]:

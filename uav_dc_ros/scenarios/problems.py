@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias, get_args, get_origin, 
 import msgspec
 
 from uav_dc_ros.core import scenario as core
+from uav_dc_ros.core.keys import path_of
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ScenarioError, UnknownKeyError
 from uav_dc_ros.scenarios.lines import Lines
@@ -99,7 +100,7 @@ def _problems(text: str, folder: Path) -> Iterator[Problem]:
             return
     if fit:
         for problem in core.inconsistencies(scenario):
-            yield Problem(line_of(lines, core.path_of(problem)), problem)
+            yield Problem(line_of(lines, path_of(problem)), problem)
 
 
 def _text(error: ScenarioError) -> str:

@@ -15,7 +15,8 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.scenario import Scenario, from_values, leaves
+from uav_dc_ros.core.keys import leaves
+from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import ScenarioError
 
 MISSING = "users.missing"  # the share of the users that sends nothing: no key of a scenario

@@ -9,7 +9,8 @@ import msgspec
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.core.scenario import Scenario, path_of
+from uav_dc_ros.core.keys import path_of
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import PolicyError
 from uav_dc_ros.experiments.scenarios import flyable, listing
 from uav_dc_ros.experiments.scenarios.flyable import Flyable

@@ -8,7 +8,8 @@ import safetensors.torch
 from safetensors import SafetensorError, safe_open
 
 from uav_dc_ros import files
-from uav_dc_ros.core.scenario import leaves, with_radio_model
+from uav_dc_ros.core.keys import leaves
+from uav_dc_ros.core.scenario import with_radio_model
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train.population import Population
 from uav_dc_ros.experiments.train.training import Training
