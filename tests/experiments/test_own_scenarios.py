@@ -330,6 +330,76 @@ def test_a_field_around_the_users_of_a_file(
     assert missions.users_collected.mean() >= 27.0
 
 
+TOWER = {"polygon_m": [[-40.0, -40.0], [60.0, -40.0], [60.0, 60.0], [-40.0, 60.0]], "height_m": 120.0}
+ZONE = {
+    "kind": "no_fly",
+    "name": "school",
+    "polygon_m": [[350.0, 0.0], [450.0, 0.0], [450.0, 400.0], [350.0, 400.0]],
+}
+
+
+def test_a_field_among_obstacles_is_checked_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    users = [{"x_m": 100.0 * i + 90.0, "y_m": 60.0 * i} for i in range(10)]
+    scenario = field.around("town", users, None, [TOWER, ZONE])
+    assert scenario.mission.start_m[:2] != (0.0, 0.0), "the tower stands there"
+    found = flyable.examine(scenario)
+    assert found.problems == ()
+    missions = roll_out(scenario, PLANNERS["tour"](scenario), range(2))
+    assert missions.landed.all()
+    ground_m = np.asarray([[0.0, 0.0], [400.0, 300.0]])
+    near_m = flyable.nearest_cells_m(scenario, ground_m)
+    assert scenario.moves is not None
+    cells = [scenario.grid.cell_at(tuple(one)) for one in near_m]
+    assert all(cell is not None and scenario.moves.free[cell] for cell in cells)
+    rates = rate_map(scenario)
+    assert [int(np.isnan(layer.sum_rate_bps).sum()) for layer in rates.layers] == [
+        int((~scenario.moves.free[..., up]).sum()) for up in range(3)
+    ]
+    path = tmp_path / "town.toml"
+    path.write_text(document.text(scenario), "utf-8")
+    assert scenarios.load(path) == scenario
+    assert run(capsys, "check", path)[0] == 0
+    for name in ("map.png", "map.html"):
+        assert run(capsys, "draw", path, "--out", tmp_path / name)[0] == 0
+
+
+def ring(latitude: float, longitude: float, side: float) -> list[list[float]]:
+    """A closed square of a GeoJSON polygon."""
+    corners = ((0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0))
+    return [[longitude + east, latitude + north] for east, north in corners]
+
+
+def test_a_field_among_zones_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    users, zones, path = tmp_path / "users.csv", tmp_path / "zones.geojson", tmp_path / "own.toml"
+    users.write_text(csv_of_users(degrees=True), "utf-8")
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"name": name},
+            "geometry": {"type": "Polygon", "coordinates": [at]},
+        }
+        for name, at in (("school", ring(47.392, 8.534, 0.0008)), ("farm", ring(47.395, 8.537, 0.001)))
+    ]
+    zones.write_text(json.dumps({"type": "FeatureCollection", "features": features}), "utf-8")
+    status, _, err = run(capsys, "import", users, "--zones", zones, "--out", path)
+    assert (status, err) == (0, "")
+    text = path.read_text("utf-8")
+    assert 'zones = "zones.geojson"' in text
+    scenario = scenarios.load(path)
+    assert [one.name for one in scenario.obstacles] == ["school", "farm"]
+    assert run(capsys, "check", path)[0] == 0
+    # An error of the zones has the line of their file's name, beside other problems.
+    features[1]["geometry"]["coordinates"] = [ring(47.395, 8.537, 0.0)]  # type: ignore[index]
+    zones.write_text(json.dumps({"type": "FeatureCollection", "features": features}), "utf-8")
+    path.write_text(text.replace("beta = 1.0", "beta = -1.0"), "utf-8")
+    status, _, err = run(capsys, "check", path)
+    assert status == 2
+    assert f"{path}:{line_of(text, 'beta = ')}: reward.beta = -1.0" in err
+    assert f"{path}:{line_of(text, 'zones = ')}: " in err
+
+
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
@@ -337,7 +407,7 @@ def test_a_field_around_the_users_of_a_file(
         ("x_m,y_m\n5,3e6\n", "y_m from 3e+06 to 3e+06; expected 0 to 100000 m from the south edge"),
         (
             "x_m,y_m,data_bits\n5,3,1e12\n",
-            "a tour cannot collect these users; expected fewer, or less data_bits",
+            "a tour cannot collect these users; expected fewer, less data_bits",
         ),
         ("latitude,longitude\n47,8\n-47,8\n", "y_m from "),
         ("x_m\n5\n", "line 1: no column y_m; expected x_m and y_m, or latitude and longitude"),

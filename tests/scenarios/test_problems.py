@@ -133,6 +133,22 @@ def test_problems_that_do_not_depend_on_one_another_come_together() -> None:
     ]
 
 
+def test_problems_of_obstacles_have_the_lines_of_theirs() -> None:
+    first = "[[obstacles]]\nheight_m = 50.0\npolygon_m = [[300.0, 300.0], [400.0, 300.0], [400.0, 400.0]]\n"
+    second = "[[obstacles]]\nkind = 'tree'\nheight_m = -1\nbase = 3\npolygon_m = [[1.0, 2.0]]\n"
+    start = TEXT.count("\n") + 1
+    assert lines_of(TEXT + first + second) == [
+        (start + 4, "obstacles[1].kind"),
+        (start + 5, "obstacles[1].height_m"),
+        (start + 6, "unknown key obstacles[1].base"),
+        (start + 7, "obstacles[1].polygon_m"),
+    ]
+    crossing = first.replace("[400.0, 400.0]]", "[400.0, 400.0], [300.0, 280.0], [390.0, 420.0]]")
+    misplaced = TEXT.replace("dock_m = [1000.0", "dock_m = [1050.0")
+    found = lines_of(misplaced + crossing)
+    assert (line_with(misplaced, "dock_m = "), "mission.dock_m") in found
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

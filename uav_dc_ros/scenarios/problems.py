@@ -19,13 +19,28 @@ from uav_dc_ros.core import scenario as core
 from uav_dc_ros.core.keys import path_of
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ScenarioError, UnknownKeyError
+from uav_dc_ros.scenarios import with_files
 from uav_dc_ros.scenarios.lines import Lines
 from uav_dc_ros.scenarios.user_files import with_users
+from uav_dc_ros.scenarios.zone_files import with_zones
 
 PROBLEMS_MAX = 50
 # Valid for some key each, beside the choices of the keys that have some.
-_STAND_INS: tuple[Any, ...] = ({}, 1, 1.0, 1e9, "a", [], [[1.0, 1.0]], [1.0, 1.0], [1.0, 1.0, 1.0], True)
+_STAND_INS: tuple[Any, ...] = (
+    {},
+    1,
+    1.0,
+    1e9,
+    "a",
+    [],
+    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
+    [1.0, 1.0],
+    [1.0, 1.0, 1.0],
+    True,
+)
 Key: TypeAlias = tuple[str | int, ...]
+# Arrays of tables that may come from a file, and the key with its name.
+_FILES: dict[Key, Key] = {("users", "user"): ("users", "file"), ("obstacles",): ("zones",)}
 # Values in these do not decide whether others fit together.
 _APART = ("name", "reward")
 
@@ -47,16 +62,17 @@ def find(text: str, folder: Path) -> tuple[Scenario | None, list[Problem]]:
     Files that it names are relative to `folder`.
     """
     try:
-        return core.from_values(with_users(core.read_values(text, ""), folder, ""), ""), []
+        return core.from_values(with_files(core.read_values(text, ""), folder, ""), ""), []
     except ScenarioError:
         found = itertools.islice(_problems(text, folder), PROBLEMS_MAX)
     return None, sorted(found, key=lambda problem: problem.line or 0)
 
 
 def line_of(lines: Lines, path: Key) -> int | None:
-    """The line of a key; for users of a file, that of `users.file`."""
-    if path[:2] == ("users", "user") and lines.exactly(path[:2]) is None:
-        path = ("users", "file")
+    """The line of a key; for what is in another file, that of the file's name."""
+    for inner, file in _FILES.items():
+        if path[: len(inner)] == inner and lines.exactly(path[: len(inner) + 1]) is None:
+            return lines.of(file)
     return lines.of(path)
 
 
@@ -73,13 +89,15 @@ def _problems(text: str, folder: Path) -> Iterator[Problem]:
     meant: dict[Key, Key] = {}  # keys, and how they are misspelt in the file
     hidden: list[Key] = []  # tables that are not checked further
     fit = True
-    try:
-        values = with_users(values, folder, "")
-    except ScenarioError as error:
-        yield Problem(lines.of(("users", "file")), _text(error))
-        del values["users"]["file"]
-        hidden.append(("users",))
-        fit = False
+    resolves: tuple[tuple[Key, Any], ...] = ((("zones",), with_zones), (("users", "file"), with_users))
+    for key, resolve in resolves:
+        try:
+            values = resolve(values, folder, "")
+        except ScenarioError as error:
+            yield Problem(lines.of(key), _text(error))
+            del _around(values, key)[key[-1]]
+            hidden.append(key[:1])
+            fit = False
     while True:
         try:
             scenario = core.with_types(values, "")
@@ -122,7 +140,8 @@ def _repair(values: dict[str, Any], path: Key, hidden: list[Key]) -> bool:
         try:
             core.with_types(values, "")
         except ScenarioError as error:
-            if error.path == path:
+            # An error within is no error of the value only where a table takes its place.
+            if error.path == path or (stand_in != {} and error.path[: len(path)] == path):
                 continue
         # What a table lacks, or has too much for its new model, is no problem of the file.
         hidden += [path] if stand_in == {} else [path[:-1]] if path[-1] == "model" else []

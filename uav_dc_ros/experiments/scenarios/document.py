@@ -20,6 +20,8 @@ COMMENTS = {
     "grid.altitude_min_m": "of the lowest layer, above the users",
     "grid.altitude_step_m": "from layer to layer",
     "datum_deg": "latitude and longitude of x = 0, y = 0 on WGS 84",
+    "zones": "relative to this file",
+    "obstacles": "A building or a no-fly zone, see docs/obstacles.md.",
     "users": "The users on the ground, see docs/users.md.",
     "users.file": "relative to this file",
     "users.cluster_centres_m": "x, y of each",
@@ -43,6 +45,7 @@ COMMENTS = {
     "radio.noise_power_dbm": "at the UAV",
     "radio.ref_gain_db": "channel power gain at 1 m",
     "radio.path_loss_exponent": "2 in free space",
+    "radio.obstruction_loss_db": "of a link that a building cuts",
     "radio.carrier_hz": "",
     "radio.environment": "",
     "radio.line_of_sight": "mean_loss_db or mean_gain",
@@ -64,15 +67,19 @@ ENERGY = """
 """
 
 
-def text(scenario: Scenario, header: str = "", users_file: str | None = None) -> str:
+def text(
+    scenario: Scenario, header: str = "", users_file: str | None = None, zones_file: str | None = None
+) -> str:
     """The file's text, which `scenario.parse` reads as the same scenario; `header` is its first comment.
 
-    With `users_file` the text names that file instead of the list of users in it.
+    With `users_file` or `zones_file` the text names that file instead of the users or obstacles in it.
     """
     values = msgspec.to_builtins(scenario)
     if users_file is not None:
         others = {key: value for key, value in values["users"].items() if key != "user"}
         values["users"] = {"file": users_file, **others}
+    if zones_file is not None:
+        values = {key: value for key, value in values.items() if key != "obstacles"} | {"zones": zones_file}
     lines = [*(f"# {line}".rstrip() for line in header.splitlines()), *([""] if header else [])]
     lines += _table(values, ())
     return "\n".join(lines) + "\n" + ("" if scenario.energy else ENERGY)

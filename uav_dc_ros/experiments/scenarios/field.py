@@ -13,12 +13,15 @@ The rest follows by rule:
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
 
 from uav_dc_ros import scenarios
+from uav_dc_ros.core.obstacles import Obstacle
+from uav_dc_ros.core.obstacles.prisms import blocks
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.experiments.scenarios import flyable
@@ -32,6 +35,7 @@ COLLECT_STEPS = 2.6  # that a user needs
 DRIFT_STEPS = 4.5  # root mean square of a user's way after 60 steps, in steps at its maximum speed
 COLLECTED_MIN = 0.8  # share of the users that a tour of a random field collects
 RESERVE = 1.2  # times the steps of a tour
+OBSTRUCTION_LOSS_DB = 20.0  # excess loss without line of sight in an urban environment, see `channel`
 RADIUS_CELLS = 1.2  # of a disc, if there is room
 RADIUS_MIN_CELLS = 0.2
 APART_RADII = 3.0  # between the centres of two discs
@@ -167,10 +171,16 @@ def _scattered(
     return centres_m
 
 
-def around(name: str, users: list[dict[str, Any]], datum_deg: Point | None) -> Scenario:
+def around(
+    name: str,
+    users: list[dict[str, Any]],
+    datum_deg: Point | None,
+    obstacles: Sequence[dict[str, Any]] = (),
+) -> Scenario:
     """A field around users that stay where they are: plain values of `core.users.settings.User`.
 
-    The grid begins at x = 0, y = 0, where the mission starts, and the dock is at its opposite corner.
+    The grid begins at x = 0, y = 0, where the mission starts, and the dock is at its opposite corner; or, of
+    both, at the nearest place that is free of `obstacles`, plain values of `core.obstacles.Obstacle`.
 
     Raises:
         ParameterError: users west or south of the grid's corner, or too far apart; users that a tour cannot
@@ -184,12 +194,32 @@ def around(name: str, users: list[dict[str, Any]], datum_deg: Point | None) -> S
             )
     size_m = [max(SIDE_MIN_M, *(user[key] for user in users)) for key in ("x_m", "y_m")]
     cell_m, (n_x, n_y) = _cells((size_m[0], size_m[1]))
-    layout = Layout(cell_m, (n_x, n_y), (0.0, 0.0), (_metres(cell_m, n_x), _metres(cell_m, n_y)))
+    corners = [(0, 0), (n_x, n_y)]
+    start_m, dock_m = (_free_m(cell_m, (n_x, n_y), corner, obstacles) for corner in corners)
     table = {"user": users, "mobility": {"model": "static"}}
-    made = _complete(name, table, layout, {"datum_deg": datum_deg} if datum_deg else {})
+    more: dict[str, Any] = {"datum_deg": datum_deg} if datum_deg else {}
+    more |= {"obstacles": list(obstacles)} if obstacles else {}
+    made = _complete(name, table, Layout(cell_m, (n_x, n_y), start_m, dock_m), more)
     if made is None:
-        raise ParameterError("a tour cannot collect these users; expected fewer, or less data_bits of each")
+        raise ParameterError(
+            "a tour cannot collect these users; expected fewer, less data_bits of each, or none in a building"
+        )
     return made
+
+
+def _free_m(
+    cell_m: float, n_cells: tuple[int, int], corner: tuple[int, int], obstacles: Sequence[dict[str, Any]]
+) -> Point:
+    """The place nearest to a corner of the grid over which the UAV can climb to every layer, metres."""
+    solid = msgspec.convert(obstacles, tuple[Obstacle, ...])
+    grid = scenarios.load(SHIPPED).grid
+    top_m = grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
+    columns = itertools.product(range(n_cells[0] + 1), range(n_cells[1] + 1))
+    for x, y in sorted(columns, key=lambda at: abs(at[0] - corner[0]) + abs(at[1] - corner[1])):
+        place_m = _metres(cell_m, x), _metres(cell_m, y)
+        if blocks(solid, (*place_m, 0.0), (*place_m, top_m)) is None:
+            return place_m
+    raise ParameterError("the obstacles close the whole field; expected a place for the start and the dock")
 
 
 def _complete(
@@ -205,6 +235,8 @@ def _complete(
     step_s = round(cell_m / SPEED_MPS, 2)
     limits |= {"start_m": (*layout.start_m, top_m), "dock_m": layout.dock_m, "step_s": step_s}
     limits |= {"max_steps": 1_000_000, "d_cons_m": 1e6}
+    if any(one.get("kind", "building") == "building" for one in values.get("obstacles", ())):
+        radio["obstruction_loss_db"] = OBSTRUCTION_LOSS_DB
     placed = from_values(values, name).users
     step_bits = step_s * radio["bandwidth_hz"] * math.log2(1.0 + 1.0 / max(max(placed.sizes) - 1, 1))
     r_min_bits = float(f"{COLLECT_STEPS * step_bits:.1e}")

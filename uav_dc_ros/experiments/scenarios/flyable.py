@@ -6,6 +6,7 @@ The tour is the planner `tour`, flown with the scenario's own channel, users and
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TypeAlias
 
 import msgspec
@@ -14,6 +15,7 @@ import numpy as np
 from uav_dc_ros import planners
 from uav_dc_ros.core import mission, observations, world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.obstacles import UNREACHABLE, moves_to_dock
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act
 from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
@@ -21,6 +23,7 @@ from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
 SEEDS = range(10)
 DISC_POINTS = 500  # of a disc, of equal area each
 EDGE_POINTS = 72
+DISTANCES_MAX = 2_000_000  # between points and cells, at a time
 HOVERS_MAX = 20  # steps for each cluster, beside the way, after which a tour without a limit ends
 
 
@@ -100,10 +103,11 @@ def examine(scenario: Scenario, seeds: Sequence[int] = SEEDS) -> Flyable:
         energy_used_j=float(flown.energy_used_j.max()) if scenario.energy else None,
         without_limit=steps_of_tour(scenario, seeds),
     )
-    start, dock = scenario.start_cell, scenario.dock_cell
+    (east, north, _), dock = scenario.start_cell, scenario.dock_cell
+    moves = abs(east - dock[0]) + abs(north - dock[1])
     return Flyable(
         users=scenario.n_users,
-        moves_to_dock=abs(start[0] - dock[0]) + abs(start[1] - dock[1]),
+        moves_to_dock=moves_to_dock(scenario) if scenario.obstacles else moves,
         speed_mps=scenario.grid.cell_m / scenario.mission.step_s,
         clusters=clusters,
         tour=tour,
@@ -199,15 +203,35 @@ def disc_m(centre_m: Point, radius_m: float) -> Array:
 
 def nearest_cell_m(scenario: Scenario, ground_m: Array) -> Array:
     """3D distance of points on the ground, metres `[P, 2]`, from the cell nearest to each, metres, `[P]`."""
-    ground_distance_m = np.linalg.norm(ground_m - nearest_column_m(scenario, ground_m), axis=-1)
-    return np.hypot(ground_distance_m, scenario.grid.altitude_min_m)
+    cells_m = nearest_cells_m(scenario, ground_m)
+    return np.hypot(np.linalg.norm(ground_m - cells_m[:, :2], axis=-1), cells_m[:, 2])
 
 
-def nearest_column_m(scenario: Scenario, ground_m: Array) -> Array:
-    """Centres of the columns of cells nearest to points on the ground, both metres, `[P, 2]`."""
+def nearest_cells_m(scenario: Scenario, ground_m: Array) -> Array:
+    """Centres x, y, altitude of the cells nearest to points on the ground `[P, 2]`, metres, `[P, 3]`.
+
+    Among obstacles, of the cells that the UAV can reach.
+    """
     grid = scenario.grid
-    last = np.asarray(grid.shape[:2]) - 1
-    return np.clip(np.rint(ground_m / grid.cell_m), 0, last) * grid.cell_m
+    if scenario.moves is None:
+        columns = np.clip(np.rint(ground_m / grid.cell_m), 0, np.asarray(grid.shape[:2]) - 1)
+        return np.pad(columns * grid.cell_m, ((0, 0), (0, 1)), constant_values=grid.altitude_min_m)
+    lowest_m = _lowest_reachable_m(scenario)
+    found = []
+    for block in np.array_split(ground_m, max(1, len(ground_m) * len(lowest_m) // DISTANCES_MAX)):
+        distance = ((block[:, None] - lowest_m[:, :2]) ** 2).sum(axis=-1) + lowest_m[:, 2] ** 2
+        found.append(lowest_m[distance.argmin(axis=-1)])
+    return np.concatenate(found)
+
+
+@lru_cache(maxsize=1)
+def _lowest_reachable_m(scenario: Scenario) -> Array:
+    """Centre of the lowest cell of each column that the UAV can reach from the start, metres, `[C, 3]`."""
+    assert scenario.moves is not None, "only with obstacles"
+    reachable = scenario.moves.steps_from(np.asarray([scenario.start_cell])) != UNREACHABLE
+    columns = np.argwhere(reachable.any(axis=-1))
+    lowest = reachable.argmax(axis=-1)[tuple(columns.T)]
+    return scenario.grid.centre_m(np.column_stack([columns, lowest]), like=np.zeros(1))
 
 
 def _problems(

@@ -14,7 +14,7 @@ from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.experiments.scenarios import document, field, listing
-from uav_dc_ros.scenarios import user_files
+from uav_dc_ros.scenarios import user_files, zone_files
 
 CLUSTERS, USERS, SIZE_M = 5, 10, (1000.0, 1000.0)  # those of the shipped field
 UNITS = "x is east, y is north, altitude is above the users. A key ends in its unit. Every key is checked."
@@ -38,7 +38,9 @@ def add_import(parser: argparse.ArgumentParser) -> None:
     """Options of `import`."""
     users = "a CSV or GeoJSON file of users, see docs/users.md"
     parser.add_argument("users", type=Path, metavar="USERS", help=users)
-    out = "the new file, which names the file of users relative to itself"
+    zones = "a GeoJSON file of buildings and no-fly zones, see docs/obstacles.md"
+    parser.add_argument("--zones", type=Path, metavar="ZONES", help=zones)
+    out = "the new file, which names the other files relative to itself"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", dest="file", help=out)
     parser.set_defaults(run=import_users)
 
@@ -75,25 +77,32 @@ def random(options: argparse.Namespace) -> int:
 def import_users(options: argparse.Namespace) -> int:
     """Write a field around the users of a file; the exit status."""
     users: Path = options.users
-    if not str(users).isprintable():  # it becomes text of the file
-        raise ParameterError(f"{str(users)!r}; expected a name of printable characters")
+    zones: Path | None = options.zones
+    given = f" {users} --zones {zones}" if zones else f" {users}"
+    if not given.isprintable():  # it becomes text of the file
+        raise ParameterError(f"{given.strip()!r}; expected names of printable characters")
 
     def make() -> Scenario:
         corner = user_files.corner_deg(users)
         # Rounded down by a metre at most, so that no user is west or south of it.
         datum = corner and (math.floor(corner[0] * 1e5) / 1e5, math.floor(corner[1] * 1e5) / 1e5)
+        obstacles = zone_files.read(zones, datum) if zones else ()
         try:
-            return field.around(_name(options.file) or "my_field", user_files.read(users, datum), datum)
+            listed = user_files.read(users, datum)
+            return field.around(_name(options.file) or "my_field", listed, datum, obstacles)
         except ParameterError as error:
             raise ParameterError(f"{users}: {error}") from None
 
     folder = options.file.absolute().parent
-    return _write(options, make, f" {users}", os.path.relpath(users.absolute(), folder))
+    names = {
+        f"{key}_file": os.path.relpath(path.absolute(), folder)
+        for key, path in (("users", users), ("zones", zones))
+        if path is not None
+    }
+    return _write(options, make, given, **names)
 
 
-def _write(
-    options: argparse.Namespace, make: Callable[[], Scenario], given: str, users_file: str | None = None
-) -> int:
+def _write(options: argparse.Namespace, make: Callable[[], Scenario], given: str, **names: str) -> int:
     path: Path | None = options.file
     if path is not None:
         if path.is_file() and files.is_replaced(path):
@@ -101,7 +110,7 @@ def _write(
         files.check_writable(path)
     scenario = make()
     header = f"Made by: uav-dc scenario {options.verb}{given}\n{UNITS}"
-    text = document.text(scenario, header, users_file)
+    text = document.text(scenario, header, **names)
     if path is None:
         sys.stdout.write(text)
     else:

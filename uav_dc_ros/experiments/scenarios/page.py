@@ -25,7 +25,7 @@ def content(scenario: Scenario) -> bytes:
 
 def _data(scenario: Scenario) -> dict[str, Any]:
     rates, grid = rate_map(scenario), scenario.grid
-    hovers_m = flyable.nearest_column_m(scenario, np.asarray(scenario.cluster_centres_m))
+    hovers_m = flyable.nearest_cells_m(scenario, np.asarray(scenario.cluster_centres_m))[:, :2]
     return {
         "version": __version__,
         "world": world_data(scenario),
@@ -35,7 +35,7 @@ def _data(scenario: Scenario) -> dict[str, Any]:
             {
                 "altitude_m": layer.altitude_m,
                 "reach_m": layer.reach_m,
-                # Rows from south to north, as Plotly draws them.
+                # Rows from south to north, as Plotly draws them; NaN becomes null.
                 "sum_rate_bps": [[float(f"{rate:.4g}") for rate in row] for row in layer.sum_rate_bps.T],
             }
             for layer in rates.layers

@@ -7,13 +7,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 
 from uav_dc_ros import files
 from uav_dc_ros.core import channel
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.env.render import DOCK, FAINT, INK, PAPER, WAITING
+from uav_dc_ros.env.render import BUILDING, DOCK, FAINT, INK, NO_FLY, PAPER, WAITING
 from uav_dc_ros.experiments.scenarios import flyable
 from uav_dc_ros.experiments.scenarios.rate_map import Layer, RateMap, rate_map, scale_bar_m
 from uav_dc_ros.recordings.thinning import spread
@@ -43,7 +43,7 @@ def _figure(scenario: Scenario) -> Figure:
     size = (PANEL_IN * n_columns + 1.2, (PANEL_IN * shape + 0.5) * n_rows + 1.2)
     figure = Figure(figsize=size, dpi=120, facecolor=PAPER, layout="constrained")
     panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True).ravel()
-    highest = max(float(layer.sum_rate_bps.max()) for layer in shown) / 1e6
+    highest = max(float(np.nan_to_num(layer.sum_rate_bps).max()) for layer in shown) / 1e6
     norm = Normalize(0.0, highest or 1.0)
     for axes, layer in zip(panels, shown, strict=True):
         tiles = axes.pcolormesh(
@@ -79,10 +79,17 @@ def _figure(scenario: Scenario) -> Figure:
 def _draw_field(axes: Axes, scenario: Scenario, rates: RateMap, layer: Layer) -> None:
     """What is the same in every layer, and the circles on the ground that this layer reaches."""
     cell_m, wide_m = scenario.grid.cell_m, _extent_m(scenario)[0]
-    hovers_m = flyable.nearest_column_m(scenario, np.asarray(scenario.cluster_centres_m))
+    hovers_m = flyable.nearest_cells_m(scenario, np.asarray(scenario.cluster_centres_m))[:, :2]
+    for obstacle in scenario.obstacles:
+        closes = obstacle.base_m <= layer.altitude_m <= obstacle.top_m
+        style = BUILDING if obstacle.kind == "building" else NO_FLY
+        axes.add_patch(Polygon(obstacle.polygon_m, zorder=2, alpha=0.9 if closes else 0.35, **style))
+    for kind, style, label in (("building", BUILDING, "building"), ("no_fly", NO_FLY, "no-fly zone")):
+        if any(obstacle.kind == kind for obstacle in scenario.obstacles):
+            axes.fill([], [], label=f"{label} (faint: not at this altitude)", **style)
     for disc, hover_m in zip(scenario.users.clusters, hovers_m, strict=True):
-        axes.add_patch(Circle(disc.centre_m, disc.radius_m, fill=False, ec=INK, lw=1.2))
-        axes.add_patch(Circle(hover_m, layer.reach_m, fill=False, ec=INK, lw=0.9, ls=DASHES))
+        axes.add_patch(Circle(disc.centre_m, disc.radius_m, fill=False, ec=INK, lw=1.2, zorder=3))
+        axes.add_patch(Circle(hover_m, layer.reach_m, fill=False, ec=INK, lw=0.9, ls=DASHES, zorder=3))
     axes.plot([], [], "o", markersize=9, mfc="none", mec=INK, mew=1.2, label="cluster")
     reach = f"in reach from above a cluster ({scenario.mission.d_cons_m:g} m)"
     axes.plot([], [], color=INK, lw=0.9, ls=DASHES, label=reach)

@@ -21,7 +21,8 @@ class Layer(NamedTuple):
 
     altitude_m: float
     reach_m: float  # radius on the ground within `mission.d_cons_m`; 0: nothing is in reach
-    sum_rate_bps: Array  # mean over the start positions of some missions, `[X, Y]`
+    # Mean over the start positions of some missions, `[X, Y]`; NaN where an obstacle closes the cell
+    sum_rate_bps: Array
 
 
 class RateMap(NamedTuple):
@@ -47,15 +48,19 @@ def rate_map(scenario: Scenario) -> RateMap:
         cells = np.concatenate([columns, np.full((len(columns), 1), up)], axis=1)
         uav_m = grid.centre_m(cells, like=state.users_m)
         block = max(1, _BLOCK // state.collected.size)
-        rates = [
-            world.measure(
-                scenario, uav_m[i : i + block, None], state.users_m, state.collected
-            ).sum_rate_bps.mean(axis=-1)
-            for i in range(0, len(uav_m), block)
-        ]
+        rates = []
+        for few_m in np.array_split(uav_m, -(-len(uav_m) // block)):
+            uavs_m = np.broadcast_to(few_m[:, None], (len(few_m), missions, 3))
+            users_m, collected = (
+                np.broadcast_to(one, (len(few_m), *one.shape)) for one in (state.users_m, state.collected)
+            )
+            rates.append(world.measure(scenario, uavs_m, users_m, collected).sum_rate_bps.mean(axis=-1))
+        of_layer = np.concatenate(rates)
+        if scenario.moves is not None:
+            of_layer = np.where(scenario.moves.free[tuple(cells.T)], of_layer, np.nan)
         altitude_m = float(uav_m[0, 2])
         reach_m = radio.ground_reach_m(scenario.mission.d_cons_m, altitude_m)
-        layers.append(Layer(altitude_m, reach_m, np.concatenate(rates).reshape(len(east), len(north))))
+        layers.append(Layer(altitude_m, reach_m, of_layer.reshape(len(east), len(north))))
     return RateMap(east * grid.cell_m, north * grid.cell_m, layers, state.users_m[0], missions)
 
 

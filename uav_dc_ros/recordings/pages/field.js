@@ -7,6 +7,7 @@ open(async (page, data) => {
   const { world, check } = data;
   const { tour } = check;
   const state = { layer: 0 };
+  space.flat = true;
   const top = Math.max(...data.layers.flatMap((layer) => layer.sum_rate_bps.flat()), 1);
   const [scale, prefix] = siScale(top);
 
@@ -63,6 +64,8 @@ open(async (page, data) => {
       item('<circle cx="7" cy="7" r="6" fill="none" stroke="var(--ink)" stroke-dasharray="3 2"/>', "in reach from above the cluster"),
       item('<circle cx="7" cy="7" r="5" fill="var(--card)" stroke="var(--ink)" stroke-width="2"/>', "start"),
       item('<path d="M2 2h10v10h-10Z" fill="var(--dock)"/>', "dock"),
+      ...[["building", "ground", "building"], ["no_fly", "warm", "no-fly zone"]].filter(([kind]) => world.obstacles.some((one) => one.kind === kind)).map(
+        ([, name, words]) => item(`<path d="M2 2h10v10h-10Z" fill="var(--${name})" fill-opacity="0.5" stroke="var(--${name})"/>`, words)),
       ...(data.out_of_reach_m[0].length ? [item('<path d="M3 3 11 11M11 3 3 11" stroke="var(--bad)" stroke-width="2"/>', "out of reach of every cell")] : []),
     ];
   }
@@ -78,10 +81,11 @@ open(async (page, data) => {
     const bar = { x: [wide - data.scale_bar_m, wide], y: [y, y] };
     const ink = "#1d2733"; // on the tiles, which are the same in both schemes
     Plotly.react("scene", [
-      { type: "heatmap", name: "rate", x: data.east_m, y: data.north_m, z: layer.sum_rate_bps.map((row) => row.map((rate) => rate / scale)),
+      { type: "heatmap", name: "rate", x: data.east_m, y: data.north_m, z: layer.sum_rate_bps.map((row) => row.map((rate) => (rate === null ? null : rate / scale))),
         zmin: 0, zmax: top / scale, colorscale: RATES, xgap: 1, ygap: 1, hovertemplate: `%{z:.3~f} ${prefix}bit/s<br>east %{x} m, north %{y} m<extra></extra>`,
         colorbar: { orientation: "h", y: 1, yanchor: "bottom", len: 0.9, thickness: 10, outlinewidth: 0, tickfont: { color: colour("ink") },
           title: { text: `sum-rate, ${prefix}bit/s`, side: "top", font: { size: 12, color: colour("muted") } } } },
+      ...world.obstacles.map((one) => space.obstacle(one)),
       lines("clusters", world.clusters.map((centre, i) => ring(centre, world.cluster_radii_m[i])), { color: ink, width: 1.6 }),
       lines("reach", data.hovers_m.map((cell) => ring(cell, layer.reach_m)), { color: ink, width: 1.1, dash: "dash" }),
       dots("users", data.users_m, { symbol: "circle", size: 6, color: colour("waiting"), line: { color: "#ffffff", width: 0.7 } }),
