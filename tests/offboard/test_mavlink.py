@@ -249,6 +249,7 @@ def test_the_autopilot_s_limits_home_and_target_are_read(kind: str) -> None:
             assert known.system == f"system 1, {'ArduCopter' if kind == 'ardupilot' else 'PX4'}"
             assert known.limits is not None
             assert known.limits.fence_radius_m == 250.0
+            assert known.limits.return_altitude_m == 15.0
             speeds = known.limits.speed_mps, known.limits.climb_mps, known.limits.descent_mps
             assert speeds == pytest.approx((10.2, 2.5, 1.5))
             assert known.home == pytest.approx(place, abs=0.05)
@@ -262,14 +263,15 @@ def test_the_autopilot_s_limits_home_and_target_are_read(kind: str) -> None:
 
 def test_parameters_that_a_vehicle_does_not_know_hold_nobody_up() -> None:
     with fake("ardupilot", speed=20.0, ready_s=1.0) as autopilot:
-        for name in ("FENCE_AUTOENABLE", "WPNAV_SPEED", "WPNAV_SPEED_UP", "WPNAV_SPEED_DN"):
+        for name in ("FENCE_AUTOENABLE", "RTL_ALT", "WPNAV_SPEED", "WPNAV_SPEED_UP", "WPNAV_SPEED_DN"):
             autopilot.do(f"param {name} none")
-        for name, value in (("WP_SPD", 8.5), ("WP_SPD_UP", 2.0), ("WP_SPD_DN", 1.0)):
+        for name, value in (("WP_SPD", 8.5), ("WP_SPD_UP", 2.0), ("WP_SPD_DN", 1.0), ("RTL_ALT_M", 21.0)):
             autopilot.do(f"param {name} {value}")
         autopilot.wait_for("control")
         with MavlinkVehicle(autopilot.address) as vehicle:
             known = until(vehicle, lambda known: known.missing is None)
-            assert known.limits == Limits(speed_mps=8.5, climb_mps=2.0, descent_mps=1.0)
+            expected = Limits(return_altitude_m=21.0, speed_mps=8.5, climb_mps=2.0, descent_mps=1.0)
+            assert known.limits == expected
 
 
 def test_of_two_vehicles_on_a_link_the_one_that_is_named_is_commanded() -> None:
