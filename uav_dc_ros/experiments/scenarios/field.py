@@ -5,7 +5,7 @@ The rest follows by rule:
 
 - A cell is about a tenth of the longer side, and the sides are whole cells.
 - `r_min_bits` takes a user of a cluster of K about as many steps as there: with K - 1 others as near as the
-  user, its SINR is 1 / (K - 1).
+  user, its SINR is 1 / (K - 1). Where a tour cannot collect so much, it is halved until one can.
 - `d_cons_m` has whole discs in reach of a cell, and of the UAV above their centres in every layer, with room
   for the way that a user walks.
 - `max_steps` is a fifth more than a tour without a limit takes (`flyable.steps_of_tour`).
@@ -32,6 +32,7 @@ SIDE_MIN_M, SIDE_MAX_M = 100.0, 100_000.0
 CELLS = 10  # along the longer side, about
 SPEED_MPS = 100.0 / 15.0
 COLLECT_STEPS = 2.6  # that a user needs
+HALVINGS = 6  # of the data of a user, until a tour can collect it
 DRIFT_STEPS = 4.5  # root mean square of a user's way after 60 steps, in steps at its maximum speed
 COLLECTED_MIN = 0.8  # share of the users that a tour of a random field collects
 RESERVE = 1.2  # times the steps of a tour
@@ -247,11 +248,14 @@ def _complete(
     ground_m = math.sqrt(farthest_m**2 - low_m**2) + DRIFT_STEPS * (placed.v_max_mps or 0.0) * step_s
     above_m = math.hypot(max(disc.radius_m for disc in discs), top_m)
     limits["d_cons_m"] = 10.0 * math.ceil(max(math.hypot(ground_m, low_m), above_m) / 10.0)
-    steps = flyable.steps_of_tour(from_values(values, name))
-    if steps is None:
-        return None
-    limits["max_steps"] = math.ceil(RESERVE * steps)
-    return from_values(values, name)
+    for _ in range(HALVINGS):
+        steps = flyable.steps_of_tour(from_values(values, name))
+        if steps is not None:
+            limits["max_steps"] = math.ceil(RESERVE * steps)
+            return from_values(values, name)
+        r_min_bits = float(f"{r_min_bits / 2.0:.1e}")
+        limits["r_min_bits"] = values["reward"]["data_scale_bits"] = r_min_bits
+    return None
 
 
 def _cells(size_m: Point) -> tuple[float, tuple[int, int]]:
