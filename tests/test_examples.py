@@ -19,7 +19,7 @@ EXAMPLES = ROOT / "examples"
 def test_these_are_all() -> None:
     assert {path.name for path in EXAMPLES.iterdir() if path.is_file()} == {
         *("one_episode.py", "own_scenario.toml", "own_policy_node.py"),
-        *("train_and_deploy.py", "bag_to_table.py"),
+        *("train_and_deploy.py", "bag_to_table.py", "gain_map_sionna.py"),
     }
 
 
@@ -52,6 +52,13 @@ def test_the_commands_in_own_scenario_are_commands(monkeypatch: pytest.MonkeyPat
         with pytest.raises(SystemExit) as ended:
             uav_dc.main([*words[1:], "--help"])
         assert ended.value.code == 0, shlex.join(words)
+
+
+def test_gain_map_without_the_ray_tracer_is_one_line(ros: Ros) -> None:
+    """With it the example was run by hand: see docs/channels.md."""
+    command = (sys.executable, EXAMPLES / "gain_map_sionna.py", "three_clusters", "gains.npz")
+    status, output = finish(ros.start_command(*command))
+    assert (status, output) == (2, "sionna-rt is missing (No module named 'sionna'): pip install sionna-rt\n")
 
 
 def test_own_policy_node(ros: Ros) -> None:

@@ -119,6 +119,17 @@ class Users(PerUser, frozen=True, kw_only=True):
     cluster: Annotated[list[Index], Meta(description="index of the user's cluster")]
     x_m: Annotated[list[float], Meta(description="metres east")]
     y_m: Annotated[list[float], Meta(description="metres north")]
+    shadowing_seed: Annotated[
+        Seed | UnsetType,
+        Meta(description="seed of the mission's shadowing; absent in a scenario without shadowing"),
+    ] = UNSET
+    link_seed: Annotated[
+        Seed | UnsetType,
+        Meta(
+            description="seed of the line of sight and the fading of each user in this step; absent in a "
+            "scenario whose channel draws neither"
+        ),
+    ] = UNSET
 
 
 class Rates(PerUser, frozen=True, kw_only=True):

@@ -1,5 +1,6 @@
 """Conversion between payloads and the core's arrays, and checks of payloads against the scenario."""
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,26 @@ from msgspec import UNSET
 from uav_dc_ros import messages
 from uav_dc_ros.core import energy, world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.propagation import stochastic
+from uav_dc_ros.core.propagation.stochastic import Realization, Seeds, Shadowing
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Link
 from uav_dc_ros.errors import MessageError
 
 
 def users(
-    scenario: Scenario, users_m: Array, *, mission: int, step: int, time_ns: int, run: str = ""
+    scenario: Scenario,
+    users_m: Array,
+    *,
+    mission: int,
+    step: int,
+    time_ns: int,
+    run: str = "",
+    seeds: Seeds | None = None,
 ) -> messages.Users:
-    """Users' positions, metres `[U, 2]`, as a payload."""
+    """Users' positions, metres `[U, 2]`, as a payload. Where the channel is random, it needs its `seeds`."""
+    radio = scenario.radio
+    assert seeds is not None or not radio.is_random, "a random channel has seeds"
     return messages.Users(
         run=run,
         mission=mission,
@@ -25,6 +37,8 @@ def users(
         cluster=scenario.user_cluster.tolist(),
         x_m=users_m[:, 0].tolist(),
         y_m=users_m[:, 1].tolist(),
+        shadowing_seed=seeds.shadowing if seeds and radio.shadowing else UNSET,
+        link_seed=seeds.link if seeds and radio.draws_links else UNSET,
     )
 
 
@@ -32,6 +46,20 @@ def users_m(payload: messages.Users, scenario: Scenario) -> Array:
     """Users' positions, metres, `[U, 2]`; raises MessageError as `check` does."""
     check(payload, scenario)
     return np.asarray([payload.x_m, payload.y_m], dtype=np.float64).T
+
+
+def realization(payload: messages.Users, scenario: Scenario) -> Realization | None:
+    """What the channel has drawn in a step with users that `check` accepts; None: it is not random."""
+    if not scenario.radio.is_random:
+        return None
+    shadowing, seed = scenario.radio.shadowing, payload.shadowing_seed
+    waves = np.zeros(0) if shadowing is None or seed is UNSET else _waves(shadowing, seed)
+    return Realization(waves, np.asarray(0 if payload.link_seed is UNSET else payload.link_seed))
+
+
+@lru_cache(maxsize=4)  # one in each step of a mission
+def _waves(shadowing: Shadowing, seed: int) -> Array:
+    return stochastic.waves(shadowing, np.asarray(seed), like=np.zeros(0))
 
 
 def rates(
@@ -95,7 +123,8 @@ def check(payload: messages.Payload, scenario: Scenario) -> None:
     """Raise MessageError for a payload of another world.
 
     That is a mission with another fingerprint, a cell outside the grid, more steps than the battery
-    allows, or no battery where the scenario has one; users, or rates of users, other than the scenario's.
+    allows, or no battery where the scenario has one; users, or rates of users, other than the scenario's; and
+    users without the seeds of a random channel.
     """
     match payload:
         case messages.Mission() if payload.fingerprint != scenario.fingerprint:
@@ -123,6 +152,14 @@ def check(payload: messages.Payload, scenario: Scenario) -> None:
                 f"{len(payload.cluster)} users in {len(set(payload.cluster))} clusters; expected the "
                 f"{scenario.n_users} in {scenario.n_clusters} of scenario {scenario.name!r}, in its order",
             )
+        case messages.Users():
+            radio = scenario.radio
+            for name, needed in (("shadowing_seed", radio.shadowing), ("link_seed", radio.draws_links)):
+                if (getattr(payload, name) is UNSET) is bool(needed):
+                    given, expected = ("no ", "one") if needed else ("", "none")
+                    raise MessageError(
+                        "layout", f"{given}{name}; expected {expected} in scenario {scenario.name!r}"
+                    )
         case messages.Rates() if len(payload.data_bits) != scenario.n_users:
             raise MessageError(
                 "layout",

@@ -26,7 +26,7 @@ HIDDEN = ("bag_record", "diagnostics")  # a command of its own; a topic of every
 # What each topic holds. Everything else in the table is in `uav_dc_ros.topics` and in the node table.
 CONTENT = {
     "pose": "the UAV's position and heading",
-    "users": "step, time, and of every user the cluster, x and y",
+    "users": "step, time, seeds of a random channel, and of every user the cluster, x and y",
     "rates": "sum-rate; of every user SINR, rate, data, served, collected",
     "mission": "step that the vehicle is ready for, phase, reason, cell, remaining steps, steps not reached, "
     "energy used",

@@ -220,10 +220,11 @@ def test_the_manual_s_table_is_the_code_s():
     text = (Path(__file__).parents[2] / "docs" / "channels.md").read_text("utf-8")
     rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.MULTILINE)
     assert {name: tuple(map(float, numbers)) for name, *numbers in rows} == channel.ENVIRONMENTS
-    (example,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    blocks = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    example = "".join(block for block in blocks if "gain_map" not in block)
     values = msgspec.to_builtins(scenarios.load("three_clusters"))
     scenario = from_values(values | tomllib.loads(example), "docs")
-    assert channel.title(scenario.radio) == "air_to_ground, urban, 2 GHz"
+    assert channel.title(scenario.radio) == "air_to_ground, urban, 2 GHz, shadowing, rician fading"
     assert channel.title(scenarios.load("three_clusters").radio) == "free_space"
 
 
@@ -236,13 +237,33 @@ def with_radio(scenario, **radio):
     return from_values(values | {"radio": COMMON | radio}, "test")
 
 
-@pytest.fixture(scope="module", params=[("air_to_ground", "urban"), ("tr_36_777", "umi_av")], ids=str)
+RICIAN = {"model": "rician", "k_db": 6.0}
+WORLDS = [
+    {"model": "air_to_ground", "environment": "urban"},
+    {"model": "tr_36_777", "environment": "umi_av"},
+    {
+        "model": "tr_36_777",
+        "environment": "uma_av",
+        "line_of_sight": "drawn",
+        "fading": RICIAN,
+        "shadowing": {"correlation_m": 40.0},
+    },
+    {
+        "model": "free_space",
+        "ref_gain_db": -50.0,
+        "path_loss_exponent": 2.0,
+        "shadowing": {"sigma_db": 6.0, "correlation_m": 40.0},
+        "fading": {"model": "rayleigh"},
+    },
+]
+
+
+@pytest.fixture(scope="module", params=WORLDS, ids=["air_to_ground", "tr_36_777", "random", "random_free"])
 def any_model(request, three, changed):
     """An odd number of users, so that no vector loop comes out even."""
-    model, environment = request.param
     scenario = changed(three, users={"users_per_cluster": 7})
-    radio = {"model": model, "environment": environment, "carrier_hz": 2e9, "line_of_sight": "mean_gain"}
-    return with_radio(scenario, **radio)
+    own = {} if request.param["model"] == "free_space" else {"carrier_hz": 2e9, "line_of_sight": "mean_gain"}
+    return with_radio(scenario, **own | request.param)
 
 
 @pytest.mark.parametrize("n", [1, 3, 33])
@@ -277,7 +298,9 @@ def test_float32_stays_float32_and_is_close(any_model, library):
     for (_, a), (_, b) in zip(exact, fly(any_model, loose, moves[:10]), strict=True):
         rate_bps = np.asarray(b.link.rate_bps)
         assert rate_bps.dtype == np.float32
-        np.testing.assert_allclose(rate_bps, a.link.rate_bps, rtol=2e-3)
+        # The shortest waves of a field of shadowing turn many times between two float32 positions.
+        tolerance = 2e-2 if any_model.radio.shadowing else 2e-3
+        np.testing.assert_allclose(rate_bps, a.link.rate_bps, rtol=tolerance)
 
 
 def test_it_follows_the_device_of_the_draws(any_model):
@@ -326,7 +349,7 @@ def test_every_value_of_a_model_is_in_the_fingerprint(three):
         (
             {"ref_gain_db": -50.0},
             "unknown key radio.ref_gain_db = -50.0; expected one of model, bandwidth_hz, tx_power_w, "
-            "noise_power_dbm, carrier_hz, environment, line_of_sight, interference",
+            "noise_power_dbm, shadowing, fading, carrier_hz, environment, line_of_sight, interference",
         ),
         ({"model": "free_space"}, "unknown key radio.carrier_hz = 2000000000.0; expected one of model, "),
         ({"carrier_hz": 2.4}, "radio.carrier_hz = 2.4; expected float >= 100000000.0"),

@@ -290,6 +290,7 @@ def test_shapes_and_types(three, array, batch, dtype):
         "mission_reward": ((), real),
         "energy_used_j": ((), real),
         "motion": ((users, 0), real),
+        "waves": ((1, 0), real),
     }
     of_outcome = {
         "reward": ((), real),

@@ -11,6 +11,8 @@ import safetensors.torch
 import torch
 
 from tests.support.worlds import population, run, tiny
+from uav_dc_ros.core.propagation.stochastic import WAVES
+from uav_dc_ros.core.scenario import from_values
 from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.train import checkpoint
 from uav_dc_ros.experiments.train.training import Training
@@ -69,6 +71,25 @@ def test_what_goes_on_ends_as_what_was_never_interrupted(path, end, worlds_in):
             assert torch.equal(found[name], array), (stops, name)
         for name, curve in never.curves.items():
             np.testing.assert_array_equal(training.curves[name], curve)
+
+
+def test_each_run_s_shadowing_is_in_the_checkpoint(path):
+    """On arrival a mission goes on in the next episode, over its own field."""
+    values = msgspec.to_builtins(made("on_arrival").scenario)
+    values["radio"] |= {
+        "shadowing": {"sigma_db": 6.0, "correlation_m": 50.0},
+        "fading": {"model": "rayleigh"},
+    }
+    shaded = msgspec.structs.replace(made("on_arrival"), scenario=from_values(values, "test"))
+    never = fly(Training(shaded, CPU), 3)
+    checkpoint.save(path, fly(Training(shaded, CPU), 1), {})
+    again = Training(shaded, CPU)
+    checkpoint.restore(path, again)
+    expected, found = never.state()[0], fly(again, 2).state()[0]
+    assert all(torch.equal(found[name], array) for name, array in expected.items())
+    waves = found["world.waves"]
+    assert waves.shape == (3, 6, WAVES)
+    assert len({one.numpy().tobytes() for one in waves}) == 3
 
 
 @pytest.mark.parametrize("worlds_in", ["numpy", "torch"])

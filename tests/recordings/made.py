@@ -13,6 +13,8 @@ from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
 from uav_dc_ros.core import world
 from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.propagation.counter_random import seed_of
+from uav_dc_ros.core.propagation.stochastic import Seeds
 from uav_dc_ros.core.scenario import Scenario
 
 BEGUN_NS = 1_700_000_000 * 10**9
@@ -66,17 +68,21 @@ def flight(
     max_steps = scenario.mission.max_steps
     for mission in range(missions):
         rng = np.random.default_rng(seed + mission)
-        state = world.initial(scenario, rng.random(scenario.draws_shape))
+        draws = rng.random(scenario.draws_shape)
+        state, first = world.initial(scenario, draws), int(seed_of(draws))
         phase, link = messages.Phase.READY, None
         while True:
             step = int(state.step)
             time_ns = scenario.time_ns(mission, step)
             uav_m = scenario.grid.centre_m(state.cell, like=state.users_m)
-            if link is None:
-                link = world.measure(scenario, uav_m, state.users_m, state.collected)
-            publish("pose", pose(uav_m.tolist(), time_ns))
             at = {"mission": mission, "step": step}
-            publish("users", payloads.users(scenario, state.users_m, time_ns=time_ns, **at))
+            seeds = Seeds(first, int(seed_of(draws)))
+            users = payloads.users(scenario, state.users_m, time_ns=time_ns, seeds=seeds, **at)
+            if link is None:
+                drawn = payloads.realization(users, scenario)
+                link = world.measure(scenario, uav_m, state.users_m, state.collected, drawn=drawn)
+            publish("pose", pose(uav_m.tolist(), time_ns))
+            publish("users", users)
             status = messages.Mission(
                 **at,
                 phase=phase,
@@ -96,7 +102,8 @@ def flight(
                 break
             action = act(mission, step)
             publish("move", messages.Move(**at, action=ACTION_LABELS[action]))
-            state, outcome = world.step(scenario, state, np.asarray(action), rng.random(scenario.draws_shape))
+            draws = rng.random(scenario.draws_shape)
+            state, outcome = world.step(scenario, state, np.asarray(action), draws)
             link = outcome.link
             if outcome.terminated or outcome.truncated:
                 phase = messages.Phase.LANDED if outcome.landed else messages.Phase.TIMEOUT

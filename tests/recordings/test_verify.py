@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 
 from tests.conftest import Ros, finish, wait_for
+from tests.core.test_gain_map import X_M, Y_M, free_space_db
+from tests.core.test_gain_map import toml as mapped_toml
 from tests.recordings.made import about, bag_message, changing, copy, flight, nudged, pose, write
 from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag as command
 from uav_dc_ros import cdr, files, messages, payloads, scenarios
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import world
+from uav_dc_ros.core.propagation import gain_map
 from uav_dc_ros.core.scenario import from_values
 from uav_dc_ros.messages import Phase
 
@@ -406,6 +409,49 @@ def test_a_bag_holds_its_channel_model(tmp_path, capsys):
     )
     status, out = verify(capsys, write(tmp_path / "other", recorded, about(scenario, scenario_values=other)))
     assert (status, "step 0, user 0, sinr: recorded" in out) == (1, True), out
+
+
+def test_a_gain_map_is_read_from_its_place_or_from_that_of_the_scenario_given(tmp_path, capsys):
+    gain_map.save(tmp_path / "map.npz", TINY.grid, X_M, Y_M, free_space_db(TINY.grid))
+    (tmp_path / "mapped.toml").write_text(mapped_toml("map.npz"))
+    scenario = scenarios.load(tmp_path / "mapped.toml")
+    bag = write(tmp_path / "bag", flight(scenario), about(scenario))
+    status, out = verify(capsys, bag)
+    assert status == 0, out
+    assert "channel: 9 of 9 steps recomputed, equal to the last bit" in out
+    (tmp_path / "moved").mkdir()
+    for name in ("map.npz", "mapped.toml"):
+        (tmp_path / name).rename(tmp_path / "moved" / name)
+    gain_map.load.cache_clear()
+    gain_map._values.cache_clear()
+    status, error = verify(capsys, bag)
+    assert (status, f"gain map {tmp_path / 'map.npz'}: cannot be read: No such file" in error) == (2, True)
+    assert verify(capsys, bag, "--scenario", tmp_path / "moved" / "mapped.toml")[0] == 0
+
+
+@pytest.mark.parametrize("seed", ["shadowing_seed", "link_seed"])
+def test_a_random_channel_is_recomputed_from_the_recorded_seeds(tmp_path, capsys, seed):
+    values = msgspec.to_builtins(TINY)
+    values["radio"] |= {
+        "shadowing": {"sigma_db": 6.0, "correlation_m": 50.0},
+        "fading": {"model": "rayleigh"},
+    }
+    scenario = from_values(values, "test")
+    recorded = flight(scenario, missions=2)
+    n_steps = sum(message.topic == "/users" for message in recorded)
+    bag = write(tmp_path / "bag", recorded, about(scenario))
+    status, out = verify(capsys, bag)
+    assert status == 0, out
+    for check in ("channel", "world"):
+        assert f"{check}: {n_steps} of {n_steps} steps recomputed, equal to the last bit" in out
+
+    def other(payload):
+        return msgspec.structs.replace(payload, **{seed: getattr(payload, seed) ^ 1})
+
+    status, out = verify(capsys, copy(bag, tmp_path / "changed", changing("users", 1, 2, other)))
+    assert status == 1
+    assert f"users: mission 1, step 2, {seed}: recorded" in out, "the world's"
+    assert "rates: mission 1, step 2, user 0, sinr: recorded" in out, "the channel's"
 
 
 def test_a_recording_that_begins_late_two_flights_and_an_abort(tmp_path, capsys):

@@ -176,9 +176,12 @@ class Flight:
         self._crowd.walk(step - self._crowd.step)
         users_m = self._crowd.positions_m
         at = {"mission": 0, "step": step}
-        self._say("users", payloads.users(self.scenario, users_m, time_ns=stamp_ns, **at))
+        seeds = self._crowd.seeds
+        users = payloads.users(self.scenario, users_m, time_ns=stamp_ns, seeds=seeds, **at)
+        self._say("users", users)
         if self._rates is None or self._rates.step != step:
-            link = world.measure(self.scenario, swayed, users_m, self._collected)
+            drawn = payloads.realization(users, self.scenario)
+            link = world.measure(self.scenario, swayed, users_m, self._collected, drawn=drawn)
             if step:
                 self._data_bits, self._collected = world.collect(
                     self.scenario, link, self._data_bits, self._collected

@@ -4,12 +4,16 @@
 `air_to_ground`  free space and an excess loss, with and without line of sight, whose probability grows with
                  the elevation. Al-Hourani, Kandeepan, Lardner, "Optimal LAP Altitude for Maximum Coverage",
                  IEEE Wireless Communications Letters 3(6), 2014
-`tr_36_777`      3GPP TR 36.777 V15.0.0, "Enhanced LTE support for aerial vehicles", Annex B, tables B-1, B-2
+`gain_map`       path gains from a table: see `gain_map`
+`tr_36_777`      3GPP TR 36.777 V15.0.0, "Enhanced LTE support for aerial vehicles", Annex B, Tables B-1 to 3
 
+Each may have shadowing and fading, and the models with a line of sight may draw it: see `stochastic`.
 docs/channels.md writes the formulas out, and states what this project assumes.
 """
 
 import math
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import msgspec
@@ -17,23 +21,47 @@ from msgspec import Meta
 
 from uav_dc_ros.core import radio
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.grid import Grid
+from uav_dc_ros.core.propagation import gain_map, stochastic
+from uav_dc_ros.core.propagation.stochastic import Fading, Realization, Shadowing
 from uav_dc_ros.core.radio import Interference
+from uav_dc_ros.core.users.settings import UserSettings
 
-# Mean over a link with and without line of sight. `mean_loss_db`: of the losses in dB, as in the letter.
-# `mean_gain`: of the linear gains, which gives the mean received power.
-LineOfSight: TypeAlias = Literal["mean_loss_db", "mean_gain"]
+# A link with and without line of sight. `mean_loss_db`: the mean of the losses in dB, as in the letter.
+# `mean_gain`: that of the linear gains, which gives the mean received power. `drawn`: one of both, by a draw
+# for each user and step.
+LineOfSight: TypeAlias = Literal["mean_loss_db", "mean_gain", "drawn"]
 Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 CarrierHz: TypeAlias = Annotated[float, Meta(ge=1e8, le=1e11)]
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 
-class RadioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="model"):
+class RadioSettings(
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    kw_only=True,
+    omit_defaults=True,
+    tag_field="model",
+):
     """The uplink: keys of every model."""
 
     bandwidth_hz: Positive  # bandwidth B, hertz
     tx_power_w: Positive  # transmit power p of a user, watts
     noise_power_dbm: Annotated[float, Meta(ge=-300, le=100)]  # noise power alpha^2, dBm
+    shadowing: Shadowing | None = None  # none without the table
+    fading: Fading | None = None  # none without the table; `fading.model` names one
+
+    @property
+    def draws_links(self) -> bool:
+        """Whether each step draws the line of sight or the fading of each link."""
+        return self.fading is not None or getattr(self, "line_of_sight", None) == "drawn"
+
+    @property
+    def is_random(self) -> bool:
+        """Whether the channel draws anything."""
+        return self.shadowing is not None or self.draws_links
 
     @property
     def noise_power_w(self) -> float:
@@ -74,7 +102,15 @@ class AerialVehicle(RadioSettings, frozen=True, tag="tr_36_777"):
     interference: Interference  # transmitting users, see `radio.sinr`
 
 
-Radio: TypeAlias = FreeSpace | AirToGround | AerialVehicle
+class GainMap(RadioSettings, frozen=True, tag="gain_map"):
+    """Path gains from a table; see `gain_map.gain_db`."""
+
+    file: str  # of the table, `.npz`; in a scenario's file relative to its folder, here absolute
+    interference: Interference  # transmitting users, see `radio.sinr`
+    sha256: str = ""  # of the file's content, hexadecimal; `scenarios.load` works it out where it is missing
+
+
+Radio: TypeAlias = FreeSpace | AirToGround | AerialVehicle | GainMap
 
 
 class Environment(NamedTuple):
@@ -100,9 +136,11 @@ ENVIRONMENTS = {
 
 
 class Aerial(NamedTuple):
-    """Range and line of sight of one environment of TR 36.777, Table B-1; h is the height, metres.
+    """Range, line of sight and shadowing of one environment of TR 36.777, tables B-1 and B-3.
 
-    p1 = max(p1_slope log10(h) + p1_offset, p1_min), d1 = max(d1_slope log10(h) + d1_offset, 18), metres.
+    p1 = max(p1_slope log10(h) + p1_offset, p1_min), d1 = max(d1_slope log10(h) + d1_offset, 18), metres, and
+    with line of sight sigma = max(sigma_los_db exp(-sigma_los_per_m h), sigma_los_min_db); h is the height,
+    metres.
     """
 
     min_height_m: float  # the UAV flies above it; below, the table refers to users on the ground
@@ -113,13 +151,17 @@ class Aerial(NamedTuple):
     d1_slope: float
     d1_offset: float
     certain_above_m: float  # height above which line of sight is certain
+    sigma_los_db: float
+    sigma_los_per_m: float
+    sigma_los_min_db: float
+    sigma_nlos_db: float  # standard deviation of the shadowing without line of sight
 
 
 AERIAL_MAX_HEIGHT_M = 300.0
 AERIAL = {
-    "rma_av": Aerial(10.0, 10_000.0, 15021.0, -16053.0, 1000.0, 1350.8, -1602.0, 40.0),
-    "uma_av": Aerial(22.5, 4000.0, 4300.0, -3800.0, 0.0, 460.0, -700.0, 100.0),
-    "umi_av": Aerial(22.5, 4000.0, 233.98, -0.95, 0.0, 294.05, -432.94, math.inf),
+    "rma_av": Aerial(10.0, 10_000.0, 15021.0, -16053.0, 1000.0, 1350.8, -1602.0, 40.0, 4.2, 0.0046, 0.0, 6.0),
+    "uma_av": Aerial(22.5, 4000.0, 4300.0, -3800.0, 0.0, 460.0, -700.0, 100.0, 4.64, 0.0066, 0.0, 6.0),
+    "umi_av": Aerial(22.5, 4000.0, 233.98, -0.95, 0.0, 294.05, -432.94, math.inf, 5.0, 0.01, 2.0, 8.0),
 }
 
 
@@ -133,24 +175,41 @@ class Sight(NamedTuple):
 
 def title(values: Radio) -> str:
     """The channel in words: `free_space`, or `air_to_ground, urban, 2 GHz`."""
-    model = str(values.__struct_config__.tag)
-    if isinstance(values, FreeSpace):
-        return model
-    return f"{model}, {values.environment}, {values.carrier_hz / 1e9:g} GHz"
+    parts = [str(values.__struct_config__.tag)]
+    if isinstance(values, GainMap):
+        parts += [Path(values.file).name]
+    elif not isinstance(values, FreeSpace):
+        parts += [values.environment, f"{values.carrier_hz / 1e9:g} GHz"]
+        parts += ["line of sight drawn"] * (values.line_of_sight == "drawn")
+    parts += ["shadowing"] * (values.shadowing is not None)
+    if values.fading is not None:
+        parts.append(f"{values.fading.__struct_config__.tag} fading")
+    return ", ".join(parts)
 
 
 def path_gain(
-    values: Radio, uav_m: Array, users_m: Array, distance_m: Array, cut: Array | None = None
+    values: Radio,
+    uav_m: Array,
+    users_m: Array,
+    distance_m: Array,
+    drawn: Realization | None = None,
+    cut: Array | None = None,
 ) -> Array:
     """Channel power gain, linear, `[..., U]`.
 
     The UAV is at `uav_m` `[..., 3]`, the users on the ground at `users_m` `[..., U, 2]`, and `distance_m`
-    `[..., U]` is their 3D distance, metres. A link that a building cuts (`cut`, bool `[..., U]`) loses
-    `obstruction_loss_db` more in free space, and has no line of sight in the other models.
+    `[..., U]` is their 3D distance, metres. Without what the channel has `drawn`, the gain is that without
+    shadowing and fading, and a line of sight that is to be drawn counts as in `mean_gain`.
+    A link that a building cuts (`cut`, bool `[..., U]`) loses `obstruction_loss_db` more in free space, and
+    has no line of sight in the models with one; a gain map has the buildings in it.
     """
-    if isinstance(values, FreeSpace):
-        gain = radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent)
-        return gain if cut is None else gain * obstruction_gain(values, cut, like=gain)
+    if isinstance(values, FreeSpace | GainMap):
+        if isinstance(values, FreeSpace):
+            gain = radio.path_gain(distance_m, values.ref_gain, values.path_loss_exponent)
+            gain = gain if cut is None else gain * _obstruction_gain(values, cut, like=gain)
+        else:
+            gain = _linear(gain_map.gain_db(values.file, values.sha256, uav_m, users_m))
+        return gain if drawn is None else gain * _random_gain(values, uav_m, users_m, drawn, like=gain)
     ground_m = radio.ground_distance(uav_m, users_m)
     height_m = uav_m[..., 2:3]
     if isinstance(values, AirToGround):
@@ -159,10 +218,12 @@ def path_gain(
         sight = aerial_vehicle_sight(values, height_m, ground_m, distance_m)
     if cut is not None:
         sight = sight._replace(probability=sight.probability * ~cut)
-    return mean_gain(sight, values.line_of_sight)
+    if drawn is None:
+        return mean_gain(sight, values.line_of_sight)
+    return _random_gain_over_sight(values, sight, uav_m, users_m, drawn)
 
 
-def obstruction_gain(values: FreeSpace, cut: Array, like: Array) -> Array:
+def _obstruction_gain(values: FreeSpace, cut: Array, like: Array) -> Array:
     """Gain of the links in free space that a building cuts, linear; 1 for the others, `[..., U]`."""
     loss_db = values.obstruction_loss_db
     assert loss_db is not None, "checked by parse()"
@@ -172,11 +233,57 @@ def obstruction_gain(values: FreeSpace, cut: Array, like: Array) -> Array:
 
 
 def mean_gain(sight: Sight, line_of_sight: LineOfSight) -> Array:
-    """Channel power gain of a link that has line of sight with a probability, linear, `[..., U]`."""
+    """Mean channel power gain of a link that has line of sight with a probability, linear, `[..., U]`."""
     probability, los_db, nlos_db = sight
     if line_of_sight == "mean_loss_db":
         return _linear(-(nlos_db + probability * (los_db - nlos_db)))
     return probability * _linear(-los_db) + (1.0 - probability) * _linear(-nlos_db)
+
+
+def shadowing_sigmas_db(values: Radio, height_m: Array) -> tuple[float | Array, float | Array]:
+    """Standard deviations of the shadowing with and without line of sight, dB, at `height_m` `[..., 1]`.
+
+    Without `sigma_db` those of TR 36.777, Table B-3, heights as in `aerial_vehicle_sight`.
+    """
+    assert values.shadowing is not None, "checked by the caller"
+    sigma_db = values.shadowing.sigma_db
+    if sigma_db is not None:
+        return sigma_db, sigma_db
+    assert isinstance(values, AerialVehicle), "checked by parse()"
+    xp, aerial = array_namespace(height_m), AERIAL[values.environment]
+    height_m = xp.clip(height_m, aerial.min_height_m, AERIAL_MAX_HEIGHT_M)
+    los_db = aerial.sigma_los_db * xp.exp(-aerial.sigma_los_per_m * height_m)
+    return xp.clip(los_db, aerial.sigma_los_min_db, None), aerial.sigma_nlos_db
+
+
+def _random_gain(values: Radio, uav_m: Array, users_m: Array, drawn: Realization, like: Array) -> Array:
+    """Gain of shadowing and fading over a path with one loss, linear, `[..., U]` as `like`."""
+    gain = array_namespace(like).ones_like(like)
+    if values.shadowing is not None:
+        sigma_db, _ = shadowing_sigmas_db(values, uav_m[..., 2:3])
+        gain = _linear(-sigma_db * stochastic.shadowing(drawn.waves, uav_m, users_m))
+    if values.fading is not None:
+        gain = gain * stochastic.fading(values.fading, drawn.link_seed, like=gain)
+    return gain
+
+
+def _random_gain_over_sight(
+    values: AirToGround | AerialVehicle, sight: Sight, uav_m: Array, users_m: Array, drawn: Realization
+) -> Array:
+    """Channel power gain of a link with and without line of sight that draws, linear, `[..., U]`."""
+    if values.shadowing is not None:
+        los_db, nlos_db = shadowing_sigmas_db(values, uav_m[..., 2:3])
+        relative = stochastic.shadowing(drawn.waves, uav_m, users_m)
+        sight = Sight(sight.probability, sight.los_db + los_db * relative, sight.nlos_db + nlos_db * relative)
+    line_of_sight = None
+    if values.line_of_sight == "drawn":
+        line_of_sight = stochastic.has_line_of_sight(sight.probability, drawn.link_seed)
+        gain = _linear(-array_namespace(sight.los_db).where(line_of_sight, sight.los_db, sight.nlos_db))
+    else:
+        gain = mean_gain(sight, values.line_of_sight)
+    if values.fading is not None:
+        gain = gain * stochastic.fading(values.fading, drawn.link_seed, gain, line_of_sight)
+    return gain
 
 
 def air_to_ground_sight(values: AirToGround, height_m: Array, ground_m: Array, distance_m: Array) -> Sight:
@@ -228,3 +335,36 @@ def aerial_vehicle_sight(values: AerialVehicle, height_m: Array, ground_m: Array
 
 def _linear(gain_db: Array) -> Array:
     return array_namespace(gain_db).exp((math.log(10.0) / 10.0) * gain_db)
+
+
+def inconsistencies(values: Radio, grid: Grid, users: UserSettings | None, mission_s: float) -> Iterator[str]:
+    """Errors of an uplink for a grid and users, in missions of `mission_s`, seconds.
+
+    Without `users`, which have errors of their own, those that do not depend on them.
+    """
+    has_sigma = values.shadowing is None or values.shadowing.sigma_db is not None
+    if not has_sigma and not isinstance(values, AerialVehicle):
+        yield "missing key radio.shadowing.sigma_db: only radio.model = 'tr_36_777' has values of its own"
+    if isinstance(values, GainMap) and users is not None:
+        area_m = users.area_m(grid, mission_s)
+        yield from gain_map.inconsistencies(values.file, values.sha256, grid, area_m)
+    if not isinstance(values, AerialVehicle):
+        return
+    aerial, top_m = AERIAL[values.environment], grid.altitude_min_m + (grid.n_z - 1) * grid.altitude_step_m
+    if grid.altitude_min_m <= aerial.min_height_m or top_m > AERIAL_MAX_HEIGHT_M:
+        yield (
+            f"grid: altitudes {grid.altitude_min_m:g} to {top_m:g} m; expected above "
+            f"{aerial.min_height_m:g} and up to {AERIAL_MAX_HEIGHT_M:g} m, the range of "
+            f"radio.environment = {values.environment!r}"
+        )
+    corners_m = [
+        (x * (grid.n_x - 1) * grid.cell_m, y * (grid.n_y - 1) * grid.cell_m) for x in (0, 1) for y in (0, 1)
+    ]
+    for disc in () if users is None else users.start_discs():
+        distance_m = max(math.dist(disc.centre_m, corner_m) for corner_m in corners_m) + disc.radius_m
+        if distance_m > aerial.max_ground_distance_m:
+            yield (
+                f"{disc.key} = {list(disc.centre_m)}: its disc reaches {distance_m:.0f} m from "
+                f"a corner of the grid; expected at most {aerial.max_ground_distance_m:g} m, the range of "
+                f"radio.environment = {values.environment!r}"
+            )

@@ -19,6 +19,8 @@ import numpy as np
 from msgspec import Meta
 
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.propagation.counter_random import seed_of
+from uav_dc_ros.core.propagation.stochastic import Seeds
 
 if TYPE_CHECKING:  # a scenario holds a `Mobility`
     from uav_dc_ros.core.scenario import Scenario
@@ -215,8 +217,11 @@ class WalkingUsers:
         self._scenario = scenario
         self._rng = np.random.default_rng(seed)
         self.step = 0  # steps walked
+        draws = self._draws()
+        # Of the first user: the channel's seeds come from them.
+        self._first_draws = self._step_draws = self._next_draws = draws[:1]
         self.positions_m: Array  # current positions, metres, `[U, 2]`
-        self.positions_m, self._motion = begin(scenario, self._draws())
+        self.positions_m, self._motion = begin(scenario, draws)
         self._next: tuple[Array, Array] | None = None  # positions and motion after the next step
 
     def walk(self, steps: int = 1) -> None:
@@ -225,13 +230,34 @@ class WalkingUsers:
             self.next_m()
             assert self._next is not None, "set by next_m()"
             (self.positions_m, self._motion), self._next = self._next, None
+            self._step_draws = self._next_draws
             self.step += 1
 
     def next_m(self) -> Array:
         """Positions after the next step, metres, `[U, 2]`; drawn once."""
         if self._next is None:
-            self._next = move(self._scenario, self.positions_m, self._motion, self._draws())
+            draws = self._draws()
+            self._next, self._next_draws = (
+                move(self._scenario, self.positions_m, self._motion, draws),
+                draws[:1],
+            )
         return self._next[0]
+
+    @property
+    def seeds(self) -> Seeds | None:
+        """The channel's seeds in the current step; None: the channel is not random."""
+        return self._seeds(self._step_draws)
+
+    @property
+    def next_seeds(self) -> Seeds | None:
+        """The channel's seeds in the next step."""
+        self.next_m()
+        return self._seeds(self._next_draws)
+
+    def _seeds(self, draws: Array) -> Seeds | None:
+        if not self._scenario.radio.is_random:
+            return None
+        return Seeds(int(seed_of(self._first_draws)), int(seed_of(draws)))
 
     def _draws(self) -> Array:
         return self._rng.random(self._scenario.draws_shape)

@@ -19,8 +19,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from uav_dc_ros.core import channel
 from uav_dc_ros.core.arrays import Array, constant
-from uav_dc_ros.core.channel import AERIAL, AERIAL_MAX_HEIGHT_M, AerialVehicle, FreeSpace, Radio
+from uav_dc_ros.core.channel import FreeSpace, Radio
 from uav_dc_ros.core.energy import EnergySettings, StepEnergies
 from uav_dc_ros.core.grid import Grid
 from uav_dc_ros.core.keys import leaves, path_of
@@ -196,6 +197,7 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
         del world["reward"]
         if isinstance(self.radio, FreeSpace):
             del world["radio"]["model"]  # which scenarios of version 0.2.0 lack
+        world["radio"].pop("file", None)  # its content counts, not its place
         if isinstance(self.users.moves, RandomWalk):
             world["users"].pop("mobility", None)  # likewise
         return hashlib.sha256(msgspec.json.encode(world, order="sorted")).hexdigest()[:12]
@@ -366,31 +368,8 @@ def inconsistencies(scenario: Scenario) -> Iterator[str]:
             )
     if scenario.energy is not None:
         yield from scenario.energy.inconsistencies(grid, mission.step_s, mission.max_steps, moves)
-    if isinstance(scenario.radio, AerialVehicle) and not of_users:
-        yield from _out_of_range(scenario, scenario.radio.environment, top_m)
-
-
-def _out_of_range(scenario: Scenario, environment: str, top_m: float) -> Iterator[str]:
-    """Errors of a grid outside the heights and distances of an environment of TR 36.777."""
-    grid = scenario.grid
-    aerial = AERIAL[environment]
-    if grid.altitude_min_m <= aerial.min_height_m or top_m > AERIAL_MAX_HEIGHT_M:
-        yield (
-            f"grid: altitudes {grid.altitude_min_m:g} to {top_m:g} m; expected above "
-            f"{aerial.min_height_m:g} and up to {AERIAL_MAX_HEIGHT_M:g} m, the range of "
-            f"radio.environment = {environment!r}"
-        )
-    corners_m = [
-        (x * (grid.n_x - 1) * grid.cell_m, y * (grid.n_y - 1) * grid.cell_m) for x in (0, 1) for y in (0, 1)
-    ]
-    for disc in scenario.users.start_discs():
-        distance_m = max(math.dist(disc.centre_m, corner_m) for corner_m in corners_m) + disc.radius_m
-        if distance_m > aerial.max_ground_distance_m:
-            yield (
-                f"{disc.key} = {list(disc.centre_m)}: its disc reaches {distance_m:.0f} m from "
-                f"a corner of the grid; expected at most {aerial.max_ground_distance_m:g} m, the range of "
-                f"radio.environment = {environment!r}"
-            )
+    mission_s = mission.max_steps * mission.step_s
+    yield from channel.inconsistencies(scenario.radio, grid, None if of_users else scenario.users, mission_s)
 
 
 def _number_or_array(value: float | tuple[float, ...], like: Array) -> float | Array:

@@ -11,6 +11,9 @@ from typing import TypeAlias
 from uav_dc_ros.core import channel, energy, mission, mobility, observations, radio, reward
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
 from uav_dc_ros.core.observations import Observation
+from uav_dc_ros.core.propagation import stochastic
+from uav_dc_ros.core.propagation.counter_random import seed_of
+from uav_dc_ros.core.propagation.stochastic import Realization
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 
@@ -38,6 +41,7 @@ class State:
     mission_reward: Array  # reward of the mission so far, see `reward.mission_reward`, `[...]`
     energy_used_j: Array  # energy of the steps flown, joules, `[...]`; 0 in a scenario without `energy`
     motion: Array  # what the users' mobility remembers, see `mobility.move`, `[..., U, 0 to 4]`
+    waves: Array  # of the mission's shadowing, see `stochastic.waves`; without shadowing `[..., 1, 0]`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +69,9 @@ def initial(scenario: Scenario, draws: Array) -> State:
     zero = xp.sum(zeros, axis=-1)
     step = xp.astype(zero, xp.int64)
     users_m, motion = mobility.begin(scenario, draws)
+    shadowing, waves = scenario.radio.shadowing, zeros[..., None, :0]
+    if shadowing is not None:
+        waves = stochastic.waves(shadowing, seed_of(draws), zeros)
     return State(
         step=step,
         cell=step[..., None] + constant(scenario.start_cell, step),
@@ -75,21 +82,28 @@ def initial(scenario: Scenario, draws: Array) -> State:
         mission_reward=zero,
         energy_used_j=zero,
         motion=motion,
+        waves=waves,
     )
 
 
 def measure(
-    scenario: Scenario, uav_m: Array, users_m: Array, collected: Array, transmitting: Array | None = None
+    scenario: Scenario,
+    uav_m: Array,
+    users_m: Array,
+    collected: Array,
+    transmitting: Array | None = None,
+    drawn: Realization | None = None,
 ) -> Link:
     """The channel with the UAV at `uav_m` `[..., 3]` and the users at `users_m` `[..., U, 2]`, metres.
 
-    `transmitting`: the users that send, bool `[..., U]`; None: all.
+    `transmitting`: the users that send, bool `[..., U]`; None: all. `drawn`: by a channel that is random;
+    without it, see `channel.path_gain`.
     """
     values = scenario.radio
     distance_m = radio.distance(uav_m, users_m)
     served = mission.served(distance_m, collected, scenario.mission.d_cons_m)
     cut = None if scenario.buildings is None else scenario.buildings.cut(uav_m, users_m)
-    gain = channel.path_gain(values, uav_m, users_m, distance_m, cut)
+    gain = channel.path_gain(values, uav_m, users_m, distance_m, drawn, cut)
     if transmitting is not None:
         served, gain = served & transmitting, gain * transmitting
     sinr = radio.sinr(gain, values.tx_power_w, values.noise_power_w, values.interference, served)
@@ -179,7 +193,8 @@ def step(
     cell = move(scenario, state.cell, action)
     users_m, motion = mobility.move(scenario, state.users_m, state.motion, draws)
     uav_m = scenario.grid.centre_m(cell, like=users_m)
-    link = measure(scenario, uav_m, users_m, state.collected, transmitting)
+    drawn = Realization(state.waves, seed_of(draws)) if scenario.radio.is_random else None
+    link = measure(scenario, uav_m, users_m, state.collected, transmitting, drawn)
     data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
     values = rewards or scenario.reward
     counted_bits = counted_data(scenario, link.served, link.rate_bps, data_bits, rewards)
@@ -198,6 +213,7 @@ def step(
         mission_reward=reward.mission_reward(state.mission_reward, total, n_rewards, values.data),
         energy_used_j=used_j,
         motion=motion,
+        waves=state.waves,
     )
     agent_reward = reward.step_reward(total, state.total_reward, values.form)
     return after, Outcome(

@@ -1,7 +1,8 @@
 """The channel and rate monitor: SINR and rate of each user, and the data collected from them.
 
-It subscribes to positions only, so it is the same with a simulated and a real vehicle. A monitor that was
-killed restores the collected data from its journal.
+It subscribes to positions only, so it is the same with a simulated and a real vehicle. The users' positions
+come with the seeds of a random channel. A monitor that was killed restores the collected data from its
+journal.
 """
 
 from collections import deque
@@ -134,7 +135,8 @@ class ChannelMonitorNode(MissionNode):
             )
             self.reject("users", MessageError("gap", gap))
         data_bits, collected = self._data_bits, self._collected
-        link = core.measure(self.scenario, uav_m, users_m, collected)
+        drawn = payloads.realization(users, self.scenario)
+        link = core.measure(self.scenario, uav_m, users_m, collected, drawn=drawn)
         if users.step > 0:  # step 0 is the start: no time has passed to collect in
             data_bits, collected = core.collect(self.scenario, link, data_bits, collected)
         rates = payloads.rates(

@@ -25,6 +25,7 @@ from uav_dc_ros.core import world as core
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.mobility import WalkingUsers
+from uav_dc_ros.core.propagation.stochastic import Seeds
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
@@ -94,7 +95,13 @@ class ExternalUsers:
             self._users, self._mission = WalkingUsers(self._scenario, self._seed + mission), mission
         self._users.walk(step - self._users.step)
         return payloads.users(
-            self._scenario, self._users.positions_m, mission=mission, step=step, time_ns=stamp_ns, run=run
+            self._scenario,
+            self._users.positions_m,
+            mission=mission,
+            step=step,
+            time_ns=stamp_ns,
+            run=run,
+            seeds=self._users.seeds,
         )
 
 
@@ -301,18 +308,27 @@ class WorldNode(MissionNode):
         if self._next_users is not None and self._next_users[:2] == (self._mission, self._step):
             self.publish_encoded("users", self._next_users[2])
         else:
-            self.publish_encoded("users", self._encode_users(self._step, self._users.positions_m))
+            self.publish_encoded(
+                "users", self._encode_users(self._step, self._users.positions_m, self._users.seeds)
+            )
         self.publish_payload("mission", self._status())
         self.publish("target", pose)  # a simulated vehicle is at its target
         if self.pace is None and self._phase is Phase.READY:  # while the other nodes compute
             step = self._step + 1
-            self._next_users = self._mission, step, self._encode_users(step, self._users.next_m())
+            text = self._encode_users(step, self._users.next_m(), self._users.next_seeds)
+            self._next_users = self._mission, step, text
 
-    def _encode_users(self, step: int, users_m: Array) -> bytes:
+    def _encode_users(self, step: int, users_m: Array, seeds: Seeds | None) -> bytes:
         """The encoded `users` of a step at `users_m`, metres, `[U, 2]`."""
         time_ns = self.scenario.time_ns(self._mission, step)
         users = payloads.users(
-            self.scenario, users_m, mission=self._mission, step=step, time_ns=time_ns, run=self.run
+            self.scenario,
+            users_m,
+            mission=self._mission,
+            step=step,
+            time_ns=time_ns,
+            run=self.run,
+            seeds=seeds,
         )
         return messages.encode(users)
 

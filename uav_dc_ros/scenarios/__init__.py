@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from uav_dc_ros.core.propagation import gain_map
 from uav_dc_ros.core.scenario import Scenario, from_values, read_values
 from uav_dc_ros.errors import ScenarioError
 from uav_dc_ros.scenarios.user_files import with_users
@@ -41,7 +42,11 @@ def load(name_or_path: str | Path) -> Scenario:
 
 
 def with_files(values: dict[str, Any], folder: Path, source: str) -> dict[str, Any]:
-    """Plain values of a scenario with what is in its files, relative to `folder`; raises ScenarioError."""
+    """Plain values of a scenario with what is in its files, relative to `folder`; raises ScenarioError.
+
+    A gain map stays in its file: the values get its absolute path and its SHA-256.
+    """
+    values = gain_map.with_absolute_path(values, folder, source)
     return with_users(with_zones(values, folder, source), folder, source)
 
 

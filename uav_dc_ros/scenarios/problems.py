@@ -17,6 +17,7 @@ import msgspec
 
 from uav_dc_ros.core import scenario as core
 from uav_dc_ros.core.keys import path_of
+from uav_dc_ros.core.propagation import gain_map
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ScenarioError, UnknownKeyError
 from uav_dc_ros.scenarios import with_files
@@ -89,7 +90,11 @@ def _problems(text: str, folder: Path) -> Iterator[Problem]:
     meant: dict[Key, Key] = {}  # keys, and how they are misspelt in the file
     hidden: list[Key] = []  # tables that are not checked further
     fit = True
-    resolves: tuple[tuple[Key, Any], ...] = ((("zones",), with_zones), (("users", "file"), with_users))
+    resolves: tuple[tuple[Key, Any], ...] = (
+        (("zones",), with_zones),
+        (("users", "file"), with_users),
+        (("radio", "sha256"), gain_map.with_absolute_path),
+    )
     for key, resolve in resolves:
         try:
             values = resolve(values, folder, "")

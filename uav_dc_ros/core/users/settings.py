@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from uav_dc_ros.core.grid import Grid
-from uav_dc_ros.core.mobility import Mobility, RandomWalk, RandomWaypoint
+from uav_dc_ros.core.mobility import GaussMarkov, Mobility, RandomWalk, RandomWaypoint
 
 CLUSTERS_MAX = 1000
 USERS_MAX = 100_000
@@ -193,6 +193,21 @@ class UserSettings(
         for i, user in enumerate(self.user):
             name = "" if user.name is None else f" ({user.name})"
             yield Disc(f"users.user[{i}]{name}", (user.x_m, user.y_m), user.radius_m)
+
+    def area_m(self, grid: Grid, mission_s: float) -> tuple[float, float, float, float]:
+        """Where users may get to in a mission of `mission_s`, seconds: limits west, south, east, north, m."""
+        reach_m = (self.v_max_mps or 0.0) * mission_s  # of the random walk
+        corners_m: list[Point] = []
+        for disc in self.start_discs():
+            (x_m, y_m), way_m = disc.centre_m, disc.radius_m + reach_m
+            corners_m += ((x_m - way_m, y_m - way_m), (x_m + way_m, y_m + way_m))
+        model = self.moves
+        if isinstance(model, GaussMarkov) or (
+            isinstance(model, RandomWaypoint) and model.waypoints == "field"
+        ):
+            corners_m += grid.area_m
+        x_all_m, y_all_m = zip(*corners_m, strict=True)
+        return min(x_all_m), min(y_all_m), max(x_all_m), max(y_all_m)
 
     def outside(self, grid: Grid) -> Iterator[str]:
         """Errors of listed users outside the area of the grid's cells."""

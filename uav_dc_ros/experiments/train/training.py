@@ -176,6 +176,7 @@ class Training:
         state.setdefault("mission_reward", state["total_reward"])
         state.setdefault("energy_used_j", 0.0 * state["total_reward"])  # nor that: they have no battery
         state.setdefault("motion", state["users_m"][..., :0])  # nor that: their users walk at random
+        state.setdefault("waves", state["data_bits"][..., None, :0])  # nor shadowing
         self._worlds.state = State(**state)
         self._stats.restore(in_worlds("books"))
         self.n_flown = values["n_flown"]

@@ -159,7 +159,9 @@ class ChannelCheck(Check):
     def _measure(
         self, step: RecordedStep, uav_m: Array, users_m: Array, before: Collection
     ) -> tuple[world.Link, Collection]:
-        link = world.measure(self._scenario, uav_m, users_m, before[1])
+        assert step.users is not None, "the caller has its positions"
+        drawn = payloads.realization(step.users, self._scenario)
+        link = world.measure(self._scenario, uav_m, users_m, before[1], drawn=drawn)
         return link, world.collect(self._scenario, link, *before) if step.step else before
 
     def _compare(
@@ -307,9 +309,10 @@ class WorldCheck(Check):
             if self._users is None or self._users_seed != seed or self._users.step > step.step:
                 self._users, self._users_seed = WalkingUsers(scenario, seed), seed
             self._users.walk(step.step - self._users.step)
-            users_m = self._users.positions_m
-            users = payloads.users(scenario, users_m, mission=step.mission, step=step.step, time_ns=time_ns)
-            for name in (*(() if self._real else ("stamp_ns",)), "cluster", "x_m", "y_m"):
+            at: dict[str, Any] = {"mission": step.mission, "step": step.step, "time_ns": time_ns}
+            users = payloads.users(scenario, self._users.positions_m, seeds=self._users.seeds, **at)
+            names = ("cluster", "x_m", "y_m", "shadowing_seed", "link_seed")
+            for name in names if self._real else ("stamp_ns", *names):
                 found += self.compare(step, "users", name, getattr(step.users, name), getattr(users, name))
         return found
 

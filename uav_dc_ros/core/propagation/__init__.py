@@ -1,0 +1,1 @@
+"""Parts of channels beyond path loss: what they draw, and gains from tables."""
