@@ -16,6 +16,7 @@ from tests.conftest import Ros, but_run, each_once, finish, read_bag
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.users.service import FIGURES
 from uav_dc_ros.env.registration import ENV_ID
 from uav_dc_ros.topics import TOPICS
 
@@ -143,6 +144,7 @@ def test_the_summaries_are_the_environment_s_numbers(flown: Flown, simulated: li
             "reward_data": "so_far",
             "reason": "",
             "steps_not_reached": 0,
+            **{name: pytest.approx(float(last[name])) for name in FIGURES},
             "bag": str(flown.bag),
         }
 

@@ -130,6 +130,7 @@ class WorldNode(MissionNode):
         self._is_flying = False
         self._mission, self._step = -1, 0
         self._phase: Phase | None = None  # None before the first mission
+        self._energy_used_j: Array = np.asarray(0.0)
         self._action: Action | None = None  # received for this step
         self._step_at_tick: tuple[int, int] | None = None
         self._next_users: tuple[int, int, bytes] | None = None  # mission, step, encoded payload
@@ -200,7 +201,7 @@ class WorldNode(MissionNode):
         self._mission, self._step = mission, 0
         self._users = WalkingUsers(self.scenario, self.values["seed"] + mission)
         self._cell = np.asarray(self.scenario.start_cell)
-        self._energy_used_j: Array = np.asarray(0.0)
+        self._energy_used_j = np.asarray(0.0)
         self._phase = Phase.READY
         self._action = None
 

@@ -142,9 +142,11 @@ class MissionTotals:
     seed: int | None = None
     scenario: str | None = None
     fingerprint: str | None = None
-    # Of the steps with rates; before the first ones unknown
-    _service: ServiceRecord | None = field(default=None, init=False, repr=False)
-    _user_bits: Array | None = field(default=None, init=False, repr=False)  # data at the last rates, `[U]`
+
+    def __post_init__(self) -> None:
+        """Attributes that are no fields: JSON does not hold them. Before the first rates they are unknown."""
+        self._service: ServiceRecord | None = None  # of the steps with rates
+        self._user_bits: Array | None = None  # data at the last rates, `[U]`
 
     @property
     def is_over(self) -> bool:
