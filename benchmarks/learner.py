@@ -2,12 +2,15 @@
 
     python benchmarks/learner.py [--peer PYTHON] [--seconds S] [--rounds N]
     python benchmarks/learner.py --profile
+    python benchmarks/learner.py --device cuda [--runs N ...]
 
 An agent-step is one environment step and one gradient step of batch 32. World, observation (position),
 network (two hidden layers of 64), batch and buffer are those of `benchmarks/sb3_dqn.py`, which runs in
 PYTHON, an interpreter that has stable-baselines3, by turns with this. Each line but the last two is one
 batch in one process on one core; those are as the sweep does it, shards of 128 runs in two processes at
-a time. Imports are not counted on either side. With --profile: where the time of a shard goes.
+a time. Imports are not counted on either side. With --profile: where the time of a shard goes. With
+--device: agent-steps per second of one batch there, beside those of one core of the host, and how far the
+parameters of both lie apart after the first episode.
 """
 
 import argparse
@@ -20,11 +23,13 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from queue import Queue
 
 import msgspec
+import numpy as np
 import torch
 
 from uav_dc_ros import scenarios
@@ -36,7 +41,7 @@ SHARD = 128
 PEER = Path(__file__).with_name("sb3_dqn.py")
 
 
-def population(n_runs: int) -> Population:
+def population(n_runs: int, buffer_size: int = 50_000) -> Population:
     """Runs of both algorithms and both forms of the reward, as a sweep has them."""
     scenario = scenarios.load("five_clusters")
     runs = [
@@ -45,7 +50,7 @@ def population(n_runs: int) -> Population:
             environment=i % 5,
             algorithm=("dqn", "dueling_dqn")[i % 2],
             reward=msgspec.structs.replace(scenario.reward, form=("immediate", "episode")[i // 2 % 2]),
-            hyperparameters=Hyperparameters(episodes=100_000, buffer_size=50_000),
+            hyperparameters=Hyperparameters(episodes=100_000, buffer_size=buffer_size),
         )
         for i in range(n_runs)
     ]
@@ -112,6 +117,55 @@ def profile() -> None:
         )
 
 
+def rate_on(training: Training, seconds: float) -> float:
+    """Agent-steps per second on the training's device, after one episode that is not counted."""
+    device = training.device
+    training.fly_episode()
+    _wait_for(device)
+    started, steps = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        training.fly_episode()
+        _wait_for(device)
+        steps += len(training.population.runs) * training.population.scenario.mission.max_steps
+    return steps / (time.perf_counter() - started)
+
+
+def _wait_for(device: torch.device) -> None:
+    """Returns when the device has done what it was given: calls to it return before that."""
+    if device.type != "cpu":
+        torch.accelerator.synchronize(device)
+
+
+def differences(n_runs: int, device: torch.device) -> list[float]:
+    """The largest difference of a parameter between the device and the CPU after one episode, of each run."""
+    pair = [Training(population(n_runs, buffer_size=1_000), place) for place in (torch.device("cpu"), device)]
+    for training in pair:
+        training.fly_episode()
+    apart = []
+    for run in range(n_runs):
+        host, there = (training.learner.parameters(run) for training in pair)
+        apart.append(max(float(np.abs(host[name] - there[name]).max()) for name in host))
+    return apart
+
+
+def on_device(device: torch.device, sizes: Sequence[int], seconds: float) -> None:
+    """Prints what a device does, beside one core of the host."""
+    prepare_torch(n_threads=1)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
+    print(f"{name}, torch {torch.__version__}")
+    print("| runs | agent-steps/s | on one core | ratio | largest difference, worst run | median run |")
+    print("|---|---|---|---|---|---|")
+    for n_runs in sizes:
+        rate = rate_on(Training(population(n_runs), device), seconds)
+        host = rate_on(Training(population(n_runs, buffer_size=1_000), torch.device("cpu")), seconds)
+        apart = differences(n_runs, device)
+        print(
+            f"| {n_runs:,} | {rate:,.0f} | {host:,.0f} | {rate / host:.1f} "
+            f"| {max(apart):.1e} | {statistics.median(apart):.1e} |",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -119,7 +173,12 @@ def main() -> None:
     parser.add_argument("--seconds", default=6.0, type=float, metavar="S", help="of each measurement")
     parser.add_argument("--rounds", default=5, type=int, metavar="N")
     parser.add_argument("--profile", action="store_true")
+    parser.add_argument("--device", type=torch.device, metavar="DEVICE", help="such as cuda")
+    parser.add_argument("--runs", default=[1340, 4096], type=int, nargs="+", metavar="N", help="on DEVICE")
     options = parser.parse_args()
+    if options.device:
+        on_device(options.device, options.runs, options.seconds)
+        return
     if options.profile:
         profile()
         return
