@@ -27,6 +27,7 @@ from uav_dc_ros.experiments.train.progress import ProgressBar
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.paper.results import Results
     from uav_dc_ros.experiments.paper.sweep import Networks
+    from uav_dc_ros.experiments.paper.worlds.draw import World
     from uav_dc_ros.experiments.paper.worlds.verdicts import Multiverse
 
 PROG = "python -m uav_dc_ros.paper"
@@ -51,6 +52,8 @@ def main(argv: list[str] | None = None) -> None:
     add("--only", nargs="+", metavar="FIGURE", help="these figures, and the claims that they can decide")
     text = "instead of the sweep, weigh the claims in N worlds drawn over what the paper leaves open"
     add("--worlds", type=cli.count, metavar="N", help=text)
+    text = "with --worlds: weigh C1 alone in N more worlds, and all claims in those in which it holds"
+    add("--screen", type=cli.count, metavar="N", help=text)
     add("--out", type=Path, metavar="DIR", default=Path("paper_results"), help="folder to make")
     add("--resume", action="store_true", help="resume the sweep in --out, or draw a finished one again")
     add("--workers", default=_cores(), type=cli.count, metavar="N", help="processes, each on one core")
@@ -68,6 +71,8 @@ def _paper(options: argparse.Namespace, command: str) -> int:
         raise TrainingError(f"torch {FROM_TRAIN}")
     if options.worlds is not None:
         return _weigh_worlds(options)
+    if options.screen is not None:
+        raise TrainingError("--screen without --worlds; expected both")
     scale, out = _scale(options), options.out
     planned = plan.runs(scale, options.only)
     if out.exists() and not options.resume:
@@ -114,6 +119,7 @@ def _weigh_worlds(options: argparse.Namespace) -> int:
     from uav_dc_ros.experiments.paper.worlds.verdicts import VERDICTS_FILE, Multiverse
 
     scale, out, n = plan.SCALES[options.scale], options.out, options.worlds
+    n_screened = options.screen or 0
     if options.only is not None or options.block:
         raise TrainingError(
             "--worlds with --only or --block; expected neither: its runs are those of the claims"
@@ -122,11 +128,11 @@ def _weigh_worlds(options: argparse.Namespace) -> int:
         raise TrainingError(f"{out} exists; expected a new folder, or --resume")
     if (out / VERDICTS_FILE).is_file():
         multiverse = Multiverse.load(out)
-        kept = multiverse.metadata.scale.name, len(multiverse.worlds)
-        if kept != (scale.name, n):
+        kept = multiverse.metadata.scale.name, len(multiverse.drawn.worlds), len(multiverse.screened)
+        if kept != (scale.name, n, n_screened):
             raise TrainingError(
-                f"{out} has {kept[1]} worlds of the scale {kept[0]!r} and is finished; "
-                f"expected {n} of {scale.name!r}, or another --out"
+                f"{out} has {kept[1]} worlds and {kept[2]} screened ones of the scale {kept[0]!r} and is "
+                f"finished; expected {n} and {n_screened} of {scale.name!r}, or another --out"
             )
     else:
         try:
@@ -145,18 +151,37 @@ def _train_worlds(options: argparse.Namespace) -> "Multiverse":
     from uav_dc_ros.experiments.paper.worlds import draw, plan, verdicts
 
     scale, folder = plan.SCALES[options.scale], options.out / "shards"
-    worlds, rejected = draw.worlds(options.worlds)
+    drawn, rejected = draw.worlds(options.worlds)
     # The first worlds of any number are the same, and so are their shards.
     _reserve(folder, {"worlds": "any number", "scale": options.scale})
-    shards = [plan.make_shards(world, scale) for world in worlds]
-    _train_missing([shard for of_world in shards for shard, _ in of_world], folder, options)
-    rows = [
-        row
-        for world, of_world in zip(worlds, shards, strict=True)
-        for row in verdicts.rows(world, plan.findings(world, scale, sweep.load_results(of_world, folder)))
-    ]
-    metadata = verdicts.MultiverseMetadata(scale=scale, rejected=rejected)
-    multiverse = verdicts.Multiverse(metadata=metadata, worlds=tuple(worlds), rows=tuple(rows))
+
+    def weigh(worlds: "Sequence[World]", *, screening: bool = False) -> "list[verdicts.Row]":
+        make = plan.make_screening_shards if screening else plan.make_shards
+        shards = [make(world, scale) for world in worlds]
+        _train_missing([shard for of_world in shards for shard, _ in of_world], folder, options)
+        return [
+            row
+            for world, of_world in zip(worlds, shards, strict=True)
+            for row in verdicts.rows(
+                world,
+                plan.findings(world, scale, sweep.load_results(of_world, folder), screening=screening),
+            )
+        ]
+
+    rows, screened, found = weigh(drawn), [], []
+    if options.screen is not None:
+        worlds = plan.screening_worlds(options.worlds, options.screen)
+        screened = weigh(worlds, screening=True)
+        promising = {row.world for row in screened if row.verdict == "holds"}
+        found = [world for world in worlds if world.number in promising]
+        rows += weigh(found)
+    n_drawn = None if options.screen is None else len(drawn)
+    multiverse = verdicts.Multiverse(
+        metadata=verdicts.MultiverseMetadata(scale=scale, rejected=rejected, n_drawn=n_drawn),
+        worlds=(*drawn, *found),
+        rows=tuple(rows),
+        screened=tuple(screened),
+    )
     multiverse.save(options.out)
     return multiverse
 

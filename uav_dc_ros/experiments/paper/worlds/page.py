@@ -15,8 +15,13 @@ from uav_dc_ros.experiments.paper.worlds.choices import CHOICES, FIXED, PLACES, 
 from uav_dc_ros.experiments.paper.worlds.choose import implausibility, ranking
 from uav_dc_ros.experiments.paper.worlds.draw import World
 from uav_dc_ros.experiments.paper.worlds.figure import draw
-from uav_dc_ros.experiments.paper.worlds.shares import ClaimShares, Decider, Share, summaries
-from uav_dc_ros.experiments.paper.worlds.verdicts import VERDICTS_FILE, WORLDS_FILE, Multiverse
+from uav_dc_ros.experiments.paper.worlds.shares import ClaimShares, Decider, Share, share, summaries
+from uav_dc_ros.experiments.paper.worlds.verdicts import (
+    SCREENED_FILE,
+    VERDICTS_FILE,
+    WORLDS_FILE,
+    Multiverse,
+)
 
 PAGE_FILE, FIGURE_FILE = "worlds.md", "worlds.png"
 _BEST = 5  # worlds of the ranking that are shown
@@ -25,7 +30,7 @@ _TITLES = {one.name: one.title for one in (*CHOICES, *PLACES)}
 
 def write(multiverse: Multiverse, folder: Path) -> None:
     """Writes the page, its figure, and the chosen world's scenarios, into an existing folder."""
-    draw(multiverse, folder / FIGURE_FILE)
+    draw(multiverse.drawn, folder / FIGURE_FILE)
     files.write(folder / PAGE_FILE, worlds_md(multiverse).encode())
     ranked = ranking(multiverse)
     for name in plan.SCENARIOS if len(ranked) else ():
@@ -35,12 +40,13 @@ def write(multiverse: Multiverse, folder: Path) -> None:
 
 def worlds_md(multiverse: Multiverse) -> str:
     """The text of `worlds.md`."""
-    scale, n = multiverse.metadata.scale, len(multiverse.worlds)
+    scale, drawn = multiverse.metadata.scale, multiverse.drawn
+    n = len(drawn.worlds)
     warning = (
         f"> **The scale is `{scale.name}`: {scale.episodes} episodes. These verdicts mean nothing.** "
         "They show that every part of this page can be made."
     )
-    found = summaries(multiverse)
+    found = summaries(drawn)
     sections = [
         "# The paper's claims in many worlds",
         *([] if scale.name == "full" else [warning]),
@@ -49,7 +55,7 @@ def worlds_md(multiverse: Multiverse) -> str:
         "A claim that holds in few worlds owes much to choices that the paper does not state.",
         f"![Claims by worlds]({FIGURE_FILE})",
         "## The claims",
-        _claims(found, multiverse),
+        _claims(found, drawn),
         "Each share has its 95% interval (Wilson). The choices that decide a claim are the two that give "
         "most information on its verdict: 0 is none, 1 is all of it (mutual information adjusted for "
         "chance; Vinh, Epps and Bailey, JMLR 11, 2010). Numbers are taken in three classes of equal size. "
@@ -138,6 +144,8 @@ def _chosen(multiverse: Multiverse) -> str:
         ("reference", "value", "why"),
         [(f"`{one.name}`", f"{one.value:g}", one.reason) for one in REFERENCES],
     )
+    if multiverse.screened:
+        rule += f" {_screening(multiverse)}"
     if not len(ranked):
         return f"{rule}\n\n{references}\n\nC1 holds in no world: none is chosen."
     best = [
@@ -146,12 +154,27 @@ def _chosen(multiverse: Multiverse) -> str:
     ]
     world = multiverse.worlds[ranked[0]]
     text = (
-        f"C1 holds in {len(ranked)} of {len(holds)} worlds; the first {len(best)} of the rule's order are "
+        f"C1 holds in {len(ranked)} of the {len(holds)} worlds in which every claim was weighed; the first "
+        f"{len(best)} of the rule's order are "
         f"below. World {world.number} is chosen; its scenarios are `chosen_five_clusters.toml` and "
         "`chosen_three_clusters.toml`."
     )
     ranks = _table(("world", "claims that hold", "distance from plausible, doublings"), best)
     return f"{rule}\n\n{references}\n\n{text}\n\n{ranks}"
+
+
+def _screening(multiverse: Multiverse) -> str:
+    n, screened = len(multiverse.drawn.worlds), multiverse.screened
+    holds = sum(row.verdict == "holds" for row in screened)
+    return (
+        f"Since C1 holds in few of the {n} worlds, or in none, C1 alone was weighed in the next "
+        f"{len(screened)} worlds of the sequence whose episode ends at the time limit (where it ends on "
+        "arrival, the agent of none of the first 64 worlds lands in more than one greedy mission in ten). "
+        "It holds in "
+        f"{_share(share(holds, len(screened)))} of them, {holds}, and every claim was weighed in those. They "
+        "are in no share and no figure above. This step was added to the rule after the verdicts above, and "
+        "before any of these worlds was trained."
+    )
 
 
 def _ranges(multiverse: Multiverse) -> str:
@@ -174,13 +197,15 @@ def _value(world: World, name: str) -> str:
 
 
 def _provenance(multiverse: Multiverse) -> str:
-    metadata, n = multiverse.metadata, len(multiverse.worlds)
+    metadata, n = multiverse.metadata, len(multiverse.drawn.worlds)
     scale = metadata.scale
-    option = "" if scale.name == "full" else f" --scale {scale.name}"
+    option = f" --screen {len(multiverse.screened)}" if multiverse.screened else ""
+    option += "" if scale.name == "full" else f" --scale {scale.name}"
     n_rejected = sum(metadata.rejected.values())
     reasons = "; ".join(f"{reason}: {k}" for reason, k in metadata.rejected.items())
     planned = plan.planned(scale)
     ratios = ", ".join(f"{beta:g}:{zeta:g}" for beta, zeta in scale.ratios)
+    screened = f", `{SCREENED_FILE}` (C1 in each screened world)" if multiverse.screened else ""
     cut = "\n".join(f"- {claim} is not weighed: {why}" for claim, why in plan.CUT.items())
     return f"""```
 python -m uav_dc_ros.paper --worlds {n}{option}
@@ -195,7 +220,7 @@ python -m uav_dc_ros.paper --worlds {n}{option}
 - under `on_arrival` an episode is T_cons iterations and may hold several missions
 {cut}
 - data: `{WORLDS_FILE}` (a row for each world), `{VERDICTS_FILE}` (a row for each world and claim: verdict,
-  the part that decides, its effect and interval)"""
+  the part that decides, its effect and interval){screened}"""
 
 
 def _share(one: Share) -> str:

@@ -19,6 +19,7 @@ from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Results, Scena
 from uav_dc_ros.experiments.paper.setting import OBSERVATION, PlannedRun, Scale, Setting, domain
 from uav_dc_ros.experiments.paper.shards import Shard
 from uav_dc_ros.experiments.paper.sweep import GREEDY_SEEDS, RunResults
+from uav_dc_ros.experiments.paper.worlds import draw
 from uav_dc_ros.experiments.paper.worlds.draw import World
 from uav_dc_ros.experiments.train.population import Population
 
@@ -120,6 +121,23 @@ def make_shards(world: World, scale: Scale) -> list[tuple[Shard, list[PlannedRun
     return sweep.make_shards(planned(scale), scale, partial(population, world))
 
 
+def screening_worlds(first: int, n: int) -> list[World]:
+    """The n worlds, from number `first` on, whose episode ends at the time limit: see `choose`."""
+    count = 2 * n
+    while True:
+        following = draw.worlds(first + count)[0][first:]
+        found = [world for world in following if world.episode_end == "at_time_limit"]
+        if len(found) >= n:
+            return found[:n]
+        count += n
+
+
+def make_screening_shards(world: World, scale: Scale) -> list[tuple[Shard, list[PlannedRun]]]:
+    """The runs of a world that the claims in `WIDE` read, as shards."""
+    (_, _, runs) = _groups(scale)[1]
+    return sweep.make_shards(runs, scale, partial(population, world))
+
+
 def population(world: World, scenario: str, runs: Sequence[PlannedRun], scale: Scale) -> Population:
     """Planned runs in a world: its data, its scale and its learner in place of the sweep's."""
 
@@ -143,11 +161,14 @@ def population(world: World, scenario: str, runs: Sequence[PlannedRun], scale: S
     )
 
 
-def findings(world: World, scale: Scale, found: RunResults) -> list[Finding]:
-    """Every claim, tested by the sweep's rules in one world; those of `CUT` are `not tested`."""
+def findings(world: World, scale: Scale, found: RunResults, *, screening: bool = False) -> list[Finding]:
+    """Every claim, tested by the sweep's rules in one world; those of `CUT` are `not tested`.
+
+    With `screening`, those of `WIDE` alone are tested and returned.
+    """
     facts = {name: ScenarioFacts.of(world.scenario(name), any_end=True) for name in SCENARIOS}
-    tested = {claim: Finding(claim, "not tested", ()) for claim in CLAIMS}
-    for of, claims, runs in _groups(scale):
+    tested = {} if screening else {claim: Finding(claim, "not tested", ()) for claim in CLAIMS}
+    for of, claims, runs in _groups(scale)[1:] if screening else _groups(scale):
         metadata = SweepMetadata(command="", scale=of, worlds=facts, greedy_missions=GREEDY_SEEDS[1])
         evidence = Evidence(sweep.collect(runs, metadata, found))
         # A reward or a throughput of exactly 0 has no relative difference: an equality is then undecided.

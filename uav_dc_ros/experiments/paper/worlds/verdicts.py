@@ -1,11 +1,12 @@
 """The verdicts on every claim in every world, in memory and on disk.
 
-Two Parquet files: `worlds.parquet`, a row for each world with its values; `verdicts.parquet`, a row for each
-world and claim. Nothing in them depends on when, where or in how many pieces the runs were trained.
+Parquet files: `worlds.parquet`, a row for each world with its values; `verdicts.parquet`, a row for each
+world and claim; `screened.parquet`, where worlds were screened, the row of C1 for each. Nothing in them
+depends on when, where or in how many pieces the runs were trained.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
@@ -23,7 +24,7 @@ from uav_dc_ros.experiments.paper.results import read_table, write_table
 from uav_dc_ros.experiments.paper.setting import Scale
 from uav_dc_ros.experiments.paper.worlds.draw import World
 
-WORLDS_FILE, VERDICTS_FILE = "worlds.parquet", "verdicts.parquet"
+WORLDS_FILE, VERDICTS_FILE, SCREENED_FILE = "worlds.parquet", "verdicts.parquet", "screened.parquet"
 IDS = tuple(claim.id for claim in CLAIMS)
 VERDICTS: tuple[Verdict, ...] = ("holds", "undecided", "does not hold")
 
@@ -46,7 +47,8 @@ class MultiverseMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """The origin of the verdicts."""
 
     scale: Scale
-    rejected: dict[str, int]  # candidates that cannot exist, by reason
+    rejected: dict[str, int]  # candidates that cannot exist, by reason, up to the last of the drawn worlds
+    n_drawn: int | None = None  # worlds that stand for all; those after them were found by C1. None: all
     version: str = __version__
 
 
@@ -66,6 +68,7 @@ class Multiverse:
     metadata: MultiverseMetadata
     worlds: tuple[World, ...]
     rows: tuple[Row, ...]  # by world, then claim
+    screened: tuple[Row, ...] = ()  # C1 in worlds beyond those drawn, in which nothing else decided
 
     def __post_init__(self) -> None:
         """Raises TrainingError unless every world has a verdict on every claim, in order."""
@@ -77,6 +80,12 @@ class Multiverse:
             )
         if unknown := {row.verdict for row in self.rows} - set(VERDICTS):
             raise TrainingError(f"verdict {min(unknown)!r}; expected one of {', '.join(VERDICTS)}")
+
+    @cached_property
+    def drawn(self) -> "Multiverse":
+        """The worlds that were drawn whatever holds in them: shares are of these."""
+        n = self.metadata.n_drawn
+        return self if n is None else replace(self, worlds=self.worlds[:n], rows=self.rows[: n * len(IDS)])
 
     @cached_property
     def verdicts(self) -> Array:
@@ -93,6 +102,9 @@ class Multiverse:
         values = [msgspec.to_builtins(world) for world in self.worlds]
         _write(folder / WORLDS_FILE, values, _WORLDS_SCHEMA, self.metadata)
         _write(folder / VERDICTS_FILE, [row._asdict() for row in self.rows], _ROWS_SCHEMA, self.metadata)
+        if self.screened:
+            rows = [row._asdict() for row in self.screened]
+            _write(folder / SCREENED_FILE, rows, _ROWS_SCHEMA, self.metadata)
 
     @classmethod
     def load(cls, folder: Path) -> "Multiverse":
@@ -101,11 +113,22 @@ class Multiverse:
         rows, other = read_table(folder / VERDICTS_FILE, _ROWS_SCHEMA, MultiverseMetadata)
         if metadata != other:
             raise TrainingError(f"{folder}: {WORLDS_FILE} and {VERDICTS_FILE} are of different worlds")
+        screened = []
+        if metadata.n_drawn is not None:
+            table, other = read_table(folder / SCREENED_FILE, _ROWS_SCHEMA, MultiverseMetadata)
+            if metadata != other:
+                raise TrainingError(f"{folder}: {WORLDS_FILE} and {SCREENED_FILE} are of different worlds")
+            screened = table.to_pylist()
         try:
             made = tuple(msgspec.convert(world, World) for world in worlds.to_pylist())
         except msgspec.ValidationError as error:
             raise TrainingError(f"{folder / WORLDS_FILE}: {error}") from None
-        return cls(metadata=metadata, worlds=made, rows=tuple(Row(**row) for row in rows.to_pylist()))
+        return cls(
+            metadata=metadata,
+            worlds=made,
+            rows=tuple(Row(**row) for row in rows.to_pylist()),
+            screened=tuple(Row(**row) for row in screened),
+        )
 
 
 def rows(world: World, findings: Sequence[Finding]) -> list[Row]:
