@@ -61,7 +61,7 @@ def kill(
 
     The first to be killed is the process of several nodes, where there is one.
     """
-    killed = []
+    killed, process_ids = [], set()
     deaths = dict.fromkeys(KILLED, 0)
     while len(killed) < kills:
         assert process.poll() is None, "it flies until it is stopped"
@@ -70,8 +70,10 @@ def kill(
         if composed and not killed:
             name = "container"
         for process_id, command in ros.processes().items():
-            if f"uav_dc_ros.nodes.{name} " in command:
+            # A killed process may stay in the table for a while on a busy machine: it dies once.
+            if f"uav_dc_ros.nodes.{name} " in command and process_id not in process_ids:
                 os.kill(process_id, signal.SIGKILL)
+                process_ids.add(process_id)
                 killed.append(name)
                 for node in COMPOSED if name == "container" else [name]:
                     deaths[node] += 1
