@@ -21,9 +21,7 @@ def test_only_served_users_give_data(array):
     data, collected = mission.collect(
         array([0.0, 5.0, 7e6]),
         array([False, False, True]),
-        array([True, False, False]),
-        array([1e5, 2e5, 3e5]),
-        STEP_S,
+        mission.delivered(array([True, False, False]), array([1e5, 2e5, 3e5]), STEP_S),
         R_MIN_BITS,
     )
     np.testing.assert_array_equal(data, [1.5e6, 5.0, 7e6])
@@ -32,7 +30,7 @@ def test_only_served_users_give_data(array):
 
 def test_a_user_that_crosses_r_min_keeps_the_whole_step(array):
     data, collected = mission.collect(
-        array([5.9e6]), array([False]), array([True]), array([1e6]), STEP_S, R_MIN_BITS
+        array([5.9e6]), array([False]), mission.delivered(array([True]), array([1e6]), STEP_S), R_MIN_BITS
     )
     np.testing.assert_array_equal(data, [5.9e6 + 15e6])
     np.testing.assert_array_equal(collected, [True])
@@ -41,12 +39,7 @@ def test_a_user_that_crosses_r_min_keeps_the_whole_step(array):
 def test_exactly_r_min_is_collected(array):
     almost = np.nextafter(R_MIN_BITS, 0.0)
     _, collected = mission.collect(
-        array([R_MIN_BITS, almost]),
-        array([False, False]),
-        array([False, False]),
-        array([0.0, 0.0]),
-        STEP_S,
-        R_MIN_BITS,
+        array([R_MIN_BITS, almost]), array([False, False]), array([0.0, 0.0]), R_MIN_BITS
     )
     np.testing.assert_array_equal(collected, [True, False])
 
@@ -60,7 +53,8 @@ def test_nothing_is_ever_taken_back(seed, array):
         distance_m = array(rng.uniform(0.0, 500.0, 6))
         rate_bps = array(rng.uniform(0.0, 3e5, 6) * rng.integers(0, 2, 6))
         served = mission.served(distance_m, collected, D_CONS_M)
-        more, now = mission.collect(data, collected, served, rate_bps, STEP_S, R_MIN_BITS)
+        delivered_bits = mission.delivered(served, rate_bps, STEP_S)
+        more, now = mission.collect(data, collected, delivered_bits, R_MIN_BITS)
         gained = np.asarray(more - data)
         assert np.all(gained >= 0.0)
         assert np.all(np.asarray(now)[np.asarray(collected)])

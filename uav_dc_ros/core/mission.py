@@ -14,19 +14,13 @@ def delivered(served: Array, rate_bps: Array, step_s: float) -> Array:
 
 
 def collect(
-    data_bits: Array,
-    collected: Array,
-    served: Array,
-    rate_bps: Array,
-    step_s: float,
-    r_min_bits: float | Array,
+    data_bits: Array, collected: Array, delivered_bits: Array, r_min_bits: float | Array
 ) -> tuple[Array, Array]:
-    """`data_bits` and `collected` after a step, all `[..., U]`; see `delivered`.
+    """`data_bits` and `collected` after a step with `delivered_bits`, all `[..., U]`; see `delivered`.
 
-    `served` is P of this step. A user counts as collected from `r_min_bits`, a number or `[U]`, to the end
-    of the mission.
+    A user counts as collected from `r_min_bits`, a number or `[U]`, to the end of the mission.
     """
-    data_bits = data_bits + delivered(served, rate_bps, step_s)
+    data_bits = data_bits + delivered_bits
     return data_bits, collected | (data_bits >= r_min_bits)
 
 

@@ -113,16 +113,14 @@ def measure(
 
 def collect(scenario: Scenario, link: Link, data_bits: Array, collected: Array) -> tuple[Array, Array]:
     """`data_bits` and `collected` after a step over `link`, `[..., U]`."""
-    step_s, r_min_bits = scenario.mission.step_s, scenario.user_r_min_bits(data_bits)
-    return mission.collect(data_bits, collected, link.served, link.rate_bps, step_s, r_min_bits)
+    delivered_bits = mission.delivered(link.served, link.rate_bps, scenario.mission.step_s)
+    return mission.collect(data_bits, collected, delivered_bits, scenario.user_r_min_bits(data_bits))
 
 
-def counted_data(
-    scenario: Scenario, served: Array, rate_bps: Array, data_bits: Array, rewards: Rewards | None = None
-) -> Array:
+def counted_data(scenario: Scenario, served: Array, rate_bps: Array, data_bits: Array) -> Array:
     """R of each user in r^t (eq. 7), bit, of a step that ends with `data_bits`, all `[..., U]`."""
     delivered_bits = mission.delivered(served, rate_bps, scenario.mission.step_s)
-    return reward.counted_data(delivered_bits, data_bits, (rewards or scenario.reward).data)
+    return reward.counted_data(delivered_bits, data_bits, scenario.reward.data)
 
 
 def total_reward(
@@ -195,9 +193,11 @@ def step(
     uav_m = scenario.grid.centre_m(cell, like=users_m)
     drawn = Realization(state.waves, seed_of(draws)) if scenario.radio.is_random else None
     link = measure(scenario, uav_m, users_m, state.collected, transmitting, drawn)
-    data_bits, collected = collect(scenario, link, state.data_bits, state.collected)
+    delivered_bits = mission.delivered(link.served, link.rate_bps, scenario.mission.step_s)
+    r_min_bits = scenario.user_r_min_bits(delivered_bits)
+    data_bits, collected = mission.collect(state.data_bits, state.collected, delivered_bits, r_min_bits)
     values = rewards or scenario.reward
-    counted_bits = counted_data(scenario, link.served, link.rate_bps, data_bits, rewards)
+    counted_bits = reward.counted_data(delivered_bits, data_bits, values.data)
     total = total_reward(scenario, cell, counted_bits, rewards)
     n_steps = state.step + 1
     n_rewards = array_namespace(total).astype(n_steps, total.dtype)
