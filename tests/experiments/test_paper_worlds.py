@@ -206,6 +206,44 @@ def test_verdicts_are_read_as_they_were_written(worlds, tmp_path):
         Multiverse.load(tmp_path)
 
 
+def test_screened_worlds_can_be_chosen_and_count_in_no_share(worlds, tmp_path):
+    """The first half of the worlds was drawn; one of the others was found by C1."""
+
+    def verdict(world, claim):
+        return "holds" if world.number >= N // 2 and claim == "C1" else "undecided"
+
+    found, screened = worlds[N // 2 + 3], worlds[N // 2 :]
+    made = multiverse([*worlds[: N // 2], found], verdict)
+    made = dataclasses.replace(
+        made,
+        metadata=msgspec.structs.replace(made.metadata, n_drawn=N // 2),
+        screened=tuple(row for row in multiverse(screened, verdict).rows if row.claim == "C1"),
+    )
+    made.save(tmp_path)
+    assert Multiverse.load(tmp_path) == made
+    assert made.drawn.worlds == tuple(worlds[: N // 2])
+    assert all(one.shares[0].share == 0.0 for one in shares.summaries(made.drawn))
+    assert choose.choose(made) == found
+    text = page.worlds_md(made)
+    assert "12 worlds were drawn over all of them" in text
+    assert "C1 alone was weighed in the next 12 worlds" in text
+    assert f"World {found.number} is chosen" in text
+    assert "--worlds 12 --screen 12\n" in text
+    page.write(made, tmp_path)  # the figure is that of the drawn worlds
+    (tmp_path / verdicts.SCREENED_FILE).unlink()
+    with pytest.raises(TrainingError, match=r"screened\.parquet"):
+        Multiverse.load(tmp_path)
+
+
+def test_worlds_are_screened_whose_episode_ends_at_the_time_limit(worlds):
+    found = plan.screening_worlds(4, 6)
+    assert found == [world for world in worlds[4:] if world.episode_end == "at_time_limit"][:6]
+    ((shard, runs),) = plan.make_screening_shards(found[0], plan.FULL)
+    assert {run.setting for run in runs} == {Setting(scenario="five_clusters")}
+    assert [run.environment for run in runs] == list(plan.ENVIRONMENTS)
+    assert shard.population.n_episodes == plan.FULL.episodes
+
+
 def test_verdicts_that_lack_a_claim_are_refused(worlds):
     made = multiverse(worlds, lambda world, claim: "holds")
     with pytest.raises(TrainingError, match="479 verdicts; expected one on each of 20 claims in each of 24"):
@@ -316,7 +354,9 @@ def test_the_kept_page_is_what_its_data_gives_in_the_worlds_as_they_are():
     kept = ROOT / "docs" / "paper"
     made = Multiverse.load(kept)
     assert made.metadata.scale == plan.FULL
-    assert list(made.worlds) == draw.worlds(len(made.worlds))[0]
+    sequence = draw.worlds(1 + max(world.number for world in made.worlds))[0]
+    assert list(made.drawn.worlds) == sequence[: len(made.drawn.worlds)]
+    assert all(world == sequence[world.number] for world in made.worlds)
     assert (kept / page.PAGE_FILE).read_text("utf-8") == page.worlds_md(made)
 
 
@@ -361,7 +401,7 @@ def test_an_interrupted_command_goes_on_and_gives_the_same_bytes(tmp_path, monke
     def command(out, stop_after=None):
         monkeypatch.setattr(cli, "train_locally", in_process(stop_after))
         with pytest.raises(SystemExit) as ended:
-            cli.main(["--worlds", "1", "--scale", "smoke", "--out", str(out), "--resume"])
+            cli.main(["--worlds", "1", "--screen", "1", "--scale", "smoke", "--out", str(out), "--resume"])
         return ended.value.code
 
     assert command(tmp_path / "whole") == 0
@@ -373,11 +413,12 @@ def test_an_interrupted_command_goes_on_and_gives_the_same_bytes(tmp_path, monke
         {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("whole", "pieces")
     )
     assert whole == pieces
-    assert {page.PAGE_FILE, page.FIGURE_FILE, verdicts.WORLDS_FILE, verdicts.VERDICTS_FILE} <= whole.keys()
+    assert {page.PAGE_FILE, page.FIGURE_FILE, *verdicts.FILES} <= whole.keys()
     capsys.readouterr()
     with pytest.raises(SystemExit):
         cli.main(["--worlds", "2", "--scale", "smoke", "--out", str(tmp_path / "whole"), "--resume"])
-    assert "has 1 worlds of the scale 'smoke' and is finished; expected 2" in capsys.readouterr().err
+    complaint = "has 1 worlds and 1 screened ones of the scale 'smoke' and is finished; expected 2 and 0 of"
+    assert complaint in capsys.readouterr().err
 
 
 @pytest.mark.long
@@ -410,6 +451,7 @@ def test_a_killed_command_goes_on_and_gives_the_same_bytes(tmp_path):
         (["--worlds", "0"], "'0'; expected a whole number of at least 1"),
         (["--worlds", "2", "--only", "lr"], "--worlds with --only or --block; expected neither"),
         (["--worlds", "2", "--block", "1"], "--worlds with --only or --block; expected neither"),
+        (["--screen", "2"], "--screen without --worlds; expected both"),
         (["--worlds", "2", "--out", "."], ". exists; expected a new folder, or --resume"),
     ],
 )

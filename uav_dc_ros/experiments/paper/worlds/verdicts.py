@@ -25,6 +25,7 @@ from uav_dc_ros.experiments.paper.setting import Scale
 from uav_dc_ros.experiments.paper.worlds.draw import World
 
 WORLDS_FILE, VERDICTS_FILE, SCREENED_FILE = "worlds.parquet", "verdicts.parquet", "screened.parquet"
+FILES = (WORLDS_FILE, VERDICTS_FILE, SCREENED_FILE)
 IDS = tuple(claim.id for claim in CLAIMS)
 VERDICTS: tuple[Verdict, ...] = ("holds", "undecided", "does not hold")
 
