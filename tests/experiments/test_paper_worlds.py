@@ -238,9 +238,9 @@ def test_screened_worlds_can_be_chosen_and_count_in_no_share(worlds, tmp_path):
 def test_worlds_are_screened_whose_episode_ends_at_the_time_limit(worlds):
     found = plan.screening_worlds(4, 6)
     assert found == [world for world in worlds[4:] if world.episode_end == "at_time_limit"][:6]
-    ((shard, runs),) = plan.make_screening_shards(found[0], plan.FULL)
+    ((shard, runs),) = plan.make_screening_shards(found[0], plan.FULL, plan.wide(plan.FULL))
     assert {run.setting for run in runs} == {Setting(scenario="five_clusters")}
-    assert [run.environment for run in runs] == list(plan.ENVIRONMENTS)
+    assert [run.environment for run in runs] == list(range(100, 110))
     assert shard.population.n_episodes == plan.FULL.episodes
 
 

@@ -26,7 +26,7 @@ from uav_dc_ros.experiments.train.progress import ProgressBar
 
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.paper.results import Results
-    from uav_dc_ros.experiments.paper.sweep import Networks
+    from uav_dc_ros.experiments.paper.sweep import Networks, RunResults
     from uav_dc_ros.experiments.paper.worlds.draw import World
     from uav_dc_ros.experiments.paper.worlds.verdicts import Multiverse
 
@@ -155,32 +155,41 @@ def _train_worlds(options: argparse.Namespace) -> "Multiverse":
     # The first worlds of any number are the same, and so are their shards.
     _reserve(folder, {"worlds": "any number", "scale": options.scale})
 
-    def weigh(worlds: "Sequence[World]", *, screening: bool = False) -> "list[verdicts.Row]":
-        make = plan.make_screening_shards if screening else plan.make_shards
-        shards = [make(world, scale) for world in worlds]
+    def trained(shards: "Sequence[list[tuple[Shard, list[PlannedRun]]]]") -> "list[RunResults]":
         _train_missing([shard for of_world in shards for shard, _ in of_world], folder, options)
+        return [sweep.load_results(of_world, folder) for of_world in shards]
+
+    def weighed(worlds: "Sequence[World]") -> "list[verdicts.Row]":
+        results = trained([plan.make_shards(world, scale) for world in worlds])
+        pairs = zip(worlds, results, strict=True)
         return [
-            row
-            for world, of_world in zip(worlds, shards, strict=True)
-            for row in verdicts.rows(
-                world,
-                plan.findings(world, scale, sweep.load_results(of_world, folder), screening=screening),
-            )
+            row for world, each in pairs for row in verdicts.rows(world, plan.findings(world, scale, each))
         ]
 
-    rows, screened, found = weigh(drawn), [], []
+    def screened_by(environments: Sequence[int], worlds: "Sequence[World]") -> "dict[int, verdicts.Row]":
+        results = trained([plan.make_screening_shards(world, scale, environments) for world in worlds])
+        return {
+            row.world: row
+            for world, each in zip(worlds, results, strict=True)
+            for row in verdicts.rows(world, plan.screening_findings(world, scale, environments, each))
+        }
+
+    rows, found = weighed(drawn), []
+    screened: dict[int, verdicts.Row] = {}
     if options.screen is not None:
         worlds = plan.screening_worlds(options.worlds, options.screen)
-        screened = weigh(worlds, screening=True)
-        promising = {row.world for row in screened if row.verdict == "holds"}
-        found = [world for world in worlds if world.number in promising]
-        rows += weigh(found)
+        screened = screened_by(plan.wide(scale), worlds)
+        undecided = [world for world in worlds if screened[world.number].verdict == "undecided"]
+        screened |= screened_by(plan.wide(scale, plan.WIDEST), undecided)
+        found = [world for world in worlds if screened[world.number].verdict == "holds"]
+        # C1 as it was screened, in more environments than here.
+        rows += [screened[row.world] if row.claim in plan.WIDE else row for row in weighed(found)]
     n_drawn = None if options.screen is None else len(drawn)
     multiverse = verdicts.Multiverse(
         metadata=verdicts.MultiverseMetadata(scale=scale, rejected=rejected, n_drawn=n_drawn),
         worlds=(*drawn, *found),
         rows=tuple(rows),
-        screened=tuple(screened),
+        screened=tuple(screened.values()),
     )
     multiverse.save(options.out)
     return multiverse

@@ -25,7 +25,7 @@ from uav_dc_ros.experiments.train.population import Population
 
 SCENARIOS = ("five_clusters", "three_clusters")
 # Layouts and seeds that the sweep does not use: the choice of a world must not see what confirms it.
-ENVIRONMENTS = tuple(range(100, 110))
+ENVIRONMENTS = tuple(range(100, 140))
 FULL = msgspec.structs.replace(
     setting.FULL,
     # The paper calls curves stable after about 400.
@@ -42,6 +42,8 @@ SCALES = {scale.name: scale for scale in (FULL, SMOKE)}
 # Weighed in twice as many environments as the others. The choice of a world rests on C1, which compares one
 # setting with a number, so that its interval is wide and its runs are few.
 WIDE = ("C1",)
+# Screening takes as many; where they leave C1 undecided, so many times those of the other claims.
+WIDEST = 8
 # Claims that are not weighed: undecided in every world.
 CUT = {
     "C18": "its 16 pairs of gamma and epsilon would take 75 more runs in each world, 30% of the budget",
@@ -101,10 +103,13 @@ def planned(scale: Scale) -> tuple[PlannedRun, ...]:
 @cache
 def _groups(scale: Scale) -> tuple[tuple[Scale, tuple[Claim, ...], tuple[PlannedRun, ...]], ...]:
     """Claims that are weighed at one scale, with their runs."""
-    wide = msgspec.structs.replace(scale, environments=ENVIRONMENTS[: 2 * len(scale.environments)])
     others = tuple(claim for claim in CLAIMS if claim.id not in (*WIDE, *CUT))
-    groups = ((scale, others), (wide, tuple(claim for claim in CLAIMS if claim.id in WIDE)))
-    return tuple((of, claims, _runs(claims, of)) for of, claims in groups)
+    return (scale, others, _runs(others, scale)), _screening(scale, wide(scale))
+
+
+def wide(scale: Scale, times: int = 2) -> tuple[int, ...]:
+    """Environments of the claims in `WIDE`: so many times those of the scale."""
+    return ENVIRONMENTS[: times * len(scale.environments)]
 
 
 def _runs(claims: Iterable[Claim], scale: Scale) -> tuple[PlannedRun, ...]:
@@ -132,10 +137,21 @@ def screening_worlds(first: int, n: int) -> list[World]:
         count += n
 
 
-def make_screening_shards(world: World, scale: Scale) -> list[tuple[Shard, list[PlannedRun]]]:
-    """The runs of a world that the claims in `WIDE` read, as shards."""
-    (_, _, runs) = _groups(scale)[1]
+def make_screening_shards(
+    world: World, scale: Scale, environments: Sequence[int]
+) -> list[tuple[Shard, list[PlannedRun]]]:
+    """The runs of a world that the claims in `WIDE` read in some environments, as shards."""
+    (_, _, runs) = _screening(scale, tuple(environments))
     return sweep.make_shards(runs, scale, partial(population, world))
+
+
+@cache
+def _screening(
+    scale: Scale, environments: tuple[int, ...]
+) -> tuple[Scale, tuple[Claim, ...], tuple[PlannedRun, ...]]:
+    of = msgspec.structs.replace(scale, environments=environments)
+    claims = tuple(claim for claim in CLAIMS if claim.id in WIDE)
+    return of, claims, _runs(claims, of)
 
 
 def population(world: World, scenario: str, runs: Sequence[PlannedRun], scale: Scale) -> Population:
@@ -161,17 +177,27 @@ def population(world: World, scenario: str, runs: Sequence[PlannedRun], scale: S
     )
 
 
-def findings(world: World, scale: Scale, found: RunResults, *, screening: bool = False) -> list[Finding]:
-    """Every claim, tested by the sweep's rules in one world; those of `CUT` are `not tested`.
-
-    With `screening`, those of `WIDE` alone are tested and returned.
-    """
-    facts = {name: ScenarioFacts.of(world.scenario(name), any_end=True) for name in SCENARIOS}
-    tested = {} if screening else {claim: Finding(claim, "not tested", ()) for claim in CLAIMS}
-    for of, claims, runs in _groups(scale)[1:] if screening else _groups(scale):
-        metadata = SweepMetadata(command="", scale=of, worlds=facts, greedy_missions=GREEDY_SEEDS[1])
-        evidence = Evidence(sweep.collect(runs, metadata, found))
-        # A reward or a throughput of exactly 0 has no relative difference: an equality is then undecided.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            tested |= {claim: finding(claim, evidence) for claim in claims}
+def findings(world: World, scale: Scale, found: RunResults) -> list[Finding]:
+    """Every claim, tested by the sweep's rules in one world; those of `CUT` are `not tested`."""
+    tested = {claim: Finding(claim, "not tested", ()) for claim in CLAIMS}
+    for group in _groups(scale):
+        tested |= {one.claim: one for one in _tested(world, *group, found)}
     return list(tested.values())
+
+
+def screening_findings(
+    world: World, scale: Scale, environments: Sequence[int], found: RunResults
+) -> list[Finding]:
+    """The claims in `WIDE`, tested in some environments of a world."""
+    return _tested(world, *_screening(scale, tuple(environments)), found)
+
+
+def _tested(
+    world: World, scale: Scale, claims: Sequence[Claim], runs: Sequence[PlannedRun], found: RunResults
+) -> list[Finding]:
+    facts = {name: ScenarioFacts.of(world.scenario(name), any_end=True) for name in SCENARIOS}
+    metadata = SweepMetadata(command="", scale=scale, worlds=facts, greedy_missions=GREEDY_SEEDS[1])
+    evidence = Evidence(sweep.collect(runs, metadata, found))
+    # A reward or a throughput of exactly 0 has no relative difference: an equality is then undecided.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return [finding(claim, evidence) for claim in claims]
