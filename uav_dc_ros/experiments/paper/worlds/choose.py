@@ -11,8 +11,8 @@ alone is weighed in the next worlds of the sequence whose episode ends at the ti
 arrival, the agent of none of the 64 lands in more than one greedy mission in ten), and every claim in those
 in which it holds. Points 1 to 4 then choose among all worlds in which every claim was weighed.
 
-It was extended again when 60 of the 176 screened worlds were known: C1 held in none and was undecided in five.
-Where it is undecided, it is weighed again in four times as many environments.
+It was extended again when 60 of the 176 screened worlds were known, with C1 in none of them and undecided in
+five. Where it is undecided, it is weighed again in four times as many environments.
 
 The confirming sweep uses other environments and seeds than the multiverse (`plan.ENVIRONMENTS`).
 """

@@ -173,8 +173,7 @@ def _screening(multiverse: Multiverse) -> str:
         "Where it was undecided there, it was weighed again in "
         f"{plan.WIDEST // 2} times as many environments. It holds in "
         f"{_share(share(holds, len(screened)))} of them, {holds}, and every claim was weighed in those. They "
-        "are in no share and no figure above. This step was added to the rule after the verdicts above, and "
-        "before any of these worlds was trained."
+        "are in no share and no figure above."
     )
 
 
