@@ -65,6 +65,7 @@ def test_two_missions_in_two_namespaces_do_not_touch(ros: Ros, small: Small) -> 
         assert all(name.startswith(f"/fleet/uav{seed}/") for name in names)
 
 
+@pytest.mark.long  # with a link that loses messages: test_bad_network
 def test_one_mission_on_two_hosts(ros: Ros, small: Small) -> None:
     """Each host starts its share; the one without the world learns the seed from the vehicle."""
     bag = ros.folder / "shared"
