@@ -2,8 +2,8 @@
 
     python benchmarks/channels.py [REPEATS]
 
-The worlds are those of `benchmarks/world_steps.py`: `five_clusters` with 50 users, in float32, with their own
-draws and the start of each mission counted in.
+The worlds are those of `benchmarks/world_steps.py`: `five_clusters_hover` with 50 users, in float32, with
+their own draws and the start of each mission counted in.
 """
 
 import sys

@@ -43,7 +43,7 @@ PEER = Path(__file__).with_name("sb3_dqn.py")
 
 def population(n_runs: int, buffer_size: int = 50_000) -> Population:
     """Runs of both algorithms and both forms of the reward, as a sweep has them."""
-    scenario = scenarios.load("five_clusters")
+    scenario = scenarios.load("five_clusters_hover")
     runs = [
         Run(
             seed=i,

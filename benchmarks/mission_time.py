@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from uav_dc_ros import scenarios
 
-STEPS = scenarios.load("five_clusters").mission.max_steps
+STEPS = scenarios.load("five_clusters_hover").mission.max_steps
 BARE = "import rclpy, numpy; rclpy.init(); rclpy.create_node('bare').destroy_node(); rclpy.shutdown()"
 ENVIRONMENT = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -59,7 +59,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         ENVIRONMENT["PYTHONPYCACHEPREFIX"] = str(Path(folder) / "bytecode")
         flown = [mission(Path(folder) / f"bag{i}") for i in range(runs + 1)][1:]
-    print(f"one five_clusters mission in lockstep, {runs} runs, {os.cpu_count()} cores; seconds")
+    print(f"one five_clusters_hover mission in lockstep, {runs} runs, {os.cpu_count()} cores; seconds")
     for part in flown[0]:
         values = [run[part] for run in flown]
         print(

@@ -39,7 +39,7 @@ print(100 * (time.process_time() - cpu) / len(late), late[int(0.99 * (len(late) 
 def main() -> None:
     """Print the share of a core of each node, and the lateness of steps."""
     seconds = int(sys.argv[1]) if len(sys.argv) > 1 else 60
-    shipped = (Path(files.__file__).parent / "scenarios" / "five_clusters.toml").read_text("utf-8")
+    shipped = (Path(files.__file__).parent / "scenarios" / "five_clusters_hover.toml").read_text("utf-8")
     with tempfile.TemporaryDirectory() as folder:
         scenario = Path(folder) / "seconds.toml"
         text = shipped.replace("step_s = 15.0", "step_s = 1.0").replace(
@@ -54,7 +54,7 @@ def main() -> None:
             capture_output=True,
             text=True,
         )
-        options = ("--scenario", scenario, "--policy", "five_clusters_dueling", "--pace", 1)
+        options = ("--scenario", scenario, "--policy", "five_clusters_hover_dueling", "--pace", 1)
         flown = fly(Path(folder), *options)
     cpu_percent = {name: flown.cpu_percent(name) for name in NODES}
     told = ", ".join(f"{name} {percent:.1f}" for name, percent in cpu_percent.items())

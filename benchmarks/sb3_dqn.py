@@ -30,7 +30,7 @@ def environment() -> gymnasium.Env:
     """One environment, without Gymnasium's checks of every step."""
     return gymnasium.make(
         "uav_dc_ros/DataCollection-v0",
-        scenario="five_clusters",
+        scenario="five_clusters_hover",
         observation="position",
         disable_env_checker=True,
     )

@@ -21,7 +21,7 @@ SECONDS_WANTED = 5.0  # of flight, so that every node tells of itself a few time
 def main() -> None:
     """Print steps per second, sizes of payloads, and the nodes' shares of a core."""
     wanted = [int(text) for text in sys.argv[1:]] or USERS
-    shipped = (Path(files.__file__).parent / "scenarios" / "five_clusters.toml").read_text("utf-8")
+    shipped = (Path(files.__file__).parent / "scenarios" / "five_clusters_hover.toml").read_text("utf-8")
     print(f"lockstep, {os.cpu_count()} cores; payloads in kB, nodes in percent of one core")
     print(f"{'users':>6} {'steps/s':>8} {'users kB':>9} {'rates kB':>9}  " + "  ".join(NODES))
     with tempfile.TemporaryDirectory() as folder:
@@ -31,7 +31,14 @@ def main() -> None:
             assert f"users_per_cluster = {users // CLUSTERS}" in text, "the scenario has changed"
             scenario.write_text(text)
             missions = max(1, round(SECONDS_WANTED * min(600, 450_000 / users) / 60))
-            options = ("--scenario", scenario, "--policy", "five_clusters_dueling", "--pace", "lockstep")
+            options = (
+                "--scenario",
+                scenario,
+                "--policy",
+                "five_clusters_hover_dueling",
+                "--pace",
+                "lockstep",
+            )
             options += ("--no-compose",)  # who takes how much
             flown = fly(Path(folder), *options, "--missions", missions)
             sizes = [flown.payload_bytes[topic] / 1e3 for topic in ("users", "rates")]

@@ -36,8 +36,8 @@ TOWN_TARGET = (50, 100_000)
 
 
 def field(n_users: int, n_buildings: int = 0) -> Scenario:
-    """`five_clusters` with another number of users, and buildings 20 to 60 m wide and high."""
-    values = msgspec.to_builtins(scenarios.load("five_clusters"))
+    """`five_clusters_hover` with another number of users, and buildings 20 to 60 m wide and high."""
+    values = msgspec.to_builtins(scenarios.load("five_clusters_hover"))
     rng = np.random.default_rng(0)
     boxes = np.stack([rng.uniform(50, 890, n_buildings), rng.uniform(50, 890, n_buildings)], axis=-1)
     sizes = rng.uniform(20, 60, (n_buildings, 3))
@@ -48,7 +48,7 @@ def field(n_users: int, n_buildings: int = 0) -> Scenario:
     if n_buildings:
         values["radio"]["obstruction_loss_db"] = 20.0
     values["users"]["users_per_cluster"] = n_users // len(values["users"]["cluster_centres_m"])
-    return from_values(values, f"five_clusters with {n_users} users")
+    return from_values(values, f"five_clusters_hover with {n_users} users")
 
 
 class Bench:

@@ -1,4 +1,4 @@
-"""A policy node of your own in ROS 2: it waits over each cluster for a while, then flies to the dock.
+"""A policy node of your own in ROS 2: it flies over each cluster, then to the dock.
 
 Start it beside the other nodes, which wait for it:
 
@@ -20,8 +20,9 @@ import uav_dc_ros
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 scenario = uav_dc_ros.load_scenario("five_clusters")
-clusters = sorted((round(x / 100), round(y / 100)) for x, y in scenario.cluster_centres_m)  # cells: 100 m
-way = [cell for cell in clusters for _ in range(5)] + [scenario.dock_cell]  # five steps over each cluster
+cell_m = scenario.grid.cell_m
+clusters = sorted((round(x / cell_m), round(y / cell_m)) for x, y in scenario.cluster_centres_m)
+way = [*clusters, scenario.dock_cell]
 
 rclpy.init()
 node = rclpy.create_node("policy")  # the name that the other nodes wait for

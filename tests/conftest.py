@@ -296,9 +296,8 @@ def read_bag(folder: Path, *topics: str) -> list[tuple[str, Any]]:
 
     read = []
     with AnyReader([folder]) as reader:
-        for connection, _, data in reader.messages():
-            if topics and connection.topic not in topics:
-                continue
+        wanted = [each for each in reader.connections if not topics or each.topic in topics]
+        for connection, _, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
             is_json = connection.msgtype == "std_msgs/msg/String"
             read.append((connection.topic, json.loads(message.data) if is_json else message))

@@ -156,13 +156,13 @@ print(json.dumps([uav_dc_ros.__file__, get_package_share_directory("uav_dc_ros")
     assert package.startswith(workspace_folder)
     assert policies.startswith(workspace_folder)
     assert share == str(prefix / "share" / "uav_dc_ros")
-    assert "three_clusters" in names
+    assert "three_clusters_hover" in names
     executable = prefix / "lib" / "uav_dc_ros" / "run_all"
     status, output = finish(ros.start_command(executable, "--help"))
     assert status == 0, output
     assert "--scenario" in output
     status, output = finish(
-        ros.start_command(executable, "--scenario", "three_clusters", "--pace", "lockstep")
+        ros.start_command(executable, "--scenario", "three_clusters_hover", "--pace", "lockstep")
     )
     assert status == 0, output
     assert "landed" in output
@@ -228,7 +228,7 @@ def test_the_launch_file_s_nodes_fly(workspace, ros):
     prefix, environment = workspace
     in_workspace(ros, environment)
     given = {
-        "scenario": "three_clusters",
+        "scenario": "three_clusters_hover",
         "seed": "3",
         "pace": "lockstep",
         "bag": "here",

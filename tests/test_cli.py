@@ -71,14 +71,14 @@ def test_scenarios_are_listed_shown_and_checked(tmp_path: Path) -> None:
     status, out, _ = uav_dc("list")
     assert status == 0
     assert [line.partition(":")[0] for line in out.splitlines()] == scenarios.names()
-    status, shown, _ = uav_dc("show", "three_clusters")
+    status, shown, _ = uav_dc("show", "three_clusters_hover")
     assert status == 0
     file = tmp_path / "own.toml"
     file.write_text(shown)
     status, out, _ = uav_dc("check", file)
     assert status == 0
     assert "30 users in 3 clusters" in out
-    assert "three_clusters_dueling" in out
+    assert "three_clusters_hover_dueling" in out
     file.write_text(shown.replace("max_steps = ", "max_steps = -"))
     status, out, err = uav_dc("check", file)
     assert (status, out) == (2, "")
@@ -193,7 +193,7 @@ def test_any_name_can_be_printed(tmp_path: Path, env: dict[str, str]) -> None:
 @pytest.mark.parametrize("env", [ASCII, {}], ids=["ASCII", "UTF-8"])
 def test_a_bag_may_have_any_name(tmp_path: Path, env: dict[str, str]) -> None:
     name = os.fsdecode(b"b\xc3\xa4g\xff")
-    report_bags.write(tmp_path / name, scenarios.load("three_clusters"), steps=3)
+    report_bags.write(tmp_path / name, scenarios.load("three_clusters_hover"), steps=3)
     for verb in (("info", "--json", "info.json"), ("verify",), ("report", "--out", "page.html")):
         status, _, err = run("-m", "uav_dc_ros.bag", verb[0], name, *verb[1:], env=env, cwd=tmp_path)
         assert (status, err) == (0, ""), verb

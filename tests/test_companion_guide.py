@@ -184,8 +184,8 @@ def test_the_numbers_in_the_text_are_the_code_s() -> None:
     assert "as a warning from 5 m on" in GUIDE
 
 
-def test_the_field_is_five_clusters_at_a_fifth() -> None:
-    field, paper = scenarios.load(ROOT / "docs" / "field.toml"), scenarios.load("five_clusters")
+def test_the_field_is_five_clusters_hover_at_a_fifth() -> None:
+    field, paper = scenarios.load(ROOT / "docs" / "field.toml"), scenarios.load("five_clusters_hover")
     fifth = 0.2
     small, large = values_of(field), values_of(paper)
     lengths = {

@@ -195,7 +195,7 @@ def test_the_diagrams_show_every_row_of_the_tables() -> None:
 
 def test_every_key_in_the_symbol_table_is_a_scenario_s() -> None:
     scenario: Scenario = msgspec.structs.replace(
-        scenarios.load("five_clusters"), energy=EnergySettings(battery_j=1e5)
+        scenarios.load("five_clusters_hover"), energy=EnergySettings(battery_j=1e5)
     )
     keys = re.findall(
         r"`((?:grid|users|mission|radio|reward|energy)\.\w+)`", (DOCS / "symbols.md").read_text("utf-8")

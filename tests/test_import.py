@@ -18,10 +18,10 @@ def python(code: str) -> str:
 @pytest.mark.parametrize(
     "code",
     [
-        f"import gymnasium, uav_dc_ros; e = gymnasium.make('{NAME}', scenario='three_clusters')",
-        f"import uav_dc_ros, gymnasium; e = gymnasium.make('{NAME}', scenario='three_clusters')",
+        f"import gymnasium, uav_dc_ros; e = gymnasium.make('{NAME}', scenario='three_clusters_hover')",
+        f"import uav_dc_ros, gymnasium; e = gymnasium.make('{NAME}', scenario='three_clusters_hover')",
         f"import uav_dc_ros; from gymnasium.envs.registration import make\ne = make('{NAME}')",
-        f"import gymnasium; e = gymnasium.make('uav_dc_ros:{NAME}', scenario='three_clusters')",
+        f"import gymnasium; e = gymnasium.make('uav_dc_ros:{NAME}', scenario='three_clusters_hover')",
     ],
 )
 def test_gymnasium_knows_the_environment(code: str) -> None:

@@ -51,7 +51,7 @@ EXAMPLES = {
         cell=(1, 2, 0),
         remaining_steps=57,
         seed=2**63 - 1,
-        scenario="five_clusters",
+        scenario="five_clusters_hover",
         fingerprint="0123456789ab",
     ),
     "move": Move(run=RUN, mission=0, step=3, action="upward"),

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import copy_repository
+from uav_dc_ros import scenarios
 
 ROOT = Path(__file__).parent.parent
 # One worker builds the wheel, once.
@@ -93,7 +94,7 @@ def test_the_wheel_holds_the_package_and_its_data_and_nothing_else(wheel, reposi
         for name in repository_files
         if re.match(r"uav_dc_ros/|policies/|msgs_json/", name)
     }
-    for kind in ("scenarios/three_clusters.toml", "py.typed", "core/world.py"):
+    for kind in ("scenarios/three_clusters_hover.toml", "py.typed", "core/world.py"):
         assert f"uav_dc_ros/{kind}" in wanted
     with zipfile.ZipFile(wheel) as archive:
         about = {name.partition(".dist-info/")[2] for name in archive.namelist()} - {""}
@@ -138,7 +139,7 @@ print(json.dumps({
     answer = run_installed(program, installed, tmp_path)
     package = installed / "uav_dc_ros"
     assert Path(answer["package"]) == package / "__init__.py"
-    assert answer["scenarios"] == {"five_clusters": 50, "three_clusters": 30}
+    assert answer["scenarios"] == {name: scenarios.load(name).n_users for name in scenarios.names()}
     assert Path(answer["policies"]) == package / "policies"
     assert Path(answer["schemas"]) == package / "msgs_json"
     for folder in ("policies", "schemas"):
@@ -153,7 +154,7 @@ print(json.dumps({
 
 def test_the_installed_package_flies_from_an_empty_folder(installed, ros):
     ros.environment |= {"PYTHONPATH": str(installed), "PYTHONSAFEPATH": "1"}
-    status, output = ros.run_all("--scenario", "three_clusters", "--pace", "lockstep")
+    status, output = ros.run_all("--scenario", "three_clusters_hover", "--pace", "lockstep")
     assert status == 0, output
     assert "landed" in output
     assert "error" not in output.lower(), output
@@ -166,7 +167,7 @@ def test_gymnasium_makes_the_installed_environment(installed, tmp_path):
 import json
 import uav_dc_ros
 import gymnasium
-env = gymnasium.make("uav_dc_ros/DataCollection-v0", scenario="three_clusters")
+env = gymnasium.make("uav_dc_ros/DataCollection-v0", scenario="three_clusters_hover")
 print(json.dumps([uav_dc_ros.__file__, int(env.reset(seed=1)[1]["step"])]))
 """
     assert run_installed(program, installed, tmp_path) == [str(installed / "uav_dc_ros" / "__init__.py"), 0]

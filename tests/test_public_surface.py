@@ -59,8 +59,8 @@ def test_a_config_brings_nothing_heavy() -> None:
 
 
 def test_a_policy_acts_rolls_out_and_is_evaluated() -> None:
-    scenario = uav_dc_ros.load_scenario("three_clusters")
-    policy = uav_dc_ros.load_policy("three_clusters_dueling")
+    scenario = uav_dc_ros.load_scenario("three_clusters_hover")
+    policy = uav_dc_ros.load_policy("three_clusters_hover_dueling")
     env = uav_dc_ros.DataCollectionEnv(scenario, policy.config.observation)
     observation, _ = env.reset(seed=3)
     assert uav_dc_ros.Action(int(policy.act(observation))) in uav_dc_ros.Action

@@ -143,8 +143,8 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_an_unknown_name_lists_the_known_ones(tmp_path):
-    message = refused("five_clusters_duelling")
-    assert "'five_clusters_duelling'" in message
+    message = refused("five_clusters_hover_duelling")
+    assert "'five_clusters_hover_duelling'" in message
     assert all(name in message for name in policy.names())
 
 
@@ -227,16 +227,20 @@ def test_a_stored_scenario_with_a_bad_value_is_refused(folder):
 
 
 def test_check_names_both_layouts(tmp_path):
-    five = scenarios.load("five_clusters")
+    five = scenarios.load("five_clusters_hover")
     sees_mission = policy.load(saved(tmp_path / "mission", five))
     sees_position = policy.load(saved(tmp_path / "position", five, observation="position"))
-    sees_mission.check(changed("five_clusters", mission={"max_steps": 30}, users={"users_per_cluster": 3}))
-    larger = changed("five_clusters", grid={"n_z": 4})
+    sees_mission.check(
+        changed("five_clusters_hover", mission={"max_steps": 30}, users={"users_per_cluster": 3})
+    )
+    larger = changed("five_clusters_hover", grid={"n_z": 4})
     for one in (sees_mission, sees_position):
-        with pytest.raises(PolicyError, match=r"'five_clusters'.*\(11, 11, 4\); expected \(11, 11, 3\)"):
+        with pytest.raises(
+            PolicyError, match=r"'five_clusters_hover'.*\(11, 11, 4\); expected \(11, 11, 3\)"
+        ):
             one.check(larger)
-    three = scenarios.load("three_clusters")
-    with pytest.raises(PolicyError, match=r"'three_clusters': the number of clusters is 3; expected 5"):
+    three = scenarios.load("three_clusters_hover")
+    with pytest.raises(PolicyError, match=r"'three_clusters_hover': the number of clusters is 3; expected 5"):
         sees_mission.check(three)
     sees_position.check(three)
 

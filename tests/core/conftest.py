@@ -26,7 +26,7 @@ def array(request: pytest.FixtureRequest) -> Callable[..., Any]:
 @pytest.fixture(scope="session")
 def three() -> Scenario:
     """The shipped scenario with three clusters."""
-    return scenarios.load("three_clusters")
+    return scenarios.load("three_clusters_hover")
 
 
 @pytest.fixture(scope="session")

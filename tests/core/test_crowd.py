@@ -10,7 +10,7 @@ from uav_dc_ros.env.registration import ENV_ID
 
 
 def test_they_walk_as_in_the_environment() -> None:
-    scenario = scenarios.load("three_clusters")
+    scenario = scenarios.load("three_clusters_hover")
     env = gymnasium.make(ENV_ID, scenario=scenario).unwrapped
     _, info = env.reset(seed=7)
     crowd = WalkingUsers(scenario, 7)

@@ -250,7 +250,7 @@ def test_the_observation_energy_is_mission_and_the_state_of_charge(three, change
     assert "expected a scenario with [energy]" in (observations.problem("energy", three) or "")
 
 
-TEXT = scenarios.find("three_clusters").read_text("utf-8")
+TEXT = scenarios.find("three_clusters_hover").read_text("utf-8")
 
 
 def test_every_value_is_in_the_fingerprint_and_none_in_that_of_a_scenario_without():

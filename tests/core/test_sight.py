@@ -94,7 +94,7 @@ MODELS = [
 
 @pytest.mark.parametrize("values", MODELS, ids=lambda values: values["model"])
 def test_a_cut_link_has_the_gain_without_line_of_sight_and_others_keep_theirs(values, array):
-    plain = msgspec.to_builtins(scenarios.load("five_clusters")) | {"radio": values}
+    plain = msgspec.to_builtins(scenarios.load("five_clusters_hover")) | {"radio": values}
     scenario, free = (from_values(plain | {"obstacles": one}, "test") for one in ([TOWER], []))
     uav_m, users_m = array(np.array([600.0, 400.0, 150.0])), array(np.array([[200.0, 400.0], [700.0, 400.0]]))
     distance_m = radio.distance(uav_m, users_m)
@@ -117,6 +117,8 @@ def test_free_space_needs_a_loss_for_buildings_only():
     with pytest.raises(
         ScenarioError, match=r"missing key radio\.obstruction_loss_db; expected the loss of a"
     ):
-        changed("five_clusters", obstacles=[TOWER])
-    changed("five_clusters", obstacles=[box(300, 300, 400, 400)])
-    assert changed("five_clusters").fingerprint == changed("five_clusters", obstacles=[]).fingerprint
+        changed("five_clusters_hover", obstacles=[TOWER])
+    changed("five_clusters_hover", obstacles=[box(300, 300, 400, 400)])
+    assert (
+        changed("five_clusters_hover").fingerprint == changed("five_clusters_hover", obstacles=[]).fingerprint
+    )

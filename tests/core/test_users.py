@@ -12,7 +12,7 @@ from uav_dc_ros.errors import PolicyError, ScenarioError
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.planners import PLANNERS
 
-VALUES = msgspec.to_builtins(scenarios.load("five_clusters"))
+VALUES = msgspec.to_builtins(scenarios.load("five_clusters_hover"))
 # In the order of a file; by cluster: b (0, 3), alone (1), a (2, 4, 5), alone (6).
 LISTED = [
     {"x_m": 300.0, "y_m": 800.0, "name": "gate", "cluster": "b"},
@@ -64,7 +64,7 @@ def test_clusters_of_unequal_size():
     assert np.bincount(scenario.user_cluster).tolist() == sizes
     equal = from_values(VALUES | {"users": VALUES["users"] | {"users_per_cluster": [10] * 5}}, "test")
     draws = np.random.default_rng(2).random((4, 50, 2))
-    one, other = (world.initial(s, draws) for s in (equal, scenarios.load("five_clusters")))
+    one, other = (world.initial(s, draws) for s in (equal, scenarios.load("five_clusters_hover")))
     np.testing.assert_array_equal(one.users_m, other.users_m)
     assert equal.fingerprint != scenario.fingerprint
 
@@ -141,7 +141,7 @@ def test_order_names_and_values_are_in_the_fingerprint():
 
 def test_policies_fit_by_their_number_of_clusters():
     """A single user is a cluster."""
-    made = policies.load("five_clusters_dueling")
+    made = policies.load("five_clusters_hover_dueling")
     with pytest.raises(PolicyError, match="the number of clusters is 4; expected 5"):
         made.check(field())
     made.check(field([*LISTED, {"x_m": 100.0, "y_m": 100.0}]))

@@ -31,9 +31,8 @@ def test_gymnasium_finds_no_fault(observation, end):
 def test_it_can_be_made_by_name_alone(module):
     """Without an import of ours: Gymnasium itself imports what stands before the colon."""
     name = f"{module}:{registration.ENV_ID}"
-    code = (
-        f"import gymnasium; print(gymnasium.make({name!r}, scenario='five_clusters').reset(seed=0)[0].shape)"
-    )
+    made = f"gymnasium.make({name!r}, scenario='five_clusters_hover')"
+    code = f"import gymnasium; print({made}.reset(seed=0)[0].shape)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("(")
 
@@ -44,7 +43,7 @@ def test_registering_twice_changes_nothing():
 
 
 def test_it_is_the_core_with_the_draws_of_its_seed():
-    env = DataCollectionEnv("three_clusters", "map")
+    env = DataCollectionEnv("three_clusters_hover", "map")
     scenario = env.scenario
     rng, actions = np.random.default_rng(7), np.random.default_rng(8)
     _, info = env.reset(seed=7)
@@ -64,11 +63,11 @@ def test_it_is_the_core_with_the_draws_of_its_seed():
 
 def test_one_seed_gives_one_mission_and_two_give_two():
     def layout(seed):
-        return DataCollectionEnv("five_clusters").reset(seed=seed)[1]["users_m"]
+        return DataCollectionEnv("five_clusters_hover").reset(seed=seed)[1]["users_m"]
 
     np.testing.assert_array_equal(layout(1), layout(1))
     assert not np.array_equal(layout(1), layout(2))
-    env = DataCollectionEnv("five_clusters")
+    env = DataCollectionEnv("five_clusters_hover")
     env.reset(seed=1)
     assert not np.array_equal(env.reset()[1]["users_m"], layout(1)), "without a seed the stream goes on"
 
@@ -112,7 +111,7 @@ def test_wrong_arguments_are_named():
 
 def test_observations_stay_within_their_space_for_a_centre_off_the_grid():
     scenario = changed(
-        "three_clusters", users={"cluster_centres_m": [[-100.0, 1100.0], [0.0, 0.0], [1100.0, 5.0]]}
+        "three_clusters_hover", users={"cluster_centres_m": [[-100.0, 1100.0], [0.0, 0.0], [1100.0, 5.0]]}
     )
     env = DataCollectionEnv(scenario, "map")
     observation, _ = env.reset(seed=0)

@@ -9,7 +9,7 @@ from uav_dc_ros.env.gym_env import DataCollectionEnv
 
 
 def test_a_picture_follows_the_mission():
-    env = DataCollectionEnv("five_clusters", render_mode="rgb_array")
+    env = DataCollectionEnv("five_clusters_hover", render_mode="rgb_array")
     env.reset(seed=0)
     start = env.render()
     assert start.dtype == np.uint8
@@ -24,7 +24,7 @@ def test_obstacles_are_in_the_picture():
     zone = {"kind": "no_fly", "polygon_m": [[600.0, 300.0], [700.0, 300.0], [700.0, 500.0], [600.0, 500.0]]}
     pictures = []
     for obstacles in ([], [zone]):
-        env = DataCollectionEnv(changed("five_clusters", obstacles=obstacles), render_mode="rgb_array")
+        env = DataCollectionEnv(changed("five_clusters_hover", obstacles=obstacles), render_mode="rgb_array")
         env.reset(seed=0)
         pictures.append(env.render().astype(int))
     rows, columns = np.nonzero(np.abs(pictures[0] - pictures[1]).sum(axis=-1))

@@ -40,7 +40,7 @@ def test_it_equals_single_environments_to_the_last_bit(end):
 
 
 def test_make_vec_finds_it():
-    made = gymnasium.make_vec(ENV_ID, num_envs=3, scenario="three_clusters", observation="position")
+    made = gymnasium.make_vec(ENV_ID, num_envs=3, scenario="three_clusters_hover", observation="position")
     assert isinstance(made, DataCollectionVectorEnv)
     assert made.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     observation, _ = made.reset(seed=[1, 2, 1])

@@ -16,7 +16,9 @@ from uav_dc_ros.experiments.paper.results import GREEDY, METRICS, Results, Scena
 from uav_dc_ros.experiments.paper.setting import FULL, PlannedRun, Scale, Setting
 
 SHORT = msgspec.structs.replace(FULL, episodes=400)
-WORLDS = {name: ScenarioFacts.of(scenarios.load(name)) for name in ("three_clusters", "five_clusters")}
+WORLDS = {
+    name: ScenarioFacts.of(scenarios.load(f"{name}_hover")) for name in ("three_clusters", "five_clusters")
+}
 # Where a made-up run ends by default. Its reward is that of its ratio, as in the paper.
 LEVELS = {
     "episode_return": 50.0,
@@ -113,7 +115,8 @@ def realistic(scale: Scale = FULL) -> Results:
 def of_the_data_of_the_step(results: Results) -> Results:
     """The same numbers, as of worlds whose reward counts the data of the step."""
     worlds = {
-        name: ScenarioFacts.of(changed(name, reward={"data": "step"})) for name in results.metadata.worlds
+        name: ScenarioFacts.of(changed(f"{name}_hover", reward={"data": "step"}))
+        for name in results.metadata.worlds
     }
     metadata = msgspec.structs.replace(results.metadata, worlds=worlds)
     return dataclasses.replace(results, metadata=metadata)

@@ -57,7 +57,9 @@ def by_hand(env, act, seed):
 )
 def test_seed_s_is_the_mission_of_the_environment_with_seed_s(tmp_path, end, data):
     """To the last bit, however many missions fly side by side."""
-    scenario = changed("five_clusters", mission={"episode_end": end, "max_steps": 30}, reward={"data": data})
+    scenario = changed(
+        "five_clusters_hover", mission={"episode_end": end, "max_steps": 30}, reward={"data": data}
+    )
     made = policy.load(saved(tmp_path / "made", scenario))
     seeds = [3, 0, 11, 12, 13, 14, 15]
     missions = roll_out(scenario, greedy_act(made, scenario), seeds)
@@ -154,14 +156,23 @@ def test_policies_are_compared_mission_by_mission():
 
 
 def test_every_policy_flies_in_every_scenario_and_is_compared_with_the_first(tmp_path, capsys):
-    made = saved(tmp_path / "made", scenarios.load("five_clusters"), observation="position")
-    arguments = ["--policy", "tour", made, "--scenario", "five_clusters", "three_clusters", "--seeds", 3]
+    made = saved(tmp_path / "made", scenarios.load("five_clusters_hover"), observation="position")
+    arguments = [
+        "--policy",
+        "tour",
+        made,
+        "--scenario",
+        "five_clusters_hover",
+        "three_clusters_hover",
+        "--seeds",
+        3,
+    ]
     with pytest.raises(SystemExit) as exit:
         main([*map(str, arguments), "--json", str(tmp_path / "x.json")])
     assert exit.value.code == 0
     report = msgspec.json.decode((tmp_path / "x.json").read_bytes(), type=EvaluationReport)
     flown = [(one.policy, one.scenario) for one in report.evaluations]
-    fields = ("five_clusters", "three_clusters")
+    fields = ("five_clusters_hover", "three_clusters_hover")
     assert flown == [(who, where) for where in fields for who in ("tour", "test")]
     compared = [(one.policy, one.baseline, one.scenario) for one in report.comparisons]
     assert compared == [("test", "tour", where) for where in fields]
@@ -174,30 +185,33 @@ def test_every_policy_flies_in_every_scenario_and_is_compared_with_the_first(tmp
 
 
 def test_policies_of_one_name_are_distinguished_by_their_folders(tmp_path, capsys):
-    three = scenarios.load("three_clusters")
+    three = scenarios.load("three_clusters_hover")
     folders = [str(saved(tmp_path / name, three, name="same")) for name in ("a", "b")]
     with pytest.raises(SystemExit):
         main(["--policy", *folders, "--seeds", "2"])
     out = capsys.readouterr().out
-    assert all(f"{folder} in three_clusters, 30 users" in out for folder in folders)
+    assert all(f"{folder} in three_clusters_hover, 30 users" in out for folder in folders)
 
 
 def test_scenarios_of_one_name_are_refused(tmp_path, capsys):
     copy = tmp_path / "copy.toml"
-    copy.write_bytes((files(scenarios) / "three_clusters.toml").read_bytes())
+    copy.write_bytes((files(scenarios) / "three_clusters_hover.toml").read_bytes())
     with pytest.raises(SystemExit) as exit:
-        main(["--policy", "tour", "--scenario", "three_clusters", str(copy)])
+        main(["--policy", "tour", "--scenario", "three_clusters_hover", str(copy)])
     assert exit.value.code == 2
-    assert "their names are three_clusters, three_clusters; expected different" in capsys.readouterr().err
+    assert (
+        "their names are three_clusters_hover, three_clusters_hover; expected different"
+        in capsys.readouterr().err
+    )
 
 
 def test_nothing_is_flown_before_all_is_known_to_fit(tmp_path, capsys, monkeypatch):
-    made = str(saved(tmp_path / "made", scenarios.load("three_clusters")))
+    made = str(saved(tmp_path / "made", scenarios.load("three_clusters_hover")))
     monkeypatch.setattr(cli, "evaluate_act", None)
     monkeypatch.setattr(cli, "save_mission_picture", None)
-    scenario = ["--scenario", "three_clusters", "five_clusters"]
+    scenario = ["--scenario", "three_clusters_hover", "five_clusters_hover"]
     for arguments, complaint in (
-        (["tour", made, *scenario], "'test' does not fit scenario 'five_clusters'"),
+        (["tour", made, *scenario], "'test' does not fit scenario 'five_clusters_hover'"),
         ([made, "--json", str(tmp_path)], f"{tmp_path} cannot be written: Is a directory"),
         ([made, "--json", "/nowhere/x", "--picture", "x.png"], "/nowhere/x cannot be written"),
         ([made, "--picture", "/nowhere/x.png"], "/nowhere/x.png cannot be written"),
@@ -209,7 +223,7 @@ def test_nothing_is_flown_before_all_is_known_to_fit(tmp_path, capsys, monkeypat
 
 
 def test_the_command_prints_and_writes_figures(tmp_path):
-    made = saved(tmp_path / "made", scenarios.load("three_clusters"))
+    made = saved(tmp_path / "made", scenarios.load("three_clusters_hover"))
     picture, link = tmp_path / "mission.png", tmp_path / "link.png"
     link.symlink_to(picture)
     status, out, err = command(
@@ -220,10 +234,10 @@ def test_the_command_prints_and_writes_figures(tmp_path):
     report = json.loads((tmp_path / "x.json").read_text())
     (written,) = report["evaluations"]
     assert report["comparisons"] == []
-    expected = evaluate(policy.load(made), scenarios.load("three_clusters"), range(4))
+    expected = evaluate(policy.load(made), scenarios.load("three_clusters_hover"), range(4))
     assert written["users_collected"] == msgspec.to_builtins(expected.users_collected)
     assert written["sha256"] == policy.load(made).sha256
-    assert written["scenario"] == "three_clusters"
+    assert written["scenario"] == "three_clusters_hover"
     assert all(title in out for title, *_ in rows(expected))
     assert "Means and their" not in out, "nothing to compare"
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -235,7 +249,7 @@ def test_the_command_prints_and_writes_figures(tmp_path):
         ([], "--policy"),
         (["--policy", "missing"], "'missing'"),
         (["--policy", "MADE", "--scenario", "nowhere"], "'nowhere'"),
-        (["--policy", "MADE", "--scenario", "five_clusters"], "expected 3"),
+        (["--policy", "MADE", "--scenario", "five_clusters_hover"], "expected 3"),
         (["--policy", "MADE", "--seeds", "0"], "'0'; expected a whole number of at least 1"),
         (["--policy", "MADE", "--seeds", "2", "--json", "/nowhere/x"], "/nowhere/x cannot be written"),
         (
@@ -244,12 +258,12 @@ def test_the_command_prints_and_writes_figures(tmp_path):
         ),
         (["--policy", "MADE", "--seeds", "2", "--picture", "x.mission"], "x.mission cannot be written"),
         (
-            ["--policy", "MADE", "tour", "--scenario", "three_clusters", "--picture", "x.png"],
+            ["--policy", "MADE", "tour", "--scenario", "three_clusters_hover", "--picture", "x.png"],
             "expected one policy",
         ),
         (["--policy", "MADE", "MADE"], "given 2 times; expected once"),
         (
-            ["--policy", "tour", "--scenario", "three_clusters", "three_clusters"],
+            ["--policy", "tour", "--scenario", "three_clusters_hover", "three_clusters_hover"],
             "given 2 times; expected once",
         ),
         (["--policy", "MADE", "--seed", "3"], "--seed 3"),
@@ -257,7 +271,7 @@ def test_the_command_prints_and_writes_figures(tmp_path):
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_mistake_is_one_line_and_status_2(tmp_path, capsys, arguments, complaint):
-    made = str(saved(tmp_path / "made", scenarios.load("three_clusters")))
+    made = str(saved(tmp_path / "made", scenarios.load("three_clusters_hover")))
     with pytest.raises(SystemExit) as exit:
         main([made if argument == "MADE" else argument for argument in arguments])
     assert exit.value.code == 2
@@ -276,7 +290,7 @@ def test_a_damaged_policy_is_one_line_and_status_2(tmp_path):
 
 
 def test_it_needs_no_torch(tmp_path):
-    made = saved(tmp_path / "made", scenarios.load("three_clusters"))
+    made = saved(tmp_path / "made", scenarios.load("three_clusters_hover"))
     code = (
         "import sys\n"
         "from uav_dc_ros.experiments.evaluate.cli import main\n"

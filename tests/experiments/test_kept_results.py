@@ -11,6 +11,7 @@ from uav_dc_ros.experiments.paper.claims.findings import check
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import FULL
+from uav_dc_ros.experiments.paper.worlds.verdicts import Multiverse
 
 ROOT = Path(__file__).parents[2]
 KEPT = ROOT / "docs" / "paper"
@@ -34,7 +35,9 @@ def test_the_document_is_what_the_data_gives(results):
     findings = check(results)
     drawn = [name for name in FIGURES if (KEPT / f"{name}.png").is_file()]
     assert drawn == list(FIGURES)
-    assert (KEPT / report.CLAIMS_FILE).read_text("utf-8") == report.claims_md(results, findings, drawn)
+    written = report.claims_md(results, findings, drawn, Multiverse.load(KEPT))
+    assert (KEPT / report.CLAIMS_FILE).read_text("utf-8") == written
+    assert "36% [25%, 48%]" in written, "the share of worlds"
     kept = msgspec.json.decode((KEPT / report.VERDICTS_FILE).read_bytes())
     assert {one["id"]: one["verdict"] for one in kept} == {one.claim.id: one.verdict for one in findings}
 

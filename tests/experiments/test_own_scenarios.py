@@ -25,7 +25,7 @@ from uav_dc_ros.experiments.scenarios import document, field, flyable
 from uav_dc_ros.experiments.scenarios.rate_map import rate_map, scale_bar_m
 from uav_dc_ros.planners import PLANNERS
 
-FIVE = scenarios.find("five_clusters").read_text("utf-8")
+FIVE = scenarios.find("five_clusters_hover").read_text("utf-8")
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -122,7 +122,7 @@ URBAN |= {"carrier_hz": 2e9, "environment": "urban", "line_of_sight": "mean_gain
     "scenario",
     [
         *map(scenarios.load, scenarios.names()),
-        changed("five_clusters", energy=ENERGY),
+        changed("five_clusters_hover", energy=ENERGY),
         tiny(mission={"r_min_bits": 1e-7 / 3}),
     ],
     ids=lambda scenario: scenario.name,
@@ -133,12 +133,12 @@ def test_the_text_of_a_scenario_is_the_scenario_and_explains_each_key(scenario: 
     assert parse(text, "") == scenario
     assert parse(text, "").fingerprint == scenario.fingerprint
     keys = {key.partition("[")[0] for key, _ in leaves(read_values(text, "")) if " " not in key}
-    assert {key for key in keys if not key.startswith("energy.")} <= set(document.COMMENTS)
+    assert {key for key in keys if not key.startswith("energy.")} <= {*document.COMMENTS, "users.user"}
     assert max(map(len, text.splitlines())) <= document.WIDTH
 
 
 def test_the_commented_battery_is_valid() -> None:
-    text = document.text(scenarios.load("five_clusters"))
+    text = document.text(scenarios.load("five_clusters_hover"))
     with_battery = (
         text.replace("# [energy]", "[energy]").replace("# battery_j", "battery_j").replace("# ends", "ends")
     )
@@ -162,7 +162,7 @@ def test_new_writes_the_shipped_field_or_one_of_other_numbers(
     assert out.startswith(f"{path}: 50 users in 5 clusters")
     made = scenarios.load(path)
     assert made.name == "my_field_2"
-    shipped = scenarios.load("five_clusters")
+    shipped = scenarios.load("five_clusters_hover")
     assert (made.grid, made.users, made.mission, made.radio) == (
         *(shipped.grid, shipped.users, shipped.mission, shipped.radio),
     )
@@ -188,8 +188,8 @@ def test_new_writes_the_shipped_field_or_one_of_other_numbers(
         (("random", "--seed", "1", "--clusters", "50", "--size", "5000x100"), "50 clusters in 5000 x 100 m;"),
         (("random", "--seed", "1", "no/folder.toml"), "no/folder.toml cannot be written: No such file"),
         (("check", "nowhere.toml"), "scenario 'nowhere.toml': no such name or file"),
-        (("draw", "five_clusters", "--out", "a.gif"), "--out a.gif; expected a name that ends in .png"),
-        (("draw", "five_clusters", "--out", "no/map.png"), "no/map.png cannot be written"),
+        (("draw", "five_clusters_hover", "--out", "a.gif"), "--out a.gif; expected a name that ends in .png"),
+        (("draw", "five_clusters_hover", "--out", "no/map.png"), "no/map.png cannot be written"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_line_and_status_2(
@@ -287,7 +287,7 @@ def test_users_of_a_file_are_checked_and_drawn(tmp_path: Path, capsys: pytest.Ca
         f"{path}:{line_of(LISTED, 'beta = ')}: reward.beta = -1.0; expected float >= 0.0",
     ]
     listed = changed(
-        "five_clusters",
+        "five_clusters_hover",
         users={"user": [{"x_m": 1.0, "y_m": 2.0, "name": "a"}]}
         | dict.fromkeys(("cluster_centres_m", "users_per_cluster", "cluster_radius_m")),
     )
@@ -427,11 +427,11 @@ def test_users_around_which_there_is_no_field(
 
 
 def test_a_check_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = run(capsys, "check", "three_clusters", "--json")
+    status, out, err = run(capsys, "check", "three_clusters_hover", "--json")
     found = json.loads(out)
     assert (status, err, found["problems"], found["valid"]) == (0, "", [], True)
-    assert found["fingerprint"] == scenarios.load("three_clusters").fingerprint
-    assert "three_clusters_dueling" in found["policies"]
+    assert found["fingerprint"] == scenarios.load("three_clusters_hover").fingerprint
+    assert "three_clusters_hover_dueling" in found["policies"]
     assert (found["tour"]["landed"], found["tour"]["missions"]) == (10, 10)
     assert sum(cluster["collected"] for cluster in found["clusters"]) == pytest.approx(
         found["tour"]["collected"]
@@ -451,9 +451,9 @@ def test_a_check_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_what_a_tour_collects_is_what_evaluate_reports() -> None:
     for scenario in (
-        scenarios.load("five_clusters"),
-        changed("five_clusters", mission={"episode_end": "on_arrival"}),
-        changed("five_clusters", energy={"battery_j": 1e5, "ends": "both"}),
+        scenarios.load("five_clusters_hover"),
+        changed("five_clusters_hover", mission={"episode_end": "on_arrival"}),
+        changed("five_clusters_hover", energy={"battery_j": 1e5, "ends": "both"}),
     ):
         found = flyable.examine(scenario, range(5)).tour
         missions = roll_out(scenario, PLANNERS["tour"](scenario), range(5))
@@ -488,19 +488,23 @@ def test_half_of_a_disc_is_in_reach() -> None:
     mission = {"d_cons_m": math.hypot(100.0, 100.0)}
     users = {"cluster_centres_m": [centre_m], "cluster_radius_m": radius_m}
     share, needed_m = flyable.reach(
-        changed("five_clusters", users=users, mission=mission), centre_m, radius_m
+        changed("five_clusters_hover", users=users, mission=mission), centre_m, radius_m
     )
     assert share == pytest.approx(0.5, abs=0.03)
     assert needed_m == pytest.approx(math.hypot(105.0, 100.0), abs=0.01)
 
 
 def test_a_cluster_that_cannot_be_collected_has_no_tour_without_a_limit() -> None:
-    assert flyable.steps_of_tour(scenarios.load("five_clusters"), range(5)) == pytest.approx(50.0, abs=1.5)
-    assert flyable.steps_of_tour(changed("five_clusters", mission={"r_min_bits": 1e10}), range(2)) is None
+    assert flyable.steps_of_tour(scenarios.load("five_clusters_hover"), range(5)) == pytest.approx(
+        50.0, abs=1.5
+    )
+    assert (
+        flyable.steps_of_tour(changed("five_clusters_hover", mission={"r_min_bits": 1e10}), range(2)) is None
+    )
 
 
 def test_the_rate_over_a_cell_is_that_of_the_world() -> None:
-    scenario = changed("five_clusters", users={"users_per_cluster": 3})
+    scenario = changed("five_clusters_hover", users={"users_per_cluster": 3})
     rates = rate_map(scenario)
     states = [
         world.initial(scenario, np.random.default_rng(seed).random(scenario.draws_shape))
@@ -553,7 +557,7 @@ def test_drawing_names_the_library_that_is_missing(library: str, out: str, tmp_p
     program = (
         f"import sys; sys.modules[{library!r}] = None\n"
         "from uav_dc_ros import scenario\n"
-        f"scenario.main(['draw', 'three_clusters', '--out', {out!r}])"
+        f"scenario.main(['draw', 'three_clusters_hover', '--out', {out!r}])"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False,

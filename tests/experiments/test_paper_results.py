@@ -143,7 +143,7 @@ def test_results_of_version_0_1_0_are_of_the_data_so_far(results):
     assert msgspec.convert(facts, ScenarioFacts) == results.metadata.worlds["five_clusters"]
 
 
-@pytest.mark.parametrize("name", ["three_clusters", "five_clusters"])
+@pytest.mark.parametrize("name", ["three_clusters_hover", "five_clusters_hover"])
 def test_the_throughput_gives_the_data_term_of_the_mean_over_the_steps(name):
     """Where a mission is over the dock from its arrival on, and not before."""
     scenario = changed(name, reward={"beta": 3.0, "zeta": 2.0, "r_plus": "binary", "data": "step"})
@@ -156,7 +156,7 @@ def test_the_throughput_gives_the_data_term_of_the_mean_over_the_steps(name):
         np.testing.assert_allclose(missions.reward, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["three_clusters", "five_clusters"])
+@pytest.mark.parametrize("name", ["three_clusters_hover", "five_clusters_hover"])
 def test_the_throughput_gives_the_data_term(name):
     """Of flown missions: r^t with the binary R_plus is beta c throughput + zeta landed."""
     scenario = changed(name, reward={"beta": 3.0, "zeta": 2.0, "r_plus": "binary"})

@@ -45,19 +45,19 @@ def evaluated(capsys, *arguments):
 
 def test_a_shift_is_the_scenario_with_the_values_changed_by_hand(tmp_path, capsys):
     text = "radio.noise_power_dbm=+6,users.v_max_mps=x2,mission.max_steps=-4,radio.ref_gain_db==-53"
-    arguments = ["--policy", "tour", "--scenario", "three_clusters", "--seeds", 6, "--shift", text]
+    arguments = ["--policy", "tour", "--scenario", "three_clusters_hover", "--seeds", 6, "--shift", text]
     arguments += ["--shift", "mission.d_cons_m=200", "--json", tmp_path / "x.json"]
     out = evaluated(capsys, *arguments)
-    three = scenarios.load("three_clusters")
+    three = scenarios.load("three_clusters_hover")
     worlds = [
         three,
         changed(
-            "three_clusters",
+            "three_clusters_hover",
             radio={"noise_power_dbm": -104.0, "ref_gain_db": -53.0},
             users={"v_max_mps": 2 * three.users.v_max_mps},
             mission={"max_steps": three.mission.max_steps - 4},
         ),
-        changed("three_clusters", mission={"d_cons_m": 200.0}),
+        changed("three_clusters_hover", mission={"d_cons_m": 200.0}),
     ]
     by_hand = [evaluate_act("tour", None, PLANNERS["tour"](one), one, range(6)) for one in worlds]
     report = msgspec.json.decode((tmp_path / "x.json").read_bytes(), type=EvaluationReport)
@@ -72,7 +72,7 @@ def test_a_shift_is_the_scenario_with_the_values_changed_by_hand(tmp_path, capsy
         pairs = one.values["data_bits"] - by_hand[0].values["data_bits"]
         difference = effect.differences["data_bits"]
         assert (difference.mean, difference.low, difference.high) == tuple(interval(pairs))
-    assert out.count("tour in three_clusters, 30 users") == 2, "one table of figures, and the shifts"
+    assert out.count("tour in three_clusters_hover, 30 users") == 2, "one table of figures, and the shifts"
     assert "-110.0 -> -104.0" in out
     assert f"{report.shifts[0].differences['data_bits'].mean / 1e6:+.1f}" in out
 
@@ -80,7 +80,16 @@ def test_a_shift_is_the_scenario_with_the_values_changed_by_hand(tmp_path, capsy
 def test_without_a_shift_the_file_is_what_it_was(tmp_path, capsys):
     evaluated(
         capsys,
-        *("--policy", "tour", "--scenario", "three_clusters", "--seeds", 2, "--json", tmp_path / "x.json"),
+        *(
+            "--policy",
+            "tour",
+            "--scenario",
+            "three_clusters_hover",
+            "--seeds",
+            2,
+            "--json",
+            tmp_path / "x.json",
+        ),
     )
     report = json.loads((tmp_path / "x.json").read_text())
     assert set(report) == {"evaluations", "comparisons"}
@@ -88,7 +97,7 @@ def test_without_a_shift_the_file_is_what_it_was(tmp_path, capsys):
 
 
 def test_policies_are_compared_in_each_shifted_world(tmp_path, capsys):
-    arguments = ["--policy", "tour", "nearest", "--scenario", "five_clusters", "--seeds", 2]
+    arguments = ["--policy", "tour", "nearest", "--scenario", "five_clusters_hover", "--seeds", 2]
     evaluated(capsys, *arguments, "--shift", "users.v_max_mps=x3", "--json", tmp_path / "x.json")
     report = msgspec.json.decode((tmp_path / "x.json").read_bytes(), type=EvaluationReport)
     compared = [(one.policy, one.baseline, one.shift) for one in report.comparisons]
@@ -99,8 +108,8 @@ def test_policies_are_compared_in_each_shifted_world(tmp_path, capsys):
 @pytest.mark.parametrize("tables", [{}, {"energy": {"battery_j": 9e4, "cruise_mps": 9.0}}, {"radio": AIR}])
 def test_every_number_of_a_scenario_can_be_changed(tables):
     """By nothing, which gives the same world."""
-    values = msgspec.to_builtins(scenarios.load("five_clusters")) | tables
-    scenario = msgspec.convert(values, type(scenarios.load("five_clusters")))
+    values = msgspec.to_builtins(scenarios.load("five_clusters_hover")) | tables
+    scenario = msgspec.convert(values, type(scenarios.load("five_clusters_hover")))
     keys = [key for key, value in leaves(values) if isinstance(value, int | float) and "number of" not in key]
     assert len(keys) > 30
     for key in keys:
@@ -109,7 +118,7 @@ def test_every_number_of_a_scenario_can_be_changed(tables):
 
 
 def test_a_list_is_changed_element_by_element():
-    five = scenarios.load("five_clusters")
+    five = scenarios.load("five_clusters_hover")
     centres_m = np.asarray(five.users.cluster_centres_m)
     moved = shifted(five, "users.cluster_centres_m=+60")
     np.testing.assert_array_equal(moved.scenario.users.cluster_centres_m, centres_m + 60.0)
@@ -133,7 +142,7 @@ def test_users_of_a_list_are_changed_all_or_one_by_one():
 
 
 def test_a_policy_does_not_know_that_the_users_have_moved(tmp_path):
-    five = scenarios.load("five_clusters")
+    five = scenarios.load("five_clusters_hover")
     made = policy.load(saved(tmp_path / "made", five, observation="map"))
     moved = shifted(five, "users.cluster_centres_m=+60,mission.max_steps=+20")
     act, own = greedy_act(made, moved.known), greedy_act(made, five)
@@ -148,7 +157,7 @@ def test_a_policy_does_not_know_that_the_users_have_moved(tmp_path):
 @pytest.mark.parametrize("library", ["numpy", "torch"])
 @pytest.mark.parametrize("interference", ["all", "associated", "none"])
 def test_a_user_that_sends_nothing_is_as_one_that_is_not_there(library, interference):
-    scenario = changed("three_clusters", radio={"interference": interference})
+    scenario = changed("three_clusters_hover", radio={"interference": interference})
     rng = np.random.default_rng(3)
     users_m, collected = rng.random((5, 30, 2)) * 500.0, rng.random((5, 30)) < 0.2
     uav_m = np.array([200.0, 250.0, 100.0])
@@ -194,7 +203,10 @@ def test_missing_users_are_a_share_of_each_mission_and_are_never_collected():
 @pytest.mark.parametrize(
     ("shift", "complaint"),
     [
-        ("radio.noise=+6", "'five_clusters': unknown key radio.noise; did you mean radio.noise_power_dbm?"),
+        (
+            "radio.noise=+6",
+            "'five_clusters_hover': unknown key radio.noise; did you mean radio.noise_power_dbm?",
+        ),
         ("energy.battery_j=x2", "unknown key energy.battery_j; expected a numeric key, such as"),
         ("users.cluster_centres_m[7][0]=+6", "unknown key users.cluster_centres_m[7][0]"),
         ("radio.interference=1", "radio.interference is 'all'; expected a numeric key"),
@@ -208,7 +220,7 @@ def test_missing_users_are_a_share_of_each_mission_and_are_never_collected():
             "mission.max_steps=19",
             "mission.max_steps = 19; expected at least 20, the moves from start to dock",
         ),
-        ("grid.n_x=+1", "--shift grid.n_x=+1: policy 'five_clusters_dueling' does not fit scenario"),
+        ("grid.n_x=+1", "--shift grid.n_x=+1: policy 'five_clusters_hover_dueling' does not fit scenario"),
         ("users.missing=0.3", "'users.missing=0.3'; expected KEY=VALUE"),
         ("users.missing=+30%", "'users.missing=+30%'; expected KEY=VALUE"),
         ("users.missing=0%", "users.missing = 0%; expected at least one and at most all of 50 users"),
@@ -223,7 +235,7 @@ def test_missing_users_are_a_share_of_each_mission_and_are_never_collected():
 )
 def test_a_mistake_is_one_line_and_status_2(capsys, shift, complaint):
     with pytest.raises(SystemExit) as exit:
-        main(["--policy", "five_clusters_dueling", "--seeds", "1", "--shift", shift])
+        main(["--policy", "five_clusters_hover_dueling", "--seeds", "1", "--shift", shift])
     assert exit.value.code == 2
     err = capsys.readouterr().err
     assert complaint in err
@@ -237,6 +249,6 @@ def test_shifts_are_given_once_and_without_a_picture(capsys):
         ([*same, "--picture", "x.png"], "--picture of 2 evaluations; expected one policy"),
     ):
         with pytest.raises(SystemExit) as exit:
-            main(["--policy", "five_clusters_dueling", "--seeds", "1", *more])
+            main(["--policy", "five_clusters_hover_dueling", "--seeds", "1", *more])
         assert exit.value.code == 2
         assert complaint in capsys.readouterr().err

@@ -136,7 +136,7 @@ def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--scenario", "nowhere"], "'nowhere': no such name or file; expected one of five_clusters"),
+        (["--scenario", "nowhere"], "'nowhere': no such name or file; expected one of farm, five_clusters,"),
         (["--algo", "sarsa"], "'sarsa'"),
         (["--observation", "radar"], "'radar'"),
         (["--gamma", "1.5"], "--gamma is 1.5; expected float <= 1"),
@@ -370,7 +370,7 @@ def test_what_a_kill_leaves_is_whole(left):
         ({"--hidden": 17}, "hidden[0] = 16; expected 17, as in this command"),
         ({"--algo": "dqn"}, "runs[0].algorithm = 'dueling_dqn'; expected 'dqn', as in this command"),
         ({"--episodes": 50}, "hyperparameters.episodes = 30; expected 50, as in this command"),
-        ({"--scenario": "three_clusters"}, "scenario"),
+        ({"--scenario": "three_clusters_hover"}, "scenario"),
         ({"--checkpoint-every": 7}, "checkpoint_every = 10; expected 7, as in this command"),
     ],
     ids=str,

@@ -96,7 +96,7 @@ def test_a_lockstep_that_stands_still_repeats_its_step(ros: Ros, small_scenario:
         (
             "world",
             {"scenario": "mars"},
-            "scenario 'mars': no such name or file; expected one of five_clusters",
+            "scenario 'mars': no such name or file; expected one of farm, five_clusters",
         ),
         ("world", {"seed": -1}, "seed: -1; expected a whole number from 0 to "),
         ("world", {"missions": 0}, "missions: 0; expected a whole number from 1 to "),

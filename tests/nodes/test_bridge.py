@@ -104,8 +104,8 @@ def simulated_cells(scenario: Scenario, seed: int) -> list[list[int]]:
 @pytest.mark.parametrize(
     ("kind", "wire", "name", "least"),
     [
-        ("ardupilot", "tcp", "three_clusters", 25),
-        pytest.param("px4", "udp", "five_clusters", 40, marks=pytest.mark.long),
+        ("ardupilot", "tcp", "three_clusters_hover", 25),
+        pytest.param("px4", "udp", "five_clusters_hover", 40, marks=pytest.mark.long),
     ],
 )
 def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) -> None:

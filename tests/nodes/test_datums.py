@@ -11,9 +11,9 @@ from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.runner import run_options
 
-FIVE, THREE = scenarios.load("five_clusters"), scenarios.load("three_clusters")
+FIVE, THREE = scenarios.load("five_clusters_hover"), scenarios.load("three_clusters_hover")
 DATUM = Geodetic(latitude_deg=-35.363261, longitude_deg=149.16523, altitude_m=584.0)
-FLIGHT = r"-35\.363261,149\.16523,584\.0 \(flight of five_clusters, 20\d\d-.*\+00:00\)"
+FLIGHT = r"-35\.363261,149\.16523,584\.0 \(flight of five_clusters_hover, 20\d\d-.*\+00:00\)"
 
 
 @pytest.fixture(autouse=True)

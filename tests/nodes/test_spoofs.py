@@ -153,4 +153,4 @@ def test_a_lie_ends_no_node_and_no_run_hangs(ros: Ros, truth: dict[str, list[Any
 
 def test_every_lie_is_told() -> None:
     told = [*HARMLESS, *HARMFUL]
-    assert sorted(told) == sorted(lies(scenarios.load("five_clusters")))
+    assert sorted(told) == sorted(lies(scenarios.load("five_clusters_hover")))

@@ -11,12 +11,12 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.vehicle import Mode, SetMode
 
-LEVEL_J = changed("five_clusters", energy={"battery_j": 1e6}).step_energies_j.level
+LEVEL_J = changed("five_clusters_hover", energy={"battery_j": 1e6}).step_energies_j.level
 
 
 def with_battery(steps: float) -> Scenario:
     """A battery that lasts for so many moves."""
-    return changed("five_clusters", energy={"battery_j": steps * LEVEL_J, "ends": "both"})
+    return changed("five_clusters_hover", energy={"battery_j": steps * LEVEL_J, "ends": "both"})
 
 
 def test_a_spent_model_battery_away_from_the_dock_is_a_return() -> None:

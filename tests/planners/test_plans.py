@@ -27,12 +27,12 @@ def test_a_plan_collects_nearly_everyone_and_lands(name, planner):
 @pytest.mark.parametrize("planner", ["nearest", "tour"])
 @pytest.mark.parametrize("max_steps", [20, 21, 27, 40])
 def test_a_plan_is_home_in_time_however_short_that_is(planner, max_steps):
-    scenario = changed("five_clusters", mission={"max_steps": max_steps})
+    scenario = changed("five_clusters_hover", mission={"max_steps": max_steps})
     assert roll_out(scenario, PLANNERS[planner](scenario), SEEDS).landed.all()
 
 
 def test_the_tour_is_flown_in_the_shortest_order():
-    scenario = scenarios.load("five_clusters")
+    scenario = scenarios.load("five_clusters_hover")
     goals = np.rint(np.asarray(scenario.users.cluster_centres_m) / 100).astype(int)
     visited = []
     for state, _ in rollout_steps(scenario, PLANNERS["tour"](scenario), [0]):
@@ -46,17 +46,17 @@ def test_the_tour_is_flown_in_the_shortest_order():
 
 def test_many_clusters_need_no_search_of_all_orders():
     centres = [[100.0 * i, 100.0 * (i % 3)] for i in range(EXACT_TOUR_MAX + 2)]
-    scenario = changed("five_clusters", users={"cluster_centres_m": centres})
+    scenario = changed("five_clusters_hover", users={"cluster_centres_m": centres})
     assert roll_out(scenario, PLANNERS["tour"](scenario), [0]).landed.all()
 
 
 def test_a_cluster_off_the_grid_is_approached_from_its_edge():
-    scenario = changed("five_clusters", users={"cluster_centres_m": [[-150.0, 1100.0]]})
+    scenario = changed("five_clusters_hover", users={"cluster_centres_m": [[-150.0, 1100.0]]})
     assert roll_out(scenario, PLANNERS["nearest"](scenario), [0]).landed.all()
 
 
 def test_random_takes_every_action_and_repeats_itself():
-    scenario = scenarios.load("three_clusters")
+    scenario = scenarios.load("three_clusters_hover")
     cells = [
         [state.cell for state, _ in rollout_steps(scenario, PLANNERS["random"](scenario), SEEDS)]
         for _ in range(2)
@@ -69,13 +69,21 @@ def test_random_takes_every_action_and_repeats_itself():
 
 def test_evaluate_compares_policies_with_planners(tmp_path, capsys):
     figures = tmp_path / "figures.json"
-    arguments = ["--policy", "five_clusters_dueling", "tour", "--scenario", "five_clusters", "--seeds", "5"]
+    arguments = [
+        "--policy",
+        "five_clusters_hover_dueling",
+        "tour",
+        "--scenario",
+        "five_clusters_hover",
+        "--seeds",
+        "5",
+    ]
     with pytest.raises(SystemExit) as ended:
         main([*arguments, "--json", str(figures)])
     assert ended.value.code == 0
-    assert "tour in five_clusters" in capsys.readouterr().out
+    assert "tour in five_clusters_hover" in capsys.readouterr().out
     learnt, planned = json.loads(figures.read_text())["evaluations"]
-    assert (learnt["policy"], planned["policy"]) == ("five_clusters_dueling", "tour")
+    assert (learnt["policy"], planned["policy"]) == ("five_clusters_hover_dueling", "tour")
     assert len(learnt["sha256"]) == 64
     assert planned["sha256"] is None
 

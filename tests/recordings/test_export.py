@@ -245,8 +245,11 @@ def test_what_is_no_transition_is_skipped_and_counted(tmp_path, capsys):
         (["--out", "{new}", "--observation", "map"], "--observation applies only with --transitions"),
         (["--out", "{new}", "--tables", "steps,poses"], "'poses'; expected some of steps, users, missions"),
         (["--out", "/proc/new"], "/proc/new cannot be written"),
-        (["--out", "{new}", "--scenario", "five_clusters"], "start this node with the mission's scenario"),
-        (["--transitions", "--out", "{new}.npz", "--scenario", "five_clusters"], "holds no transition"),
+        (
+            ["--out", "{new}", "--scenario", "five_clusters_hover"],
+            "start this node with the mission's scenario",
+        ),
+        (["--transitions", "--out", "{new}.npz", "--scenario", "five_clusters_hover"], "holds no transition"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

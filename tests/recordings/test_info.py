@@ -39,8 +39,8 @@ def write_step(
         "mission": messages.Mission(
             mission=mission, step=step,
             phase=messages.Phase.LANDED if step == last else messages.Phase.READY,
-            cell=(0, 0, 0), remaining_steps=9, seed=7 + mission, scenario="five_clusters",
-            fingerprint=scenarios.load("five_clusters").fingerprint,
+            cell=(0, 0, 0), remaining_steps=9, seed=7 + mission, scenario="five_clusters_hover",
+            fingerprint=scenarios.load("five_clusters_hover").fingerprint,
         ),
     }  # fmt: skip
     if step < last:
@@ -81,7 +81,7 @@ def flown(
     """Two missions of three steps, 0.1 s each, 2 s between them; `without` some in mission 1, step 1."""
     metadata = {
         "version": "0.2.0",
-        "scenario": "five_clusters",
+        "scenario": "five_clusters_hover",
         "policy": "p",
         "policy_sha256": "ab12",
         "seed": "7",
@@ -139,7 +139,7 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     text = info(bag, capsys)
     for expected in (
         "bag complete",
-        "five_clusters (",
+        "five_clusters_hover (",
         "p (ab12)",
         "2: 2 landed; 75.0% of the users",
         "policy 2",
@@ -292,7 +292,7 @@ def test_payloads_that_cannot_be_decoded_are_reported_by_every_verb(
         ("export", "--transitions", "--out", str(tmp_path / "transitions.npz")),
     ):
         with pytest.raises(SystemExit) as stopped:
-            command.main([verb, str(bag), *options, "--scenario", "five_clusters"])
+            command.main([verb, str(bag), *options, "--scenario", "five_clusters_hover"])
         error = capsys.readouterr().err
         assert stopped.value.code == 2
         assert f"8 messages of users cannot be read: {why}" in error

@@ -56,7 +56,7 @@ def action(scenario, cell, after):
     )
 
 
-@pytest.mark.parametrize("reading", ["so_far", "step"])
+@pytest.mark.parametrize("reading", ["step", pytest.param("so_far", marks=pytest.mark.long)])
 def test_the_page_of_missions_equals_the_summary_of_run_all(ros, reading):
     """And both the environment, by each reading of the reward. A file without one is of the data so far."""
     scenario_file = ros.folder / "small.toml"
@@ -232,7 +232,7 @@ def test_a_mission_of_many_users_fits(made):
 
 
 def test_as_many_missions_as_fit_and_the_others_on_request(tmp_path, capsys, monkeypatch):
-    folder = report_bags.write(tmp_path / "bag", scenarios.load("five_clusters"), seeds=tuple(range(8)))
+    folder = report_bags.write(tmp_path / "bag", scenarios.load("five_clusters_hover"), seeds=tuple(range(8)))
     out = tmp_path / "page.html"
     monkeypatch.setattr(pages, "PAGE_MAX", 2_250_000)  # some of eight
     assert report(folder, "--out", out) == 0

@@ -324,6 +324,7 @@ def test_a_comparison_is_drawn_and_fits_a_phone_too(browser_3d, comparison_page)
     opened.context.close()
 
 
+@pytest.mark.long
 def test_a_browser_that_cannot_unpack_reports_it(browser, mission_page):
     context = browser.new_context(viewport=DESKTOP)
     context.add_init_script("delete window.DecompressionStream")

@@ -16,7 +16,7 @@ TILES = """() => document.getElementById("scene").data.find((trace) => trace.nam
 
 def test_a_page_draws_each_layer_and_lists_problems(browser: Any, tmp_path: Path) -> None:
     centres_m = [[300.0, 300.0], [1150.0, 700.0]]
-    scenario = changed("five_clusters", users={"cluster_centres_m": centres_m, "users_per_cluster": 3})
+    scenario = changed("five_clusters_hover", users={"cluster_centres_m": centres_m, "users_per_cluster": 3})
     path = tmp_path / "page.html"
     path.write_bytes(page.content(scenario))
     opened = Opened(browser, path, PHONE)

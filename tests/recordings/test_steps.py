@@ -317,11 +317,11 @@ def test_a_topic_of_another_type_is_told():
 def test_the_scenario_of_a_bag(tmp_path):
     from uav_dc_ros import scenarios
 
-    shipped = scenarios.load("three_clusters")
+    shipped = scenarios.load("three_clusters_hover")
     bag = write(tmp_path / "foreign", flight(shipped, steps=1))
     with BagReader(bag) as reader:
         assert step_reader.scenario(reader, "") == shipped, "by the fingerprint of its missions"
-        assert step_reader.scenario(reader, "", "five_clusters").name == "five_clusters"
+        assert step_reader.scenario(reader, "", "five_clusters_hover").name == "five_clusters_hover"
     bag = write(tmp_path / "unknown", flight(SCENARIO, steps=1))
     with (
         BagReader(bag) as reader,

@@ -25,7 +25,7 @@ from uav_dc_ros.core.scenario import from_values
 from uav_dc_ros.messages import Phase
 
 TINY = tiny()
-POLICY = "five_clusters_dueling"
+POLICY = "five_clusters_hover_dueling"
 
 
 def verify(capsys, bag, *options):
@@ -45,7 +45,9 @@ def verify(capsys, bag, *options):
 def flown(module_ros: Ros):
     """A bag of two missions that real nodes flew in lockstep."""
     bag = module_ros.folder / "bag"
-    status, output = module_ros.run_all("--missions", 2, "--seed", 7, "--pace", "lockstep", "--bag", bag)
+    world = ("--scenario", "five_clusters_hover", "--policy", POLICY)
+    given = ("--missions", 2, "--seed", 7, "--pace", "lockstep", "--bag", bag)
+    status, output = module_ros.run_all(*world, *given)
     assert status == 0, output
     return bag
 
@@ -71,7 +73,10 @@ def test_a_clean_flight_verifies_to_the_last_bit(flown, capsys):
         "missions)",
         "verified",
     ]
-    assert "2 missions, 122 steps in scenario 'five_clusters', policy 'five_clusters_dueling' (sha" in out
+    assert (
+        "2 missions, 122 steps in scenario 'five_clusters_hover', policy 'five_clusters_hover_dueling' (sha"
+        in out
+    )
 
 
 MOVED = {"left": "hover", "right": "hover", "hover": "left"}
@@ -232,7 +237,7 @@ def test_a_lost_pose_leaves_its_step_out_only(flown, tmp_path, capsys):
 
 
 def test_another_policy(flown, capsys):
-    status, out = verify(capsys, flown, "--policy", "five_clusters_position")
+    status, out = verify(capsys, flown, "--policy", "five_clusters_hover_position")
     assert status == 0
     found = [line for line in out.splitlines() if "Q " in line]
     assert len(found) == 5
@@ -240,12 +245,12 @@ def test_another_policy(flown, capsys):
     assert ", recorded " in found[0]
     n = [int(line.split(": ")[1].split()[0]) for line in out.splitlines() if line.endswith("of 60 moves")]
     assert len(n) == 2
-    assert f"'five_clusters_position' decides differently in {sum(n)} of 120 steps" in out
+    assert f"'five_clusters_hover_position' decides differently in {sum(n)} of 120 steps" in out
     status, out = verify(capsys, flown, "--policy", POLICY)
     assert status == 0
     assert "decides differently in 0 of 120 steps" in out
-    status, err = verify(capsys, flown, "--policy", "three_clusters_dueling")
-    assert (status, "does not fit scenario 'five_clusters'" in err) == (2, True)
+    status, err = verify(capsys, flown, "--policy", "three_clusters_hover_dueling")
+    assert (status, "does not fit scenario 'five_clusters_hover'" in err) == (2, True)
 
 
 def test_a_missing_policy_is_reported_and_found_by_its_hash(flown, tmp_path, capsys):
@@ -315,8 +320,8 @@ def test_a_bag_of_another_recorder(tmp_path, capsys):
     bag = write(tmp_path / "bag", flight(TINY, missions=2), namespace="/uav2")
     status, err = verify(capsys, bag)
     assert (status, "expected --scenario NAME|FILE" in err) == (2, True)
-    assert verify(capsys, bag, "--scenario", "five_clusters")[0] == 1, "another world"
-    shipped = flight(scenarios.load("three_clusters"), missions=2)
+    assert verify(capsys, bag, "--scenario", "five_clusters_hover")[0] == 1, "another world"
+    shipped = flight(scenarios.load("three_clusters_hover"), missions=2)
     bag = write(tmp_path / "shipped", shipped, namespace="/uav2")
     status, out = verify(capsys, bag, "--namespace", "uav2")
     assert status == 0
@@ -325,7 +330,7 @@ def test_a_bag_of_another_recorder(tmp_path, capsys):
     assert "the bag names no seed of a simulated world: poses and users are not recomputed" in out
     assert "decisions: not verified: the bag does not name the policy that flew; --policy NAME|DIR" in out
     assert out.splitlines()[-1] == "verified in part"
-    status, out = verify(capsys, bag, "--policy", "three_clusters_dueling")
+    status, out = verify(capsys, bag, "--policy", "three_clusters_hover_dueling")
     assert (status, "decides differently in" in out) == (0, True)
 
 
@@ -526,7 +531,9 @@ def test_a_monitor_that_outlives_a_flight_takes_no_pose_of_it_for_the_next(ros: 
 
     def start(node, *parameters):
         given = [part for parameter in parameters for part in ("-p", parameter)]
-        return ros.start(f"uav_dc_ros.nodes.{node}", "--ros-args", "-p", "scenario:=five_clusters", *given)
+        return ros.start(
+            f"uav_dc_ros.nodes.{node}", "--ros-args", "-p", "scenario:=five_clusters_hover", *given
+        )
 
     def stop(node):
         node.terminate()

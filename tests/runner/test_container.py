@@ -146,9 +146,9 @@ def test_one_node_that_cannot_begin_lets_none_begin(ros: Ros, small_policy: Path
     """The policy is for another world."""
     file = parameters(
         ros.folder,
-        world={"scenario": "three_clusters"},
-        channel_monitor={"scenario": "three_clusters"},
-        policy={"scenario": "three_clusters", "policy": str(small_policy)},
+        world={"scenario": "three_clusters_hover"},
+        channel_monitor={"scenario": "three_clusters_hover"},
+        policy={"scenario": "three_clusters_hover", "policy": str(small_policy)},
     )
     given = ("--ros-args", "--params-file", file)
     status, output = ros.run_fork("uav_dc_ros.nodes.container", *COMPOSED, *given)

@@ -32,9 +32,12 @@ def refused(ros: Ros, *arguments: object) -> str:
     [
         (
             ("--scenario", "mars"),
-            "scenario 'mars': no such name or file; expected one of five_clusters, three",
+            "scenario 'mars': no such name or file; expected one of farm, five_clusters, ",
         ),
-        (("--policy", "nobody"), "policy 'nobody': no such name or folder; expected one of five_clusters_"),
+        (
+            ("--policy", "nobody"),
+            "policy 'nobody': no such name or folder; expected one of farm_dueling, five_clusters_",
+        ),
         (("--policy", "three_clusters_dueling"), "clusters is 5; expected 3"),
         (("--seed", "-1"), "argument --seed: '-1'; expected a whole number of at least 0"),
         (("--seed", "x"), "argument --seed: 'x'; expected a whole number"),
@@ -44,10 +47,10 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--system", "256"), "argument --system: '256'; expected a MAVLink system number from 1 to 255"),
         (("--system", "7"), "--system: expected --vehicle mavlink, mavros, px4 with it"),
         (("--pace", "0"), "argument --pace: '0'; expected 'lockstep' or a number above 0"),
-        (("--pace", "1e6"), "pace: 1e+06; expected at most 3000, which makes steps of 5 ms, or 'lockstep'"),
+        (("--pace", "1e6"), "pace: 1e+06; expected at most 3560, which makes steps of 5 ms, or 'lockstep'"),
         (
             ("--missions", "3000000"),
-            "missions: 3000000 of 60 steps of 15 s are 2.745e+09 s; expected less than",
+            "missions: 3000000 of 46 steps of 17.8 s are 2.5098e+09 s; expected less than",
         ),
         (("--bag", "/dev/null/bag"), "--bag /dev/null/bag: /dev/null is not a folder that can be written"),
         (

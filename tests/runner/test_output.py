@@ -17,7 +17,7 @@ from uav_dc_ros import cli
 from uav_dc_ros.cli import Output
 
 MISSION = ("--pace", "lockstep", "--no-record", "--nodes", "world,channel_monitor,policy", "--compose")
-MISSION = (*MISSION, "--scenario", "three_clusters", "--summary")
+MISSION = (*MISSION, "--scenario", "three_clusters_hover", "--summary")
 
 
 def test_pieces_are_written_in_their_order(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from uav_dc_ros.errors import ScenarioError
 from uav_dc_ros.scenarios import problems
 from uav_dc_ros.scenarios.lines import Lines
 
-TEXT = scenarios.find("five_clusters").read_text("utf-8")
+TEXT = scenarios.find("five_clusters_hover").read_text("utf-8")
 KEYS = [key for key, _ in leaves(read_values(TEXT, "")) if not key.startswith("the number of ")]
 TABLES = ("grid", "users", "mission", "radio", "reward")
 ENERGY = TEXT + "\n[energy]\nbattery_j = 90e3\n"
@@ -38,7 +38,7 @@ def test_each_key_has_its_line(key: str) -> None:
     path = path_of(key)
     line = Lines(TEXT).of(path)
     if path[:2] == ("users", "cluster_centres_m"):
-        centres_m = scenarios.load("five_clusters").users.cluster_centres_m
+        centres_m = scenarios.load("five_clusters_hover").users.cluster_centres_m
         x_m, y_m = centres_m[path[2]]  # type: ignore[index]
         assert line == line_with(TEXT, f"[{x_m}, {y_m}]")
     else:

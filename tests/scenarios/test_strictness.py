@@ -17,7 +17,7 @@ from uav_dc_ros.core.channel import FreeSpace
 from uav_dc_ros.core.scenario import Scenario, from_values, parse
 from uav_dc_ros.errors import ScenarioError, UavDcError
 
-TEXT = (files(scenarios) / "three_clusters.toml").read_text("utf-8")
+TEXT = (files(scenarios) / "three_clusters_hover.toml").read_text("utf-8")
 VALUES = tomllib.loads(TEXT)
 TABLES = ("grid", "users", "mission", "radio", "reward")
 LEAVES = [("name",), *((table, key) for table in TABLES for key in VALUES[table])]
@@ -54,25 +54,27 @@ def refused(tmp_path):
 
 def test_a_users_own_file(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text(with_line("max_steps", "max_steps = 77").replace("three_clusters", "my_field"), "utf-8")
+    path.write_text(
+        with_line("max_steps", "max_steps = 77").replace("three_clusters_hover", "my_field"), "utf-8"
+    )
     for wanted in (path, str(path)):
         scenario = scenarios.load(wanted)
         assert scenario.name == "my_field"
         assert scenario.mission.max_steps == 77
-        assert scenario.users == scenarios.load("three_clusters").users
+        assert scenario.users == scenarios.load("three_clusters_hover").users
 
 
 def test_a_users_own_file_in_the_working_directory(tmp_path, monkeypatch):
     (tmp_path / "mine.toml").write_text(TEXT, "utf-8")
     monkeypatch.chdir(tmp_path)
-    assert scenarios.load("mine.toml") == scenarios.load("three_clusters")
+    assert scenarios.load("mine.toml") == scenarios.load("three_clusters_hover")
 
 
 def test_windows_line_ends_and_whole_numbers_for_real_ones(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_bytes(with_line("cell_m", "cell_m = 100").replace("\n", "\r\n").encode())
     scenario = scenarios.load(path)
-    assert scenario == scenarios.load("three_clusters")
+    assert scenario == scenarios.load("three_clusters_hover")
     assert isinstance(scenario.grid.cell_m, float)
 
 
@@ -95,7 +97,7 @@ def test_a_cluster_is_in_reach_while_a_cell_reaches_its_disc(refused, tmp_path):
 def test_a_byte_order_mark_is_no_part_of_the_scenario(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(TEXT, "utf-8-sig")  # as Windows editors write it
-    assert scenarios.load(path) == scenarios.load("three_clusters")
+    assert scenarios.load(path) == scenarios.load("three_clusters_hover")
 
 
 @pytest.mark.parametrize(
@@ -277,7 +279,7 @@ def test_an_unknown_table(refused):
 def test_a_scenario_without_the_data_of_the_reward_counts_the_data_so_far():
     """As those of version 0.1.0 do; it is written in any case."""
     scenario = parse(with_line("data", ""), "old.toml")
-    assert scenario == scenarios.load("three_clusters")
+    assert scenario == scenarios.load("three_clusters_hover")
     assert msgspec.to_builtins(scenario)["reward"]["data"] == "so_far"
 
 
@@ -327,8 +329,8 @@ def test_no_such_name_or_file(wanted):
     with pytest.raises(ScenarioError) as caught:
         scenarios.load(wanted)
     assert str(caught.value) == (
-        f"scenario {wanted!r}: no such name or file; expected one of five_clusters, three_clusters, "
-        "or the path of a TOML file"
+        f"scenario {wanted!r}: no such name or file; expected one of farm, five_clusters, "
+        "five_clusters_hover, three_clusters, three_clusters_hover, town, or the path of a TOML file"
     )
 
 

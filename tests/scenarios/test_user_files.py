@@ -4,7 +4,6 @@ import json
 import re
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pymap3d
 import pytest
@@ -12,9 +11,10 @@ import pytest
 from tests.doc_commands import blocks
 from uav_dc_ros import scenario as command
 from uav_dc_ros import scenarios
+from uav_dc_ros.core.users.settings import User
 from uav_dc_ros.errors import ScenarioError
 
-TEXT = scenarios.find("five_clusters").read_text("utf-8")
+TEXT = scenarios.find("five_clusters_hover").read_text("utf-8")
 TEXT = re.sub(
     r"(?s)\[users\].*?\[mission\]", "[users]\nfile = 'users.csv'\nv_max_mps = 1.0\n\n[mission]", TEXT
 )
@@ -55,10 +55,10 @@ def point(longitude, latitude, **properties):
 
 def test_csv_in_metres(load):
     scenario = load(METRES)
-    assert msgspec.to_builtins(scenario.users.user) == (
-        {"x_m": 300.0, "y_m": 800.5, "name": "gate", "cluster": "b"},
-        {"x_m": 800.0, "y_m": 200.0, "name": "pump, old", "priority": 3.0},
-        {"x_m": 500.0, "y_m": 500.0, "name": "mast", "cluster": "b", "radius_m": 20.0, "data_bits": 2e6},
+    assert scenario.users.user == (
+        User(x_m=300.0, y_m=800.5, name="gate", cluster="b"),
+        User(x_m=800.0, y_m=200.0, name="pump, old", priority=3.0),
+        User(x_m=500.0, y_m=500.0, name="mast", cluster="b", radius_m=20.0, data_bits=2e6),
     )
     assert scenario.users.file is None, "the scenario holds the users themselves"
     again = load(METRES.replace("\n", "\r\n").replace(",x_m", " , x_m"))

@@ -30,7 +30,7 @@ def scenario(tmp_path):
 
     def write(text, datum="datum_deg = [47.4, 8.5]", own=""):
         (tmp_path / "zones.geojson").write_text(text, "utf-8")
-        shipped = scenarios.find("five_clusters").read_text("utf-8")
+        shipped = scenarios.find("five_clusters_hover").read_text("utf-8")
         shipped = shipped.replace("[radio]", "[radio]\nobstruction_loss_db = 20.0")
         path = tmp_path / "mine.toml"
         path.write_text(f'zones = "zones.geojson"\n{datum}\n{shipped}{own}', "utf-8")

@@ -14,7 +14,7 @@ from uav_dc_ros.experiments.train.population import Population, Run
 
 
 def changed(shipped: str, **tables: Any) -> Scenario:
-    """A shipped scenario with other values: `changed("five_clusters", mission={"max_steps": 5})`."""
+    """A shipped scenario with other values: `changed("five_clusters_hover", mission={"max_steps": 5})`."""
     values = msgspec.to_builtins(scenarios.load(shipped))
     for table, entries in tables.items():
         values[table] = values.get(table, {}) | entries if isinstance(entries, dict) else entries
@@ -30,7 +30,7 @@ def tiny(**tables: Any) -> Scenario:
     }
     for table, entries in tables.items():
         sections[table] = sections.get(table, {}) | entries
-    return changed("three_clusters", name="tiny", **sections)
+    return changed("three_clusters_hover", name="tiny", **sections)
 
 
 def config(scenario: Scenario, **values: Any) -> PolicyConfig:

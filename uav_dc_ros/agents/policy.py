@@ -17,7 +17,7 @@ import safetensors.numpy
 from msgspec import Meta
 from safetensors import SafetensorError
 
-from uav_dc_ros import files
+from uav_dc_ros import files, scenarios
 from uav_dc_ros.agents import network
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.arrays import Array
@@ -88,8 +88,9 @@ class Policy:
 
     @property
     def name(self) -> str:
-        """The policy's name."""
-        return self.config.name
+        """The policy's name; of a shipped policy that of its folder, since shipped ones have been renamed."""
+        shipped = self.folder.parent == files.shipped_folder("policies")
+        return self.folder.name if shipped else self.config.name
 
     @cached_property
     def _architecture(self) -> network.Architecture:
@@ -181,7 +182,7 @@ def load(name_or_path: str | Path) -> Policy:
     config_bytes, model_bytes = _read(path), _read(model_path)
     try:
         config = msgspec.json.decode(config_bytes, type=PolicyConfig)
-        scenario = from_values(config.scenario, f"{path}: scenario")
+        scenario = scenarios.as_shipped(from_values(config.scenario, f"{path}: scenario"))
         if (problem := observations.problem(config.observation, scenario)) is not None:
             raise PolicyError(f"{path}: {problem}")
     except msgspec.MsgspecError as error:

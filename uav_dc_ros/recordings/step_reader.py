@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from uav_dc_ros import cdr, messages, scenarios, topics
 from uav_dc_ros.bags.message_definitions import matches_jazzy
@@ -85,8 +86,9 @@ def scenario(reader: BagReader, namespace: str, wanted: str | Path | None = None
     flown = ""
     if status is not None:
         for shipped in map(scenarios.load, scenarios.names()):
-            if shipped.fingerprint == status.fingerprint:
-                return shipped
+            # Under another name in version 0.1.0.
+            if (former := replace(shipped, name=status.scenario)).fingerprint == status.fingerprint:
+                return former
         flown = f", and its missions fly {status.scenario!r} ({status.fingerprint})"
     raise BagError(f"bag {reader.path} holds no scenario{flown}; expected --scenario NAME|FILE")
 

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
 from uav_dc_ros.core.propagation import gain_map
 from uav_dc_ros.core.scenario import Scenario, from_values, read_values
 from uav_dc_ros.errors import ScenarioError
@@ -15,6 +17,21 @@ FOLDER = Path(__file__).parent
 def names() -> list[str]:
     """Names of the shipped scenarios."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def as_shipped(scenario: Scenario) -> Scenario:
+    """The scenario, under the name of a shipped one that is the same world.
+
+    Names have changed in version 0.2.0. The scenario itself if its name is that of the same world, or if no
+    shipped one is the same.
+    """
+    if scenario.name in names() and load(scenario.name).fingerprint == scenario.fingerprint:
+        return scenario
+    for name in names():
+        renamed = replace(scenario, name=name)
+        if load(name).fingerprint == renamed.fingerprint:
+            return renamed
+    return scenario
 
 
 def find(name_or_path: str | Path) -> Path:

@@ -165,7 +165,7 @@ def test_both_profiles_have_the_same_settings() -> None:
 
 MISSIONS = """
 import glob, os, subprocess, sys
-run_all = [sys.executable, "-m", "uav_dc_ros.run_all", "--scenario", "three_clusters", "--no-record"]
+run_all = [sys.executable, "-m", "uav_dc_ros.run_all", "--scenario", "three_clusters_hover", "--no-record"]
 run_all += ["--nodes", "world,channel_monitor,policy"] * (sys.argv[1] == "nodes")
 def shared(): return sorted(n for n in os.listdir("/dev/shm") if "fast" in n)
 subprocess.run([*run_all, "--pace", "lockstep"], check=True, stdout=subprocess.DEVNULL)

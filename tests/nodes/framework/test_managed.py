@@ -71,7 +71,10 @@ def test_a_bad_policy_fails_at_configure_with_its_reason_and_a_good_one_heals_it
     assert given["policy"]["success"]
     assert client.call(node="/policy", do="configure") == {"success": True, "state": "inactive"}
     output = ended(node)
-    assert "policy 'nobody': no such name or folder; expected one of five_clusters_dueling" in output
+    assert (
+        "policy 'nobody': no such name or folder; expected one of farm_dueling, five_clusters_dueling"
+        in output
+    )
 
 
 def check_parameters(client: ServiceClient, name: str) -> None:

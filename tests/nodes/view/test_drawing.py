@@ -22,7 +22,7 @@ from uav_dc_ros.nodes.view import markers
 from uav_dc_ros.nodes.view.markers import Scene, UserState
 from uav_dc_ros.nodes.view.path_history import POSES_MAX, PathHistory
 
-SCENARIO = scenarios.load("five_clusters")
+SCENARIO = scenarios.load("five_clusters_hover")
 U = SCENARIO.n_users
 MISSION = Mission(
     mission=0,
@@ -150,7 +150,9 @@ def test_the_uav_the_dock_and_the_text() -> None:
 def test_obstacles_are_drawn_with_walls_and_a_top() -> None:
     tower = {"polygon_m": [[350.0, 350.0], [450.0, 350.0], [400.0, 450.0]], "height_m": 170.0}
     zone = {"kind": "no_fly", "polygon_m": [[600.0, 0.0], [700.0, 0.0], [700.0, 90.0], [600.0, 90.0]]}
-    scenario = changed("five_clusters", radio={"obstruction_loss_db": 20.0}, obstacles=[tower, tower, zone])
+    scenario = changed(
+        "five_clusters_hover", radio={"obstruction_loss_db": 20.0}, obstacles=[tower, tower, zone]
+    )
     shapes = read(markers.markers(scenario, scene()))
     for kind, n_triangles, top_m in (("building", 2 * (1 + 6), 170.0), ("no_fly", 2 + 8, 250.0)):
         (marker,) = shapes[kind]

@@ -121,7 +121,7 @@ def test_who_joins_late_draws_the_whole_mission(ros: Ros, small_scenario: Path, 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("scenario", ["five_clusters"])
+@pytest.mark.parametrize("scenario", ["five_clusters_hover"])
 def test_another_world_s_mission_is_refused(
     ros: Ros, small_scenario: Path, small_policy: Path, scenario: str
 ) -> None:

@@ -21,7 +21,7 @@ from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Telemetry
 
 ROOT = Path(__file__).parents[3]
-SCENARIO = scenarios.load("five_clusters")
+SCENARIO = scenarios.load("five_clusters_hover")
 KINDS = ("ardupilot", "px4")
 WIRES = ("tcp", "udp")
 

@@ -20,7 +20,7 @@ from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 
 START = Enu(20.0, 0.0, 0.0)  # on the ground below it
 SCENARIO = changed(
-    "three_clusters",
+    "three_clusters_hover",
     grid={"n_x": 3, "n_y": 3, "n_z": 1, "cell_m": 20.0, "altitude_min_m": 10.0, "altitude_step_m": 5.0},
     users={"cluster_centres_m": [[20.0, 0.0]], "users_per_cluster": 4, "cluster_radius_m": 5.0},
     mission={"start_m": [20.0, 0.0, 10.0], "dock_m": [40.0, 20.0], "max_steps": 3},

@@ -19,7 +19,7 @@ SPEED_MPS = {"across": 10.0, "up": 2.5, "down": 1.5}
 RETURN_M = 15.0  # least altitude of a return
 STALE_S = 3.0  # age after which a transport takes the last report on the estimate for nothing
 
-SCENARIO = scenarios.load("five_clusters")
+SCENARIO = scenarios.load("five_clusters_hover")
 TICK_S = 0.1
 START = Enu(*SCENARIO.mission.start_m)
 ARMING = SafetySettings(arm=True)

@@ -24,7 +24,7 @@ from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
 from uav_dc_ros.offboard.setpoint_stream import STREAM_S, use_realtime_priority
 
 BURN = "while True: pass"
-LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_dueling')"
+LOAD = "from uav_dc_ros.agents import policy; policy.load('five_clusters_hover_dueling')"
 
 
 def transport(address: str) -> None:

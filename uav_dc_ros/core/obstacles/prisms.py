@@ -15,9 +15,7 @@ from uav_dc_ros.core.obstacles import polygons
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 
 
-class Obstacle(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True, dict=True
-):
+class Obstacle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, dict=True):
     """A building, or a zone that the UAV may not fly in."""
 
     name: Annotated[str, Meta(max_length=64)] = ""  # in errors and pictures

@@ -22,7 +22,7 @@ Size: TypeAlias = Annotated[int, Meta(ge=1, le=USERS_MAX)]
 Point: TypeAlias = tuple[float, float]  # x, y, metres
 
 
-class User(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+class User(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A user of the list `users.user`; a row of a file of users."""
 
     # x_m, y_m: position at the start of a mission, or the centre of the disc in which it starts, metres

@@ -20,6 +20,9 @@ from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES
 from uav_dc_ros.experiments.paper.results import Results
 from uav_dc_ros.experiments.paper.setting import domain, name
+from uav_dc_ros.experiments.paper.worlds.page import PAGE_FILE
+from uav_dc_ros.experiments.paper.worlds.shares import holding
+from uav_dc_ros.experiments.paper.worlds.verdicts import WORLDS_FILE, Multiverse
 
 CLAIMS_FILE, VERDICTS_FILE = "claims.md", "claims.json"
 _VERDICTS: dict[Verdict, str] = {
@@ -62,13 +65,16 @@ def write(
         draw(figure, results, tracks, folder / f"{figure}.png")
     findings = check(results)
     drawn = [figure for figure in FIGURES if (folder / f"{figure}.png").is_file()]
-    files.write(folder / CLAIMS_FILE, claims_md(results, findings, drawn).encode())
+    worlds = Multiverse.load(folder) if (folder / WORLDS_FILE).is_file() else None
+    files.write(folder / CLAIMS_FILE, claims_md(results, findings, drawn, worlds).encode())
     verdicts = msgspec.json.format(msgspec.json.encode([_plain(one) for one in findings]), indent=2)
     files.write(folder / VERDICTS_FILE, verdicts + b"\n")
 
 
-def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str]) -> str:
-    """The text of `claims.md`; `drawn` are the figures beside it."""
+def claims_md(
+    results: Results, findings: Sequence[Finding], drawn: Sequence[str], worlds: Multiverse | None = None
+) -> str:
+    """The text of `claims.md`; `drawn` are the figures beside it, as is the page of the `worlds`."""
     evidence, scale = Evidence(results), results.metadata.scale
     warning = (
         f"> **The scale is `{scale.name}`: {scale.episodes} episodes. These numbers mean nothing.** "
@@ -79,7 +85,7 @@ def claims_md(results: Results, findings: Sequence[Finding], drawn: Sequence[str
         *([] if scale.name == "full" else [warning]),
         f"Of {len(findings)} claims {_counts(findings)}.",
         *_of_five(findings),
-        _summary(findings),
+        _summary(findings, worlds),
         "Effect and interval are those of the part that decides: where a claim fails, the part it fails by.",
         "## How it was made",
         _provenance(results),
@@ -131,7 +137,7 @@ def _provenance(results: Results) -> str:
   verdicts also in `{VERDICTS_FILE}`"""
 
 
-def _summary(findings: Sequence[Finding]) -> str:
+def _summary(findings: Sequence[Finding], worlds: Multiverse | None) -> str:
     header = ["", "setting", "claim", "verdict", "effect [95% interval]", "contradicted by"]
     rows = []
     for finding in findings:
@@ -140,7 +146,12 @@ def _summary(findings: Sequence[Finding]) -> str:
         link = f"[{claim.id}](#{claim.id.lower()})"
         row = [link, claim.setting, claim.text, f"**{finding.verdict}**", effect, mark(claim.id)]
         rows.append([*row, finding.of_five.verdict] if finding.of_five else row)
-    return _markdown([*header, "with the paper's five"][: len(rows[0])], rows)
+    header = [*header, "with the paper's five"][: len(rows[0])]
+    if worlds is not None:
+        header.append(f"holds in [many worlds]({PAGE_FILE})")
+        for row, share in zip(rows, holding(worlds).values(), strict=True):
+            row.append("" if share is None else f"{share.share:.0%} [{share.low:.0%}, {share.high:.0%}]")
+    return _markdown(header, rows)
 
 
 def _figure(name: str) -> str:

@@ -25,7 +25,10 @@ from uav_dc_ros.experiments.train.population import Run
 Ratio: TypeAlias = tuple[float, float]
 
 OBSERVATION: Observation = "position"  # the paper's state: a network's input is the UAV's cell
-HIDDEN = (64, 64)  # the paper names no layers; two of 64 are ample for the 363 cells of the field
+# The learner of the chosen world: the paper leaves all three open. See docs/paper/worlds.md.
+HIDDEN = (32, 32)
+TARGET_EVERY = 1631  # iterations between copies to the target network
+BUFFER_SIZE = 4227  # transitions in the replay buffer
 ALGORITHMS: tuple[Algorithm, ...] = ("dqn", "dueling_dqn")
 R_PLUS: tuple[RPlus, ...] = ("binary", "exponential")
 FORMS: tuple[RewardForm, ...] = ("immediate", "episode")
@@ -170,6 +173,8 @@ class PlannedRun(NamedTuple):
                 batch_size=setting.batch_size,
                 learning_rate=setting.learning_rate,
                 episodes=scale.episodes,
+                target_every=TARGET_EVERY,
+                buffer_size=BUFFER_SIZE,
             ),
         )
 

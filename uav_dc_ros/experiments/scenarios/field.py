@@ -1,6 +1,7 @@
 """Fields made from a few numbers: laid out evenly, or at random.
 
-What the numbers leave open is as in the shipped scenario `five_clusters`: layers, speed, channel and reward.
+What the numbers leave open is as in the shipped scenario `five_clusters_hover`: layers, speed, channel and
+reward.
 The rest follows by rule:
 
 - A cell is about a tenth of the longer side, and the sides are whole cells.
@@ -26,7 +27,7 @@ from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.experiments.scenarios import flyable
 
-SHIPPED = "five_clusters"
+SHIPPED = "five_clusters_hover"
 CLUSTERS_MAX, USERS_MAX = 50, 1000  # clusters, and users of one
 SIDE_MIN_M, SIDE_MAX_M = 100.0, 100_000.0
 CELLS = 10  # along the longer side, about

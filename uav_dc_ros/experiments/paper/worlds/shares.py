@@ -63,6 +63,15 @@ def share(n: int, total: int) -> Share:
     return Share(n, p, max(float(middle - half), 0.0), min(float(middle + half), 1.0))
 
 
+def holding(multiverse: Multiverse) -> dict[str, Share | None]:
+    """The share of the drawn worlds in which each claim holds; None: it is not weighed."""
+    holds = (multiverse.drawn.verdicts == "holds").T
+    return {
+        claim: share(int(column.sum()), len(column)) if tested else None
+        for claim, column, tested in zip(IDS, holds, multiverse.tested, strict=True)
+    }
+
+
 def summaries(multiverse: Multiverse) -> list[ClaimShares]:
     """Every claim over all worlds, in the order of `IDS`."""
     features = [world.features() for world in multiverse.worlds]
