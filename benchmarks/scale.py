@@ -31,14 +31,8 @@ def main() -> None:
             assert f"users_per_cluster = {users // CLUSTERS}" in text, "the scenario has changed"
             scenario.write_text(text)
             missions = max(1, round(SECONDS_WANTED * min(600, 450_000 / users) / 60))
-            options = (
-                "--scenario",
-                scenario,
-                "--policy",
-                "five_clusters_hover_dueling",
-                "--pace",
-                "lockstep",
-            )
+            policy = "five_clusters_hover_dueling"
+            options = ("--scenario", scenario, "--policy", policy, "--pace", "lockstep")
             options += ("--no-compose",)  # who takes how much
             flown = fly(Path(folder), *options, "--missions", missions)
             sizes = [flown.payload_bytes[topic] / 1e3 for topic in ("users", "rates")]

@@ -26,6 +26,17 @@ def test_there_is_one_for_each_scenario_and_one_with_the_papers_state():
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_it_has_one_name_however_it_is_loaded(name, monkeypatch):
+    """Also the renamed ones, whose config has the name of before, and that of their world."""
+    folder = policy.load(name).folder
+    monkeypatch.chdir(folder.parent)
+    for where in (name, folder, f"./{name}", f"../{folder.parent.name}/{name}"):
+        loaded = policy.load(where)
+        assert loaded.name == name
+        assert loaded.scenario.fingerprint == scenarios.load(loaded.scenario.name).fingerprint
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_the_figures_on_the_card_come_out_again(name):
     loaded = policy.load(name)
     result = evaluate(loaded, scenarios.load(loaded.scenario.name))

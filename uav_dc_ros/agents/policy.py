@@ -89,7 +89,7 @@ class Policy:
     @property
     def name(self) -> str:
         """The policy's name; of a shipped policy that of its folder, since shipped ones have been renamed."""
-        shipped = self.folder.parent == files.shipped_folder("policies")
+        shipped = self.folder.resolve().parent == files.shipped_folder("policies").resolve()
         return self.folder.name if shipped else self.config.name
 
     @cached_property

@@ -22,10 +22,10 @@ def names() -> list[str]:
 def as_shipped(scenario: Scenario) -> Scenario:
     """The scenario, under the name of a shipped one that is the same world.
 
-    Names have changed in version 0.2.0. The scenario itself if its name is that of the same world, or if no
-    shipped one is the same.
+    Names have changed in version 0.2.0: a shipped name may be that of another world now. The scenario itself
+    if its name is not a shipped one, or is that of the same world, or if no shipped one is the same.
     """
-    if scenario.name in names() and load(scenario.name).fingerprint == scenario.fingerprint:
+    if scenario.name not in names() or load(scenario.name).fingerprint == scenario.fingerprint:
         return scenario
     for name in names():
         renamed = replace(scenario, name=name)
