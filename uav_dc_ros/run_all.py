@@ -63,7 +63,8 @@ def parser(prog: str = PROG) -> cli.Parser:
     real("--arm", action="store_true", help=arm)
     datum = (
         "position of the grid's corner: such that the vehicle stands at the scenario's start, that of "
-        "the last flight, or coordinates; required with --arm (default: here)"
+        "the last flight, or coordinates (default: the scenario's datum_deg; without one here, and with "
+        "--arm the option is required)"
     )
     real("--datum", metavar="here|last|LAT,LON,ALT", help=datum)
     setting = "any parameter of a node, such as bridge.failsafe_action=land; repeatable"

@@ -2,11 +2,15 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
 from uav_dc_ros import run_all, scenarios
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError, ParameterError, VehicleError
+from uav_dc_ros.nodes import vehicles
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.runner import run_options
@@ -24,10 +28,10 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def check(*given: str) -> None:
+def check(*given: str, scenario: Scenario = FIVE) -> None:
     """What run_all checks of the options of a vehicle."""
     wanted = run_all.parser().parse_args(["--vehicle", "mavlink", "--connect", "tcp:127.0.0.1:1", *given])
-    run_options.check_vehicle(wanted, ["bridge"], FIVE)
+    run_options.check_vehicle(wanted, ["bridge"], scenario)
 
 
 def test_a_datum_with_a_minus_is_a_value() -> None:
@@ -47,6 +51,49 @@ def test_arming_requires_a_datum() -> None:
         check(*given)
     with pytest.raises(VehicleError, match="datum: '47,8'; expected LATITUDE,LONGITUDE,ALTITUDE"):
         check("--datum", "47,8")
+
+
+PLACED = msgspec.structs.replace(FIVE, datum_deg=(DATUM.latitude_deg, DATUM.longitude_deg))
+
+
+def test_a_scenario_with_a_datum_needs_no_option_and_refuses_another_place() -> None:
+    check("--arm", scenario=PLACED)
+    assert datums.parse("", PLACED, "mavlink", arm=True) is None, "the ground gives the altitude"
+    near, far = DATUM.at(Enu(3.0, 3.0, 50.0)), DATUM.at(Enu(0.0, -6.0, 0.0))
+    assert datums.parse(str(near), PLACED, "mavlink") == near
+    expected = (
+        rf"^datum: '{far}'; the grid's corner at {far} is 6\.0 m from datum_deg = "
+        r"\[-35\.363261, 149\.16523\] of scenario five_clusters_hover; expected at most 5 m, or no datum$"
+    )
+    with pytest.raises(ParameterError, match=expected):
+        check("--arm", "--datum", str(far), scenario=PLACED)
+    datums.save(PLACED, far, "mavlink")
+    with pytest.raises(ParameterError, match=r"^datum: 'last'; .* 6\.0 m from datum_deg"):
+        check("--datum", "last", scenario=PLACED)
+    text, moved = datums.describe(DATUM, "", PLACED)
+    assert moved
+    assert ", from the scenario's datum_deg and the ground under the vehicle; 0.0 m" in text
+    assert "6.0 m north of that of the last flight" in text
+
+
+@pytest.mark.parametrize("vehicle", ["mavlink", "mavros"])
+@pytest.mark.parametrize(
+    ("text", "grid_origin", "expected"),
+    [("", "", PLACED.datum_deg), ("here", "", None), (str(DATUM), "", None), ("", "1.0,2.0,3.0", None)],
+)
+def test_the_transports_get_the_scenario_s_datum(
+    vehicle: str, text: str, grid_origin: str, expected: tuple[float, float] | None
+) -> None:
+    values = {"vehicle": vehicle, "datum": text, "connect": "tcp:127.0.0.1:1", "system": 1, "arm": False}
+    datum = datums.parse(text, PLACED, vehicle)
+    node: Any = None
+    made: Any = vehicles.make(node, values, PLACED, datum, grid_origin, None, False)
+    telemetry = made._telemetry
+    if vehicle == "mavros":
+        assert telemetry.datum == (Geodetic(*expected, 0.0) if expected else datum)
+    else:
+        assert telemetry.datum_deg == expected
+    made.close()
 
 
 def test_the_last_flight_s_is_that_of_the_same_world() -> None:

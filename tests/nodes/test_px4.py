@@ -343,6 +343,18 @@ def test_an_invalid_grid_origin(grid_origin: str) -> None:
         Px4Telemetry(start=PLACE, grid_origin=grid_origin)
 
 
+def test_the_scenario_s_datum_has_the_altitude_of_the_ground(msg: Any) -> None:
+    corner = ZURICH.at(Enu(-5.0, -7.0, 0.0))
+    telemetry = standing(msg, datum_deg=corner[:2])
+    assert telemetry.snapshot().position is None, "not where the scenario starts"
+    assert "with a global position" in str(telemetry.snapshot().missing)
+    telemetry.on_vehicle_local_position(position(msg, START, ZURICH), 1.0)
+    north_m, east_m, down_m = START
+    datum, place = telemetry.datum, telemetry.snapshot().position
+    assert datum == pytest.approx((*corner[:2], ZURICH.altitude_m - down_m), abs=1e-3)
+    assert place == pytest.approx((5.0 + east_m, 7.0 + north_m, 0.0), abs=1e-3)
+
+
 def test_a_grid_with_a_datum_needs_a_px4_that_knows_the_earth(msg: Any) -> None:
     telemetry = standing(msg, datum=ZURICH.at(Enu(-5.0, -7.0, 0.0)))
     assert telemetry.snapshot().position is None

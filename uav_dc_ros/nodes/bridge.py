@@ -218,7 +218,7 @@ class AutopilotBridge(MissionNode):
         self._grid, moved = grid, True
         text = f"the grid lies at {grid} of the vehicle's own frame; not compared with the last flight"
         if datum is not None:
-            source = "" if self._is_restarted else self.values["datum"] or datums.HERE
+            source = datums.RESTART if self._is_restarted else self.values["datum"]
             text, moved = datums.describe(datum, source, self.scenario)
         (self.get_logger().warning if moved else self.get_logger().info)(text)
 

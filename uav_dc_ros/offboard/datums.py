@@ -1,4 +1,4 @@
-"""The grid's datum: the option that gives it, and the datum of the last flight in each scenario's world.
+"""The grid's datum: the option or scenario that gives it, and that of the last flight in each world.
 
 Files are in the user's state folder (systemd's `STATE_DIRECTORY`, `XDG_STATE_HOME`, or `~/.local/state`).
 """
@@ -15,10 +15,11 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import NodeError, ParameterError, UavDcError, VehicleError
 from uav_dc_ros.offboard.frames import Geodetic
 
-HERE, LAST = "here", "last"
+HERE, LAST, RESTART = "here", "last", "restart"
 EXPECTED = (
     f"{HERE} (the vehicle stands at the scenario's start), {LAST} (as in the last flight) or LAT,LON,ALT"
 )
+SCENARIO = ""  # without the option: `datum_deg` of the scenario, or else `here`
 MOVED_M = 5.0  # two fixes of one place differ by less
 NO_ALTITUDE = "mavros"  # altitude 0 of the datum is the ground under the vehicle
 
@@ -79,15 +80,43 @@ def save(scenario: Scenario, datum: Geodetic, vehicle: str) -> None:
 def parse(text: str, scenario: Scenario, vehicle: str, *, arm: bool = False) -> Geodetic | None:
     """Datum given by an option or parameter; None: the position of the vehicle on the ground gives it.
 
-    The text is `here`, `last` or LAT,LON,ALT; empty is as `here`, but not with `arm`. Raises ParameterError
-    if no last flight fits `vehicle`, the transport, or `arm` has no datum; VehicleError if the text is none.
+    The text is `here`, `last` or LAT,LON,ALT. Empty is the scenario's `datum_deg` with the altitude of the
+    ground under the vehicle; without that key it is as `here`, but not with `arm`.
+
+    Raises:
+        ParameterError: no last flight fits `vehicle`, the transport; `arm` has no datum; the datum and
+            `datum_deg` disagree.
+        VehicleError: the text is none of these.
     """
-    if arm and not text:
+    if arm and not text and scenario.datum_deg is None:
         raise ParameterError(f"arm: without a datum; expected one with it: {_offer(scenario)}")
     if text in ("", HERE):
         return None
-    if text != LAST:
-        return Geodetic.parse(text)
+    datum = _last(scenario, vehicle) if text == LAST else Geodetic.parse(text)
+    if (conflict := disagreement(datum, scenario)) is not None:
+        raise ParameterError(f"datum: {text!r}; {conflict}, or no datum")
+    return datum
+
+
+def disagreement(datum: Geodetic, scenario: Scenario) -> str | None:
+    """Text on a datum more than `MOVED_M` away from the scenario's `datum_deg`; None: they agree.
+
+    The scenario's users, buildings and zones stand still on the Earth: a grid elsewhere moves them unseen.
+    """
+    own = scenario.datum_deg
+    if own is None or datum[:2] == own:
+        return None
+    apart_m = math.hypot(*datum.enu_from(Geodetic(*own, datum.altitude_m))[:2])
+    if apart_m <= MOVED_M:
+        return None
+    return (
+        f"the grid's corner at {datum} is {apart_m:.1f} m from datum_deg = {list(own)} of scenario "
+        f"{scenario.name}; expected at most {MOVED_M:g} m"
+    )
+
+
+def _last(scenario: Scenario, vehicle: str) -> Geodetic:
+    """Datum of the last flight; raises ParameterError as `parse`."""
     saved = last(scenario)
     if saved is None:
         raise ParameterError(
@@ -105,13 +134,16 @@ def parse(text: str, scenario: Scenario, vehicle: str, *, arm: bool = False) -> 
 def describe(datum: Geodetic, source: str, scenario: Scenario) -> tuple[str, bool]:
     """Position of the grid, its source and its distance from the last flight's; and whether it has moved.
 
-    `source` is the text of the option, see `parse`; empty: an earlier start of the bridge in this flight.
+    `source` is the text of the option, see `parse`, or `RESTART`: an earlier bridge of this flight.
     """
     sources = {
         HERE: "from the vehicle's position",
         LAST: "as in the last flight",
-        "": "as before the restart",
+        SCENARIO: "from the scenario's datum_deg and the ground under the vehicle",
+        RESTART: "as before the restart",
     }
+    if source == SCENARIO and scenario.datum_deg is None:
+        source = HERE
     text = f"the grid's corner lies at {datum}, {sources.get(source, 'as given')}"
     try:
         saved = last(scenario)

@@ -7,6 +7,11 @@ from typing import Any, Protocol, Self
 
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 
+ALTITUDE_UNKNOWN = (  # what is missing with a datum_deg, until the vehicle on the ground gives its altitude
+    "the altitude of the grid (datum_deg of the scenario) is not known; expected the vehicle on the ground, "
+    "with a global position, or --datum=LAT,LON,ALT"
+)
+
 
 class Mode(StrEnum):
     """Flight modes that the bridge distinguishes."""

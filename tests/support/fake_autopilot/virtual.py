@@ -54,7 +54,7 @@ class VirtualFlight(FlightRecord):
         how: carefully it is flown.
         scenario: the world.
         channel: from the autopilot to the bridge; None: all arrives at once.
-        datum: of the grid.
+        datum, datum_deg: of the grid.
         system: the vehicle that is meant.
         speed: how many times faster than the clock its time runs.
         looks: after so many of its ticks the bridge looks; 1: as often as its node.
@@ -72,6 +72,7 @@ class VirtualFlight(FlightRecord):
         scenario: Scenario | None = None,
         channel: Channel | None = None,
         datum: Geodetic | None = None,
+        datum_deg: tuple[float, float] | None = None,
         system: int | None = None,
         speed: float = 1.0,
         looks: int = LOOKS,
@@ -86,7 +87,7 @@ class VirtualFlight(FlightRecord):
         self.channel = channel or (lambda sent, now_s: sent)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
-        self.telemetry = MavlinkTelemetry(datum, self.place, system)
+        self.telemetry = MavlinkTelemetry(datum, self.place, system, datum_deg=datum_deg)
         self.session = Session(load_codec(), self.telemetry, self._write)
         self.link_is_up, self.now_s, self.speed, self.looks = True, 1000.0, speed, looks
         self._control = Control(self.autopilot)

@@ -187,7 +187,8 @@ BRIDGE = (
         "",
         "position of the grid's corner: here (the vehicle stands at the scenario's start when its first good "
         "position arrives), last (as in the last flight), or latitude, longitude (degrees) and altitude "
-        "(metres) with a comma between; needed with arm; empty: here",
+        "(metres) with a comma between; empty: datum_deg of the scenario, where it has one; here otherwise, "
+        "and not with arm",
     ),
     *(SCENARIO, SEED, JOURNAL),
     Parameter(

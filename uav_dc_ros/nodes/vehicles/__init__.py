@@ -18,14 +18,16 @@ def make(
     node: Node,  # the bridge
     values: Mapping[str, Any],  # of its parameters
     scenario: Scenario,  # at its start the vehicle stands when its first position comes (ENU of the grid)
-    datum: Geodetic | None,  # replaces the start. Through MAVROS, the start gives the height all the same
-    grid_origin: str,  # of an earlier bridge in the same flight, which replaces both; empty: none
+    datum: Geodetic | None,  # replaces start and `datum_deg`. Through MAVROS, the start gives the height
+    grid_origin: str,  # of an earlier bridge in the same flight, which replaces all of them; empty: none
     system: int | None,  # MAVLink system of the vehicle then, unless the parameter names one
     restarted: bool,  # whether an earlier bridge was killed, which the ROS graph may still list
 ) -> Vehicle:
     """The vehicle that a bridge's parameters name; not opened yet. Call `check` before."""
     start = Enu(*scenario.mission.start_m)._replace(up_m=0.0)
-    grid: dict[str, Any] = {"start": start, "datum": datum, "grid_origin": grid_origin}
+    datum_deg = None if values["datum"] or grid_origin else scenario.datum_deg
+    grid: dict[str, Any] = {"start": start, "datum": datum, "datum_deg": datum_deg}
+    grid["grid_origin"] = grid_origin
     if values["vehicle"] == "mavlink":
         return MavlinkVehicle(values["connect"], **grid, system=values["system"] or system)
     if values["vehicle"] == "mavros":

@@ -187,12 +187,15 @@ class MavrosVehicle:
         start: Enu,
         grid_origin: str = "",
         datum: Geodetic | None = None,
+        datum_deg: tuple[float, float] | None = None,
         arms: bool = False,
         restarted: bool = False,
     ) -> None:
         self._node, self._restarted = node, restarted or bool(grid_origin)
         self._package = load_messages(needed_for="arming" if arms else "")
-        self._telemetry = MavrosTelemetry(start, datum, grid_origin, has_msgs=self._package is not None)
+        self._telemetry = MavrosTelemetry(
+            start, datum, grid_origin, has_msgs=self._package is not None, datum_deg=datum_deg
+        )
         self._yaw_rad: float | None = None
         self._stream: SetpointStream[Target] = SetpointStream(self._publish, "mavros")
         self._publisher: Any = None

@@ -80,11 +80,12 @@ class Px4Vehicle:
         start: Enu,
         grid_origin: str = "",
         datum: Geodetic | None = None,
+        datum_deg: tuple[float, float] | None = None,
         restarted: bool = False,
     ) -> None:
         self._messages = load_messages()
         self._node, self._restarted = node, restarted or bool(grid_origin)
-        self._telemetry = Px4Telemetry(start=start, grid_origin=grid_origin, datum=datum)
+        self._telemetry = Px4Telemetry(start=start, grid_origin=grid_origin, datum=datum, datum_deg=datum_deg)
         self._lock = threading.Lock()  # of all below, and of `_telemetry`
         self._streamed_vehicle_s = 0.0
         self._sent: Ned | None = None

@@ -12,7 +12,7 @@ from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, sphere_sc
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM, OtherControllers, Systems
 from uav_dc_ros.offboard.message_order import Discard, Sequence, VehicleClock
 from uav_dc_ros.offboard.rejections import Rejections
-from uav_dc_ros.offboard.vehicle import Limits, Mode, Telemetry
+from uav_dc_ros.offboard.vehicle import ALTITUDE_UNKNOWN, Limits, Mode, Telemetry
 
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 POSITION_IGNORED = 0x7  # POSITION_TARGET_TYPEMASK
@@ -59,9 +59,15 @@ class MavlinkTelemetry:
     """State of one vehicle. Arguments: see `MavlinkVehicle`."""
 
     def __init__(
-        self, datum: Geodetic | None, start: Enu, system: int | None = None, again: bool = False
+        self,
+        datum: Geodetic | None,
+        start: Enu,
+        system: int | None = None,
+        again: bool = False,
+        datum_deg: tuple[float, float] | None = None,
     ) -> None:
         self.datum, self.start = datum, start  # of the grid, None: not known yet; see `MavlinkVehicle`
+        self.datum_deg = datum_deg
         self.systems, self.other_controllers = Systems(system, again), OtherControllers(SYSTEM, COMPONENT)
         self.rejections = Rejections()
         self.discarded: Counter[str] = Counter()
@@ -215,6 +221,8 @@ class MavlinkTelemetry:
             return f"the autopilot is not ready to arm: {(reasons or ['no position estimate yet'])[-1]}"
         if self.position is None and self.landed_state == ON_GROUND:
             return "the autopilot has no estimate of its position yet"
+        if self.position is None and self.datum_deg is not None:
+            return ALTITUDE_UNKNOWN
         if self.position is None:
             return "the grid has no datum, and the vehicle does not stand on the ground; expected a datum"
         return None
@@ -273,7 +281,10 @@ class MavlinkTelemetry:
             if self.landed_state != ON_GROUND or not self._estimate_ok():
                 return
             here = self._frame_at(Enu(0.0, 0.0, 0.0)).from_autopilot(self._ned)
-            self.datum = self._origin.at(here.minus(self.start))
+            if self.datum_deg is None:
+                self.datum = self._origin.at(here.minus(self.start))
+            else:
+                self.datum = Geodetic(*self.datum_deg, self._origin.at(here).altitude_m)
             self.frame = self._frame_at(self._origin.enu_from(self.datum))
         if self.frame is not None:
             self.position = self.frame.from_autopilot(self._ned)

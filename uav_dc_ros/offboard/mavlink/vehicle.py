@@ -44,7 +44,8 @@ class MavlinkVehicle:
         *,
         datum: Geodetic | None = None,  # None: the vehicle stands at `start` when its first position comes
         start: Enu = ORIGIN,  # in the grid's ENU frame
-        grid_origin: str = "",  # of an earlier process in the same flight; replaces `datum`
+        datum_deg: tuple[float, float] | None = None,  # without `datum`: its latitude and longitude
+        grid_origin: str = "",  # of an earlier process in the same flight; replaces all three
         system: int | None = None,  # MAVLink system of the vehicle; None: the only autopilot on the link
     ) -> None:
         if grid_origin:
@@ -53,7 +54,7 @@ class MavlinkVehicle:
         codec = load_codec()
         if self.address.kind == "serial":
             load_serial(self.address)
-        self._telemetry = MavlinkTelemetry(datum, start, system, again=bool(grid_origin))
+        self._telemetry = MavlinkTelemetry(datum, start, system, again=bool(grid_origin), datum_deg=datum_deg)
         self._session = Session(codec, self._telemetry, self._write)
         self._lock = threading.Lock()  # of both
         self._down: str | None = f"{self.address} is not open yet"  # why there is no connection

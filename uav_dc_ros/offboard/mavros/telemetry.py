@@ -84,8 +84,15 @@ class MavrosTelemetry:
     """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`."""
 
     def __init__(
-        self, start: Enu, datum: Geodetic | None = None, grid_origin: str = "", has_msgs: bool = False
+        self,
+        start: Enu,
+        datum: Geodetic | None = None,
+        grid_origin: str = "",
+        has_msgs: bool = False,
+        datum_deg: tuple[float, float] | None = None,
     ) -> None:
+        if datum_deg is not None:
+            datum = Geodetic(*datum_deg, 0.0)  # the ground under the vehicle
         self.start, self.datum, self.has_msgs = start, datum, has_msgs  # mavros_msgs is installed
         # Of MAVROS's local frame (its EKF's origin), in the grid's frame; None: not known yet.
         self.origin = Enu.parse(grid_origin) if grid_origin else None

@@ -1,6 +1,7 @@
 """Decisions before the first step: while the bridge connects, checks the vehicle and arms it."""
 
 from uav_dc_ros.messages import Phase
+from uav_dc_ros.offboard.datums import disagreement
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence, limit_conflict, limit_warnings
@@ -10,6 +11,8 @@ from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.vehicle import Arm, Command, Limits, Mode, SetMode, Telemetry
 
 NO_POSITION_S = 5.0  # a vehicle in the air whose grid position is unknown for longer is refused, steady clock
+
+NO_GLOBAL_POSITION = "the scenario has datum_deg, and the vehicle reports no global position; expected one"
 
 
 class Preflight:
@@ -57,6 +60,8 @@ class Preflight:
         if telemetry.missing is not None or fault is not None or position is None:
             reason = telemetry.missing or (fault.text if fault is not None else "no position yet")
             return self._wait(now_s, telemetry, reason, waited_s)
+        if not was_airborne and telemetry.datum is None and self.progress.scenario.datum_deg is not None:
+            return self._wait(now_s, telemetry, NO_GLOBAL_POSITION, waited_s)
         breach = self.fence.breach(position)
         if was_airborne and (decision := self._after_restart(telemetry, breach)) is not None:
             return decision
@@ -209,7 +214,11 @@ class Preflight:
 
     def _refusal(self, telemetry: Telemetry) -> str | None:
         """Why the mission cannot be flown with this vehicle; None: it can."""
-        return other_controller(telemetry) or self._conflict(telemetry)
+        return other_controller(telemetry) or self._elsewhere(telemetry) or self._conflict(telemetry)
+
+    def _elsewhere(self, telemetry: Telemetry) -> str | None:
+        """How far the grid lies from where the scenario has it; None: nowhere else."""
+        return None if telemetry.datum is None else disagreement(telemetry.datum, self.progress.scenario)
 
     def _conflict(self, telemetry: Telemetry) -> str | None:
         """The autopilot's limit that excludes a cell. Arming moves home to the vehicle's position."""

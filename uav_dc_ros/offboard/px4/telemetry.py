@@ -10,7 +10,7 @@ from typing import Any
 from uav_dc_ros.offboard.flight_stacks import COPTERS, PX4
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, tilt_rad, to_enu
 from uav_dc_ros.offboard.message_order import StampOrder
-from uav_dc_ros.offboard.vehicle import Mode, Telemetry
+from uav_dc_ros.offboard.vehicle import ALTITUDE_UNKNOWN, Mode, Telemetry
 
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: source of commands, by which their answers are recognised
 MAX_STEP_S = 10.0  # between two stamps; a longer step, or one back, is a change of clock
@@ -39,8 +39,15 @@ REASONS = (  # of failsafe_flags: what keeps PX4 from OFFBOARD, or from arming
 class Px4Telemetry:
     """State of one vehicle. Times are of the steady clock, seconds. Arguments: see `vehicles.make`."""
 
-    def __init__(self, *, start: Enu, grid_origin: str = "", datum: Geodetic | None = None) -> None:
-        self.start, self.datum = start, datum
+    def __init__(
+        self,
+        *,
+        start: Enu,
+        grid_origin: str = "",
+        datum: Geodetic | None = None,
+        datum_deg: tuple[float, float] | None = None,
+    ) -> None:
+        self.start, self.datum, self.datum_deg = start, datum, datum_deg
         self.frame: LocalFrame | None = None  # of PX4's local position in the grid; None: not known yet
         if grid_origin.startswith(LOCAL):
             self.datum, self.frame = None, LocalFrame(origin=Enu.parse(grid_origin.removeprefix(LOCAL)))
@@ -171,13 +178,17 @@ class Px4Telemetry:
     def _locate(self, ned: Ned, reference: Geodetic | None) -> None:
         """Find PX4's local frame in the grid's.
 
-        The first position on the ground is `start`. Once PX4 knows the global position of its origin, the
-        datum follows, and from then on the frame from the datum: PX4 may move its origin in flight.
+        The first position on the ground is `start`, or has the altitude of `datum_deg`. Once PX4 knows the
+        global position of its origin, the datum follows, and from then on the frame from the datum: PX4 may
+        move its origin in flight.
         """
         landed = self._landed()
         on_ground = landed if landed is not None else self.status is not None and not self.armed
         if self.datum is None and self.frame is None and on_ground:
-            self.frame = LocalFrame(origin=self.start.minus(to_enu(ned)))
+            if self.datum_deg is None:
+                self.frame = LocalFrame(origin=self.start.minus(to_enu(ned)))
+            elif reference is not None:
+                self.datum = Geodetic(*self.datum_deg, reference.at(to_enu(ned)).altitude_m)
         if reference is None or reference == self._reference:
             return
         if self.datum is None and self.frame is not None:
@@ -204,6 +215,8 @@ class Px4Telemetry:
             return "PX4 has no estimate of its position yet"
         if self.datum is not None:
             return "PX4 has no global position, and the grid has a datum; expected GPS, or no datum"
+        if self.datum_deg is not None:
+            return ALTITUDE_UNKNOWN
         return "the grid has no datum, and the vehicle does not stand on the ground; expected a datum"
 
     def _rejection(self) -> str | None:
