@@ -1,8 +1,11 @@
 """Each example runs, and does what it says."""
 
 import csv
+import itertools
+import re
 import shlex
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,7 @@ import pytest
 from tests.conftest import ROOT, Ros, finish
 from uav_dc_ros import scenarios, uav_dc
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.core.scenario import from_values, read_values
 from uav_dc_ros.experiments.evaluate.evaluation import evaluate_act
 from uav_dc_ros.planners import PLANNERS
 
@@ -19,7 +23,7 @@ EXAMPLES = ROOT / "examples"
 def test_these_are_all() -> None:
     assert {path.name for path in EXAMPLES.iterdir() if path.is_file()} == {
         *("one_episode.py", "own_scenario.toml", "own_policy_node.py"),
-        *("train_and_deploy.py", "bag_to_table.py", "gain_map_sionna.py"),
+        *("own_users.csv", "train_and_deploy.py", "bag_to_table.py", "gain_map_sionna.py"),
     }
 
 
@@ -40,6 +44,34 @@ def test_own_scenario_can_be_flown() -> None:
     assert flown.landing_rate.mean == 1.0
     assert flown.users_collected.mean is not None
     assert flown.users_collected.mean > 5
+
+
+def choices() -> list[str]:
+    """The choices in comments: blocks of lines without a space after the `#`."""
+    lines = (EXAMPLES / "own_scenario.toml").read_text("utf-8").splitlines()
+    blocks = itertools.groupby(lines, lambda line: re.match(r"#[^ ]", line) is not None)
+    return ["\n".join(line[1:] for line in block) for is_choice, block in blocks if is_choice]
+
+
+def test_each_choice_in_own_scenario_works_with_those_above_it() -> None:
+    path = EXAMPLES / "own_scenario.toml"
+    values = read_values(path.read_text("utf-8"), str(path))
+    made = []
+    for text in choices():
+        for table, value in tomllib.loads(text).items():
+            if table == "obstacles" and table in values:
+                value = [*values[table], *value]
+            elif isinstance(value, dict) and value.keys() == {"mobility"}:
+                value = values[table] | value
+            values[table] = value
+        made.append(from_values(scenarios.with_files(dict(values), EXAMPLES, str(path)), str(path)))
+    last = made[-1]
+    assert len({scenario.fingerprint for scenario in made}) == len(made), "each makes another world"
+    assert [type(scenario.radio).__name__ for scenario in made[-4:]] == ["FreeSpace", *["AirToGround"] * 3]
+    assert (last.n_users, last.users.moves.n_draws > 0, len(last.obstacles)) == (4, True, 2)
+    assert last.energy is not None
+    flown = evaluate_act("tour", None, PLANNERS["tour"](last), last, range(3)).evaluation
+    assert flown.landing_rate.mean == 1.0
 
 
 def test_the_commands_in_own_scenario_are_commands(monkeypatch: pytest.MonkeyPatch) -> None:
