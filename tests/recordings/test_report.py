@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from tests.conftest import read_bag
 from tests.nodes.conftest import SMALL
@@ -16,6 +17,7 @@ from tests.recordings import report_bags
 from tests.support.worlds import saved, tiny
 from uav_dc_ros import bag, files, scenarios
 from uav_dc_ros.core import world
+from uav_dc_ros.core.energy import EnergySettings
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.nodes.view import markers
 from uav_dc_ros.recordings.pages import page as pages
@@ -299,6 +301,24 @@ def test_a_comparison_pairs_equal_seeds(tmp_path, capsys):
     curve = groups[0]["curves"]["n_collected"]
     assert len(curve["mean"]) == 21
     assert curve["mean"][-1] == pytest.approx(np.mean(collected), rel=1e-3)
+
+
+def test_a_comparison_has_the_state_of_charge_where_there_is_a_battery(tmp_path):
+    plain = tiny(mission={"max_steps": 12})
+    battery = EnergySettings(battery_j=40e3)
+    flown = [
+        report_bags.write(tmp_path / name, world, seeds=(1, 2))
+        for name, world in (("battery", replace(plain, energy=battery)), ("none", plain))
+    ]
+    out = tmp_path / "page.html"
+    assert report(flown[0], "--compare", flown[1], "--out", out) == 0
+    with_battery, without = report_bags.unpacked(out)["data"]["groups"]
+    assert "state_of_charge" not in without["curves"]
+    charge = with_battery["curves"]["state_of_charge"]["mean"]
+    used_j = with_battery["metrics"]["energy_used_j"]["mean"]
+    assert charge[0] == 1.0
+    assert charge == sorted(charge, reverse=True)
+    assert charge[-1] == pytest.approx(1.0 - used_j / battery.battery_j, rel=1e-3)
 
 
 def test_missions_of_a_bag_side_by_side(tmp_path):

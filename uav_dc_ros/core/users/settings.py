@@ -131,6 +131,12 @@ class UserSettings(
         return tuple(priority / total for priority in priorities)
 
     @cached_property
+    def cluster_names(self) -> tuple[str | None, ...] | None:
+        """Name of each cluster: its own, or that of its only user; None where no cluster has one."""
+        names = tuple(users[0].cluster or users[0].name for users in self.listed)
+        return names if any(names) else None
+
+    @cached_property
     def names(self) -> tuple[str | None, ...] | None:
         """Name of each user; None where no user has one."""
         names = tuple(user.name for user in chain(*self.listed))

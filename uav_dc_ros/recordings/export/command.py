@@ -118,7 +118,7 @@ def _write_tables(
     options: argparse.Namespace, recorded: Steps, scenario: Scenario, about: dict[str, str], vehicle: str
 ) -> None:
     """Write tables into a new folder, with one piece of each in memory."""
-    columns = table_columns(vehicle, scenario.energy is not None)
+    columns = table_columns(vehicle, scenario.energy is not None, scenario.users.names is not None)
     names: list[str] = options.tables or list(columns)
     format: Format = options.format or "parquet"
     for name in names:

@@ -66,6 +66,8 @@ BATTERY: dict[str, Columns] = {
     "steps": {"energy_used_j": "float", "state_of_charge": "float"},
     "missions": {"energy_used_j": "float", "energy_per_mbit_j": "float"},
 }
+# Further column of a scenario whose users have names.
+NAMES: dict[str, Columns] = {"users": {"name": "text"}}
 # Further columns of flights with a real vehicle.
 REAL: dict[str, Columns] = {
     "steps": {
@@ -82,9 +84,10 @@ REAL: dict[str, Columns] = {
 # fmt: on
 
 
-def table_columns(vehicle: str, has_battery: bool = False) -> dict[str, Columns]:
+def table_columns(vehicle: str, has_battery: bool = False, has_names: bool = False) -> dict[str, Columns]:
     """Columns of each table for flights with this vehicle, as `step_reader.vehicle` names it."""
-    parts = [TABLES, *([BATTERY] if has_battery else []), *([REAL] if vehicle != SIMULATED else [])]
+    parts = [TABLES, *([BATTERY] if has_battery else [])]
+    parts += [*([NAMES] if has_names else []), *([REAL] if vehicle != SIMULATED else [])]
     names = dict.fromkeys(name for part in parts for name in part)
     return {name: {k: v for part in parts for k, v in part.get(name, {}).items()} for name in names}
 
@@ -163,6 +166,7 @@ class MissionRows:
         n = self._scenario.n_users
         rows: dict[str, Sequence[Any]] = {name: [value] * n for name, value in _source(step).items()}
         rows |= {"user": range(n), "cluster": self._scenario.user_cluster.tolist()}
+        rows["name"] = self._scenario.users.names or [None] * n
         for name in ("x_m", "y_m"):
             rows[name] = getattr(step.users, name, [None] * n)
         for name in ("sinr", "rate_bps", "data_bits", "served", "collected"):

@@ -20,6 +20,8 @@ from uav_dc_ros.recordings.recorded_step import mission_name
 
 WIDTH = 80  # without a terminal
 MISSIONS_MAX = 30  # listed one by one
+NAMES_MAX = 6  # of users not collected, listed for a mission
+TEXTS = ("namespace", "outcome", "not collected", "lacks")  # columns of text
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -145,6 +147,7 @@ def _missions(missions: list[MissionSurvey]) -> Table:
             "users collected": f"{mission.collected:,} of {mission.users:,}"
             if mission.users is not None
             else "-",
+            "not collected": _listed(mission.not_collected or []),
             "seed": "-" if mission.seed is None else f"{mission.seed}",
             "lacks": ", ".join(f"{n} {topic}" for topic, n in mission.missing.items()),
         }
@@ -153,16 +156,22 @@ def _missions(missions: list[MissionSurvey]) -> Table:
     shown = {
         "namespace": len({mission.namespace for mission in missions}) > 1,
         "flight": any(mission.flight for mission in missions),
+        "not collected": any(mission.not_collected for mission in missions),
         "not reached": any(mission.steps_not_reached for mission in missions),
     }
     columns = [column for column in rows[0] if shown.get(column, True)]
     for column in columns:
-        table.add_column(column, justify="left" if column in ("namespace", "outcome", "lacks") else "right")
+        table.add_column(column, justify="left" if column in TEXTS else "right")
     for row in rows:
         table.add_row(*(Text(row[column]) for column in columns))
     if len(missions) > MISSIONS_MAX:
         table.caption = f"and {len(missions) - MISSIONS_MAX:,} more missions: --json"
     return table
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - NAMES_MAX} more" if len(names) > NAMES_MAX else ""
+    return printable(", ".join(names[:NAMES_MAX]) + more)
 
 
 def _size(n_bytes: int) -> str:

@@ -5,6 +5,7 @@ Bags of any recorder, torn ones included, in two passes: one over all messages, 
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,8 @@ class MissionSurvey(MissionTotals):
     flight: int  # counts runs in the bag from 0
     mission: int
     missing: Counter[str] = field(default_factory=Counter)  # messages that the bag lacks, by topic
+    # Users not collected at the last rates, by name or number; null where users have no names
+    not_collected: list[str] | None = None
 
 
 @dataclass(kw_only=True)
@@ -251,10 +254,10 @@ def survey_missions(reader: BagReader, namespace: str, problems: list[str]) -> l
     """The missions of a namespace; adds what they lack to `problems`."""
     where = f" in {namespace}" if namespace else ""
     found: list[MissionSurvey] = []
-    try:
-        step_ns = scenario(reader, namespace).step_ns
-    except UavDcError:
-        step_ns = 2**63  # unknown scenario, in a bag of another recorder
+    step_ns, names = 2**63, None  # of an unknown scenario, in a bag of another recorder
+    with suppress(UavDcError):
+        world = scenario(reader, namespace)
+        step_ns, names = world.step_ns, world.users.names
     try:
         steps = Steps(reader, namespace, step_ns)
         before: RecordedStep | None = None
@@ -269,6 +272,10 @@ def survey_missions(reader: BagReader, namespace: str, problems: list[str]) -> l
             if step.step > next_step:
                 mission.missing.update(dict.fromkeys(STEP_TOPICS, step.step - next_step))
             mission.add(step.step, step.status, step.rates)
+            if names is not None and step.rates is not None and len(step.rates.collected) == len(names):
+                users = zip(names, step.rates.collected, strict=True)
+                left = [name or str(i) for i, (name, collected) in enumerate(users) if not collected]
+                mission.not_collected = left
             if step.status is not None and not mission.is_over:
                 mission.reason = step.phase_reports[-1].reason if step.phase_reports else ""
             before = step

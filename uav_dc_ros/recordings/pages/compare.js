@@ -15,6 +15,7 @@ const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "5
 open(async (page, data) => {
   const { groups, world } = data;
   const metrics = METRICS(data.reward_words).filter(([metric]) => groups.some((group) => group.metrics[metric]));
+  const hasBattery = groups.some((group) => "state_of_charge" in group.curves);
   const one = groups.every((group) => group.missions === 1);
   const policies = [...new Set(groups.map((group) => group.policy))];
   page.querySelector("header").prepend(make("div", {}, page.querySelector("h1"),
@@ -76,7 +77,8 @@ open(async (page, data) => {
         make("div", { class: "stack" },
           card("Users collected", make("div", { class: "chart", id: "n_collected" })),
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum_rate_bps" })),
-          card("Reward r^t of each step (eq. 7)", make("div", { class: "chart", id: "reward" }))))),
+          card("Reward r^t of each step (eq. 7)", make("div", { class: "chart", id: "reward" })),
+          hasBattery ? card("State of charge by the scenario's model", make("div", { class: "chart", id: "state_of_charge" })) : ""))),
     make("footer", {}, `After its end a mission keeps its values, at rate 0. ${one ? "" : "Bands are 95% bootstrap intervals of the mean. "}At most 20 paths of a bag are drawn. World ${world.name} ${world.fingerprint} · made by uav_dc_ros ${data.version}; figures by plotly.js (MIT license). This file needs no network.`));
 
   function drawScene() {
@@ -95,6 +97,7 @@ open(async (page, data) => {
   function drawCharts() {
     const chart = (id, title, last, divide = 1) => {
       const traces = groups.flatMap((group, i) => {
+        if (!(id in group.curves)) return []; // a world without a battery
         const curve = Object.fromEntries(Object.entries(group.curves[id]).map(([key, values]) => [key, values.map((value) => value / divide)]));
         const edge = { type: "scatter", mode: "lines", x: data.steps, line: { width: 0, shape: "hv" }, hoverinfo: "skip", showlegend: false };
         return [
@@ -107,7 +110,8 @@ open(async (page, data) => {
     const [scale, prefix] = siScale(Math.max(1, ...groups.flatMap((group) => group.curves.sum_rate_bps.high)));
     chart("n_collected", "", false);
     chart("sum_rate_bps", `${prefix}bit/s`, false, scale);
-    chart("reward", "", true);
+    chart("reward", "", !hasBattery);
+    if (hasBattery) chart("state_of_charge", "%", true, 0.01);
   }
 
   function draw() { drawScene(); drawCharts(); }

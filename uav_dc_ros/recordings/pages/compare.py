@@ -40,7 +40,7 @@ METRICS = (
     "reward",
     *FIGURES,
 )
-CURVES = ("n_collected", "sum_rate_bps", "reward")
+CHARGE = "state_of_charge"  # further curve of a world with a battery
 
 
 @dataclass
@@ -52,7 +52,7 @@ class Group:
     policy: str
     bag: str
     summaries: list[dict[str, Any]] = field(default_factory=list)
-    curves: list[dict[str, Array]] = field(default_factory=list)  # by name of CURVES, and `step`
+    curves: list[dict[str, Array]] = field(default_factory=list)  # by name, and `step`
     paths: list[list[list[float]]] = field(default_factory=list)  # x, y, z, metres
 
     def add(self, mission: MissionData) -> None:
@@ -65,6 +65,7 @@ class Group:
                 "n_collected": np.asarray([it["n_collected"] for it in steps], np.float64),
                 "sum_rate_bps": _filled([it["sum_rate_bps"] for it in steps]),
                 "reward": _filled([it["reward"][2] for it in steps]),
+                **({CHARGE: _filled([it[CHARGE] for it in steps], 1.0)} if self.scenario.energy else {}),
             }
         )
         if len(self.paths) < PATHS_MAX:
@@ -83,7 +84,7 @@ class Group:
             "seeds": self._seeds(),
             "metrics": {name: self._metric(name) for name in self._metrics()},
             "paired": None if self is first else self._paired(first),
-            "curves": {name: self._band(name, axis) for name in CURVES},
+            "curves": {name: self._band(name, axis) for name in self.curves[0] if name != "step"},
             "paths": self.paths,
         }
 
@@ -201,9 +202,9 @@ def no_step(bag: Path, missions: list[int] | None, recorded: step_reader.Steps) 
     return f"bag {bag} holds no step of a mission{wanted}{why and f': {why}'}"
 
 
-def _filled(values: list[float | None]) -> Array:
-    """Values `[T]`. An unknown one equals the one before; it is 0 at the start."""
+def _filled(values: list[float | None], first: float = 0.0) -> Array:
+    """Values `[T]`. An unknown one equals the one before; it is `first` at the start."""
     filled: list[float] = []
     for value in values:
-        filled.append(value if value is not None else (filled[-1] if filled else 0.0))
+        filled.append(value if value is not None else (filled[-1] if filled else first))
     return np.asarray(filled)

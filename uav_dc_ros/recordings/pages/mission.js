@@ -56,6 +56,13 @@ open(async (page, data) => {
     missionList(),
     make("footer", {}, footer()));
 
+  // A listed user has a name; so may a cluster.
+  function userName(i) {
+    const { user, name } = state.mission.table;
+    return name?.[i] ? `${name[i]} (user ${user[i]})` : `user ${user[i]}`;
+  }
+  function clusterName(index) { return world.cluster_names?.[index] ?? String(index); }
+
   function missionName(one) { return `mission ${one.mission}` + (one.flight ? ` of flight ${one.flight}` : ""); }
 
   function symbol(shape, name) {
@@ -119,7 +126,7 @@ open(async (page, data) => {
       counts[code].textContent = [...now.state].filter((letter) => Number(letter) === code).length;
       set.push({
         x: these.map((i) => users[0][i]), y: these.map((i) => users[1][i]), z: these.map(() => 1),
-        text: these.map((i) => plain(`user ${state.mission.table.user[i]}, cluster ${state.mission.table.cluster[i]}: ${words}, ${si(lastKnown("data_bits")?.[i], "bit")}`)),
+        text: these.map((i) => plain(`${userName(i)}, cluster ${clusterName(state.mission.table.cluster[i])}: ${words}, ${si(lastKnown("data_bits")?.[i], "bit")}`)),
       });
     });
     const i = state.mission.table.user.indexOf(state.chosen);
@@ -169,8 +176,8 @@ open(async (page, data) => {
     const borders = cluster.flatMap((one, i) => (i && one !== cluster[i - 1] ? [i - 0.5] : []));
     draw("data", [{
       type: "heatmap", x, y: user.map((_, i) => i), z: data_bits, zmin: 0, colorscale: "Cividis", hoverongaps: false,
-      customdata: user.map((u, i) => x.map(() => [u, cluster[i]])),
-      hovertemplate: `user %{customdata[0]}, cluster %{customdata[1]}, step %{x}: %{z:.2f} ${dataPrefix}bit<extra></extra>`,
+      customdata: user.map((_, i) => x.map(() => [userName(i), clusterName(cluster[i])].map(plain))),
+      hovertemplate: `%{customdata[0]}, cluster %{customdata[1]}, step %{x}: %{z:.2f} ${dataPrefix}bit<extra></extra>`,
       colorbar: { title: { text: `${dataPrefix}bit`, font: { size: 12 } }, thickness: 10, outlinewidth: 0, tickcolor: colour("faint"), len: 0.95, tickfont: { color: colour("muted") } },
     }], {
       hovermode: "closest", xaxis: stepAxis(stepTitle()),
@@ -187,7 +194,7 @@ open(async (page, data) => {
   function middles(cluster) {
     const places = new Map();
     cluster.forEach((one, i) => places.set(one, [...(places.get(one) ?? []), i]));
-    return { tickvals: [...places.values()].map((rows) => rows[Math.floor(rows.length / 2)]), ticktext: [...places.keys()].map(String) };
+    return { tickvals: [...places.values()].map((rows) => rows[Math.floor(rows.length / 2)]), ticktext: [...places.keys()].map((index) => plain(clusterName(index))) };
   }
 
   // A step of a real vehicle may end before its time.
@@ -284,7 +291,8 @@ open(async (page, data) => {
     const by = (name) => (row) => row[name];
     return table([
       { name: "user", text: (row) => String(row.user), value: by("user") },
-      { name: "cluster", text: (row) => String(row.cluster), value: by("cluster") },
+      ...(columns.name ? [{ name: "name", text: (row) => row.name ?? NONE, value: by("name") }] : []),
+      { name: "cluster", text: (row) => (row.name && row.name === clusterName(row.cluster) ? NONE : clusterName(row.cluster)), value: by("cluster") },
       { name: "data", text: (row) => si(row.data_bits, "bit"), value: by("data_bits") },
       { name: "collected at", help: "step", text: (row) => (row.collected_at === null ? NONE : `■ ${row.collected_at}`), value: by("collected_at") },
       { name: "steps served", text: (row) => String(row.served_steps), value: by("served_steps") },

@@ -145,6 +145,7 @@ class MissionData:
             sinr_db = np.where(served > 0, 10 * np.log10(sinr), math.nan)
         return {
             "user": shown.tolist(),
+            **({"name": [names[i] for i in shown]} if (names := self.scenario.users.names) else {}),
             "cluster": self.scenario.user_cluster[shown].tolist(),
             "data_bits": self._data_bits[shown].tolist(),
             "collected_at": [step if step >= 0 else None for step in self._collected_at[shown].tolist()],

@@ -68,6 +68,7 @@ def world_data(scenario: Scenario) -> dict[str, Any]:
         **({"battery_j": scenario.energy.battery_j} if scenario.energy else {}),
         "users": scenario.n_users,
         "clusters": scenario.cluster_centres_m,
+        **({"cluster_names": names} if (names := scenario.users.cluster_names) else {}),
         "cluster_radii_m": [disc.radius_m for disc in scenario.users.clusters],
         "obstacles": [_obstacle_data(one, 1.15 * top_m) for one in scenario.obstacles],
         "top_m": top_m,
