@@ -147,7 +147,7 @@ def test_the_table_of_parameters_is_the_bridge_s() -> None:
     section = GUIDE.partition("| parameter | default | | parameter | default |")[2].partition("\n\n")[0]
     told = dict(re.findall(r"\| `(\w+)` \| ([^ |]+)", section))
     rows = {row.name: row.default for row in NODES["bridge"].parameters}
-    expected = {name: str(default) for name, default in rows.items()}
+    expected = {name: str(default).lower() for name, default in rows.items()}
     for name in ("vehicle", "connect", "system", "datum", "scenario", "seed", "journal", "arm"):
         del expected[name]  # told of elsewhere: options of run_all
     assert told == expected

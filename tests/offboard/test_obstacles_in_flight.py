@@ -36,6 +36,8 @@ ZONES = (
 )
 RETURNS = SafetySettings(arm=True, return_altitude_m=RETURN_M)
 LANDS = SafetySettings(arm=True, failsafe_action=Mode.LAND)
+BOTH = (HOUSES[0], ZONES[1])
+EITHER = SafetySettings(arm=True, return_altitude_m=RETURN_M, land_if_return_blocked=True)
 # Commands of the fake autopilot, and those that end the fault.
 FAULTS = {
     "none": ((), ()),
@@ -136,23 +138,23 @@ def fly(seed: int, kind: str, obstacles: tuple[Obstacle, ...], how: SafetySettin
     return f"{name}: {flight.bridge.phase}: {flight.bridge.reason}"
 
 
-CASES = [("houses", HOUSES, RETURNS), ("zones", ZONES, LANDS)]
+CASES = {"houses": (HOUSES, RETURNS), "zones": (ZONES, LANDS), "both": (BOTH, EITHER)}
 
 
-@pytest.mark.parametrize(("what", "obstacles", "how"), CASES)
-@pytest.mark.parametrize(("seed", "kind"), [(0, "ardupilot"), (1, "px4")])
-def test_no_setpoint_is_within_the_margin(
-    seed: int, kind: str, what: str, obstacles: tuple[Obstacle, ...], how: SafetySettings
-) -> None:
-    fly(seed, kind, obstacles, how)
+@pytest.mark.parametrize(
+    ("what", "seed", "kind"),
+    [("houses", 0, "ardupilot"), ("zones", 1, "px4"), ("both", 0, "px4"), ("both", 3, "ardupilot")],
+)
+def test_no_setpoint_is_within_the_margin(what: str, seed: int, kind: str) -> None:
+    fly(seed, kind, *CASES[what])
 
 
 @pytest.mark.long
 def test_no_setpoint_is_within_the_margin_in_a_hundred_faulted_missions() -> None:
     ends = []
     for seed in range(100):
-        _, obstacles, how = CASES[seed % 2]
-        ends.append(fly(100 + seed, ("ardupilot", "px4")[seed // 2 % 2], obstacles, how))
+        obstacles, how = list(CASES.values())[seed % 3]
+        ends.append(fly(100 + seed, ("ardupilot", "px4")[seed // 3 % 2], obstacles, how))
     assert len({end.partition(":")[0] for end in ends}) == len(FAULTS)
     assert sum(": landed:" in end for end in ends) > 20
     assert sum(": aborted:" in end for end in ends) > 10
@@ -192,6 +194,9 @@ HOME = Enu(0.0, 0.0, 0.0)
             "obstacles[0]: a return from cell (1, 1, 0) at 90 m above",
         ),
         (ZONES, {"failsafe_action": Mode.LAND}, None, None),
+        (BOTH, {"return_altitude_m": 15.0, "land_if_return_blocked": True}, None, None),
+        (BOTH, {"return_altitude_m": 15.0}, None, "obstacles[1]: a return from cell"),
+        (BOTH, {"land_if_return_blocked": True}, None, "bridge.return_altitude_m is not known"),
         (HOUSES, {"failsafe_action": Mode.LAND}, None, "obstacles[0]: a landing from cell (0, 0, 2) comes"),
     ],
 )

@@ -229,6 +229,12 @@ BRIDGE = (
         10_000.0,
     ),
     Parameter(
+        "land_if_return_blocked",
+        SafetySettings.land_if_return_blocked,
+        "true: with failsafe_action=return the vehicle lands where an obstacle is on the straight way home, "
+        "and none is below; false: such a mission is refused",
+    ),
+    Parameter(
         "flying_at_start",
         SafetySettings.flying_at_start,
         "action when the bridge starts beside a vehicle in the commanded mode",

@@ -62,7 +62,9 @@ class MissionController:
         self._crash = CrashDetector(settings)
         self._steps = StepControl(self.progress, settings, self.fence)
         self._preflight = Preflight(self.progress, settings, self.fence, self.detector)
-        self._landing = Landing(self.progress, self.detector, settings.failsafe_action, Phase.ABORTED, "")
+        self._landing = Landing(
+            self.progress, self.detector, self.fence, settings.failsafe_action, Phase.ABORTED, ""
+        )
         self._fault_timer = FaultTimer(settings.fault_timeout_s)
         self._policy = PolicyTimeout(settings, scenario.mission.step_s)
         self._retry = CommandRetry(settings)
@@ -334,7 +336,9 @@ class MissionController:
 
     def _land(self, mode: Mode, outcome: Phase, reason: str, blind_since_s: float | None = None) -> None:
         """Begin a landing; the setpoint is streamed until the vehicle changes its mode."""
-        self._landing = Landing(self.progress, self.detector, mode, outcome, reason, blind_since_s)
+        self._landing = Landing(
+            self.progress, self.detector, self.fence, mode, outcome, reason, blind_since_s
+        )
         self._landing.confirm(self._telemetry)  # it may land already
         self._enter(Phase.LANDING, reason)
 

@@ -34,6 +34,7 @@ class SafetySettings:
     failsafe_action: Literal[Mode.RETURN, Mode.LAND] = Mode.RETURN  # land if it cannot return
     # Altitude above home at which the autopilot returns, metres; needed among obstacles. 0: not known
     return_altitude_m: float = 0.0
+    land_if_return_blocked: bool = False  # where an obstacle is on the straight way home, and none below
     flying_at_start: Literal["resume", "land"] = "resume"  # for a vehicle in the air in the commanded mode
     command_retry_s: float = 2.0  # pause before a command that was not executed is sent again
     max_return_attempts: int = 3  # then the bridge requests land

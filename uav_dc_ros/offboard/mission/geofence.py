@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -10,7 +11,7 @@ from uav_dc_ros.core.obstacles.prisms import Obstacle
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.offboard.vehicle import Limits
+from uav_dc_ros.offboard.vehicle import Limits, Telemetry
 
 MARGIN_M = 20.0
 
@@ -58,6 +59,19 @@ class Geofence:
             ):
                 return f"nearer than {margin_m:g} m to {obstacle.title(i)}"
         return None
+
+    def return_breach(self, settings: SafetySettings, telemetry: Telemetry) -> str | None:
+        """The obstacle because of which the vehicle lands rather than returns; None: it returns.
+
+        Only with `land_if_return_blocked`, and where the vehicle keeps the margin on its way down.
+        """
+        here, home = telemetry.position, telemetry.home
+        if not (settings.land_if_return_blocked and self.obstacles) or here is None or home is None:
+            return None
+        up_m = max(here.up_m, home.up_m + settings.return_altitude_m)
+        ways = pairwise((here, here._replace(up_m=up_m), home._replace(up_m=up_m), home))
+        blocked = next((breach for way in ways if (breach := self.path_breach(*way)) is not None), None)
+        return blocked if self.path_breach(here, here._replace(up_m=0.0)) is None else None
 
 
 def limit_conflict(scenario: Scenario, settings: SafetySettings, limits: Limits, home: Enu) -> str | None:

@@ -18,6 +18,8 @@ from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.vehicle import Limits, Mode
 
+PARTS = 16  # of a move: each keeps clear of obstacles by itself
+
 
 def cell_conflict(scenario: Scenario, fence: Geofence, settings: SafetySettings) -> str | None:
     """The cell from which the policy may fly too near to an obstacle; None: there is none.
@@ -50,6 +52,8 @@ def return_conflict(
     lands = settings.failsafe_action is Mode.LAND
     if not lands and (unknown := _altitude_conflict(settings, limits)) is not None:
         return unknown
+    if not lands and settings.land_if_return_blocked:
+        return _stranded(scenario, fence, settings, home)
     # A mission may end on the way to the next cell, from where the straight way home keeps half a cell less.
     straight_m = fence.margin_m + scenario.grid.cell_m / 2
     home_m, altitude_m = np.asarray(home), settings.return_altitude_m
@@ -81,6 +85,48 @@ def return_conflict(
         if obstacle.meets(home_m, np.asarray(home.plus(Enu(0.0, 0.0, altitude_m))), fence.margin_m):
             return f"{obstacle.title(i)}: home is nearer than {fence.margin_m:g} m; expected another home"
     return None
+
+
+def _stranded(scenario: Scenario, fence: Geofence, settings: SafetySettings, home: Enu) -> str | None:
+    """Where both return and landing come too near to an obstacle, or home is near one; None: nowhere.
+
+    Each part of a move keeps `margin_m` and `tolerance_m`, one way or the other.
+    """
+    home_m, altitude_m = np.asarray(home), settings.return_altitude_m
+    top_m = np.asarray(home.plus(Enu(0.0, 0.0, altitude_m)))
+    for i, obstacle in enumerate(scenario.obstacles):
+        if obstacle.meets(home_m, top_m, fence.margin_m):
+            return f"{obstacle.title(i)}: home is nearer than {fence.margin_m:g} m; expected another home"
+    starts_m, ends_m, cells = _moves_m(scenario)
+    margin_m = fence.margin_m + settings.tolerance_m
+
+    def distances_m(start_m: Array, end_m: Array) -> list[Array]:
+        """Horizontal distance of each obstacle from straight paths."""
+        end_m = np.broadcast_to(end_m, start_m.shape)
+        return [
+            polygons.distance_m(one.polygon_m, start_m[..., :2], end_m[..., :2]) for one in scenario.obstacles
+        ]
+
+    # Below the other moves there is no obstacle: a landing is free.
+    from_cell, action = np.nonzero(np.min(distances_m(starts_m, ends_m), axis=0) < margin_m)
+    start_m, way_m = starts_m[from_cell, action], (ends_m - starts_m)[from_cell, action]
+    at_m = start_m[:, None] + way_m[:, None] * np.linspace(0.0, 1.0, PARTS + 1)[:, None]
+    from_m, to_m = at_m[:, :-1], at_m[:, 1:]
+    part_m = np.linalg.norm(to_m - from_m, axis=-1)
+    lands, returns = np.zeros((2, *part_m.shape), dtype=bool)  # whether an obstacle is in the way of it
+    ways_m = zip(scenario.obstacles, distances_m(from_m, to_m), distances_m(from_m, home_m), strict=True)
+    for obstacle, beside_m, straight_m in ways_m:
+        is_high = obstacle.top_m + fence.margin_m - home.up_m > altitude_m
+        lands |= (beside_m < margin_m) & (np.maximum(from_m, to_m)[..., 2] > obstacle.base_m)
+        returns |= (beside_m < margin_m) & (from_m[..., 2] < obstacle.base_m)
+        returns |= (straight_m < margin_m + part_m) & is_high
+    if not (both := (returns & lands).any(axis=-1)).any():
+        return None
+    cell = _first(cells[from_cell], both)
+    return (
+        f"obstacles: on a move from cell {cell} both a return at {altitude_m:g} m above home and a landing "
+        f"come nearer than {margin_m:g} m; expected a higher bridge.return_altitude_m or another home"
+    )
 
 
 def _altitude_conflict(settings: SafetySettings, limits: Limits | None) -> str | None:

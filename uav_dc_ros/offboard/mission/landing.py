@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu
 from uav_dc_ros.offboard.mission.fault_detector import FaultDetector, SafetySettings
+from uav_dc_ros.offboard.mission.geofence import Geofence
 from uav_dc_ros.offboard.mission.progress import MissionProgress
 from uav_dc_ros.offboard.mission.timeouts_and_retries import ProgressTimer
 from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
@@ -47,12 +48,14 @@ class Landing:
         self,
         progress: MissionProgress,
         detector: FaultDetector,
+        fence: Geofence,
         mode: Mode,
         outcome: Phase,
         reason: str,
         blind_since_s: float | None = None,
     ) -> None:
         self._progress, self._detector, self._settings = progress, detector, detector.settings
+        self._fence = fence
         self.mode, self.reason = mode, reason  # mode to request, reason of the landing
         self.outcome = outcome  # final phase of the mission
         self.confirmed = False  # the vehicle was in a landing mode; any later change of the mode is a pilot's
@@ -107,6 +110,10 @@ class Landing:
         if self.mode is Mode.RETURN and self.requests >= settings.max_return_attempts and answered:
             self.mode = Mode.LAND
             self.reason += f"; return not executed ({telemetry.refusal or 'no answer'}): requests land"
+        breach = self._fence.return_breach(settings, telemetry)
+        if self.mode is Mode.RETURN and not self.requests and breach is not None:
+            self.mode = Mode.LAND
+            self.reason += f"; the straight way home comes {breach}: requests land"
         refusal = f"; {telemetry.refusal}" if telemetry.refusal and self.requests else ""
         return Decision(Phase.LANDING, f"{self.reason}{refusal}", setpoint, SetMode(self.mode))
 

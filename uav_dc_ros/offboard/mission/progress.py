@@ -63,13 +63,6 @@ class MissionProgress:
         east, north, up = core.move(self.scenario, np.asarray(self.cell), np.asarray(int(action))).tolist()
         return east, north, up
 
-    @property
-    def next_targets(self) -> list[Enu]:
-        """Centres of the goal and of the cells that a move leads to from there."""
-        goal = np.asarray(self.goal)
-        cells = {tuple(core.move(self.scenario, goal, np.asarray(int(action))).tolist()) for action in Action}
-        return [self.centre(cell) for cell in sorted(cells)]
-
     def distance_m(self, position: Enu) -> float:
         """Distance of a position from the goal's centre."""
         return math.dist(position, self.target)

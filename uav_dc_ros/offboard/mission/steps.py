@@ -71,21 +71,15 @@ class StepControl:
             away_m = self._progress.distance_m(position)
             if away_m <= self._settings.tolerance_m:
                 return self._complete(REACHED, setpoint)
-            if self._progress.may_end_at(position, self._settings) and self._can_go_on_from(position):
+            # Among obstacles it flies on: with its speed, the next move would leave the straight way.
+            may_end = not self._fence.obstacles and self._progress.may_end_at(position, self._settings)
+            if may_end:
                 result = f"cell not reached after {step_s:g} s, {away_m:.0f} m away"
                 return self._complete(result, setpoint, reached=False)
             if not self._is_late:
                 self._is_late = True
                 reason = f"{reason}: {away_m:.0f} m away after {step_s:g} s, flies on"
         return Decision(Phase.MOVING, reason, setpoint)
-
-    def _can_go_on_from(self, position: Enu) -> bool:
-        """Whether the straight ways from a position to the goal and to each next cell are free."""
-        if not self._fence.obstacles:
-            return True
-        return all(
-            self._fence.path_breach(position, target) is None for target in self._progress.next_targets
-        )
 
     def _dwells(self, telemetry: Telemetry) -> bool:
         """Whether the vehicle has been at the goal for `dwell_s`."""
