@@ -64,10 +64,11 @@ def check_steps(bag: Path, steps: int = STEPS) -> None:
     assert reported[-1]["state_of_charge"] == pytest.approx(1.0 - used_j[steps] / LOW_BATTERY_J)
 
 
-def killed(ros: Ros, node: str) -> float:
+def killed(ros: Ros, node: str, run_all: subprocess.Popen[str]) -> float:
     """Kill a node; when."""
-    (process,) = [pid for pid, command in ros.processes().items() if f"uav_dc_ros.nodes.{node} " in command]
-    os.kill(process, signal.SIGKILL)
+    pids = [pid for pid, command in ros.processes().items() if f"uav_dc_ros.nodes.{node} " in command]
+    assert len(pids) == 1, (pids, run_all.poll(), finish(run_all)[1])
+    os.kill(pids[0], signal.SIGKILL)
     return time.monotonic()
 
 
@@ -250,12 +251,12 @@ def test_a_killed_policy_makes_the_vehicle_hold_and_a_killed_bridge_takes_the_mi
     with fake(kind, speed=16.0) as autopilot:
         process = ros.start("uav_dc_ros.run_all", *low, *beside(autopilot, "--arm", "--bag", "bag", *NODES))
         until(lambda: flies_east(autopilot, 2), process)
-        killed(ros, "policy")
+        killed(ros, "policy", process)
         until(lambda: flies_east(autopilot, 4), process)
-        killed(ros, "bridge")
+        armed = autopilot.n_arms  # more than one where an acknowledgement came late
+        killed(ros, "bridge", process)
         status, output = finish(process)
-        arms = [event for event in autopilot.all("command") if event["command"] == 400]
-        assert len(arms) == 1, "never armed a second time"
+        assert autopilot.n_arms == armed >= 1, "the second bridge does not arm"
         assert not autopilot.report()["armed"]
     assert "node policy was killed by SIGKILL" in output
     assert "node bridge was killed by SIGKILL" in output
@@ -277,7 +278,7 @@ def test_a_killed_bridge_lands_where_that_is_wanted(ros: Ros, low: tuple[object,
         options = beside(autopilot, "--arm", "--bag", "bag", "--set", "bridge.flying_at_start=land")
         process = ros.start("uav_dc_ros.run_all", *low, *options, "--set", "bridge.failsafe_action=land")
         until(lambda: flies_east(autopilot, 3), process)
-        killed(ros, "bridge")
+        killed(ros, "bridge", process)
         status, output = finish(process)
         down = autopilot.report()["ned"]
     assert status == 1, output
@@ -384,7 +385,7 @@ def test_the_stream_keeps_its_pace_while_policies_load_and_die(ros: Ros, low: tu
         until(lambda: flies_east(autopilot, 1), process)
         autopilot.do("times")
         for _ in range(3):
-            killed(ros, "policy")
+            killed(ros, "policy", process)
             time.sleep(4.0)  # it is found dead, started again, loads, and decides
         times = autopilot.report()["times"]
         process.send_signal(signal.SIGINT)

@@ -379,7 +379,7 @@ def test_real_nodes_that_were_killed_leave_a_bag_that_verifies(ros: Ros, low, ca
         process = ros.start("uav_dc_ros.run_all", *low, *options)
         for step, node in ((2, "policy"), (5, "bridge")):
             until(lambda step=step: flies_east(autopilot, step), process)
-            killed(ros, node)
+            killed(ros, node, process)
         status, output = finish(process)
     assert status == 0, output
     status, out = run(capsys, "verify", bag, "--policy-dir", low[-1], "--complete")

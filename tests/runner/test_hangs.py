@@ -88,10 +88,10 @@ def test_a_bridge_takes_the_mission_up_again(ros: Ros, low: tuple[object, ...]) 
         options = ("--vehicle", "mavlink", "--connect", autopilot.address, "--datum", "here", "--arm")
         flight = ros.start("uav_dc_ros.run_all", *low, *options, "--bag", "bag", "--summary", "summary.json")
         until(lambda: any(sent["ned"][1] > 50.0 for sent in autopilot.all("setpoint")))
+        armed = autopilot.n_arms  # more than one where an acknowledgement came late
         os.kill(ros.node("bridge"), signal.SIGSTOP)
         status, output = finish(flight)
-        arms = [sent for sent in autopilot.all("command") if sent["command"] == 400]
     assert status == 0, output
     assert "note: node bridge gave no sign of life for " in output, output
-    assert len(arms) == 1, "never armed a second time"
+    assert autopilot.n_arms == armed >= 1, "the second bridge does not arm"
     assert json.loads((ros.folder / "summary.json").read_text())["outcome"] == "landed"

@@ -62,6 +62,11 @@ class Fake(FakeProcess):
         """A line of `Control`'s."""
         self.write(" ".join(map(str, words)))
 
+    @property
+    def n_arms(self) -> int:
+        """Commands to arm that it has received."""
+        return sum(event["command"] == 400 for event in self.all("command"))
+
     def report(self) -> dict[str, Any]:
         """How it is now."""
         self.do("report")
