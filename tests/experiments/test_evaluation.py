@@ -135,6 +135,19 @@ def test_the_table_names_the_reward(data, title):
     assert [row[0] for row in rows(evaluation) if row[0].startswith("reward")] == [title]
 
 
+def test_the_objective_is_that_of_its_weight_and_0_without_a_landing():
+    scenario, way = tiny(), plan(1, 1, 2, 2, 6, 6, 6, 6)
+    for weight in (0.0, 0.5, 1.0):
+        flown = evaluate_act("plan", None, way, scenario, range(20), weight=weight)
+        users = flown.evaluation.users_collected.mean / scenario.n_users
+        found = flown.evaluation.objective
+        assert flown.evaluation.objective_weight == weight
+        assert found.mean == pytest.approx(weight * users + (1.0 - weight) * (1.0 - 4 / 8))
+    assert rows(flown.evaluation)[0][0] == "objective J, w = 1"
+    lost = evaluate_act("hover", None, plan(*[6] * 8), scenario, range(20))
+    assert lost.evaluation.objective == Figure(n=20, mean=0.0, low=0.0, high=0.0, min=0.0, max=0.0)
+
+
 def test_policies_are_compared_mission_by_mission():
     scenario = tiny()
     late = evaluate_act("late", None, plan(6, 6, 1, 1, 2, 2, 6, 6), scenario, range(20))
@@ -267,6 +280,7 @@ def test_the_command_prints_and_writes_figures(tmp_path):
             "given 2 times; expected once",
         ),
         (["--policy", "MADE", "--seed", "3"], "--seed 3"),
+        (["--policy", "MADE", "--objective", "1.01"], "'1.01'; expected a weight between 0 (time only) and"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -15,6 +15,7 @@ from tests.experiments.forks import Forks
 from tests.support.worlds import tiny
 from uav_dc_ros.agents import policy
 from uav_dc_ros.experiments.evaluate.evaluation import evaluate, rows
+from uav_dc_ros.experiments.train.cli import _saved_progress as saved_progress
 from uav_dc_ros.experiments.train.cli import main
 
 TINY = """
@@ -389,6 +390,14 @@ def test_a_damaged_state_is_refused(left, capsys, size):
     state.write_bytes(state.read_bytes()[:size])
     err = refused(capsys, *learns(left), "--resume")
     assert "training.safetensors: cannot be read, or not the state of a training" in err
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"), [({"merit": None}, None), ({"merit": 0.835}, 0.85), ({"objective": 0.85}, 0.85)]
+)
+def test_a_checkpoint_of_version_0_2_0_has_the_score_as_merit(values, expected):
+    """Which is 1.1 J - 0.1."""
+    assert saved_progress({"every": 10, **values}).selection_score == pytest.approx(expected)
 
 
 def test_a_foreign_file_is_refused(left, capsys):

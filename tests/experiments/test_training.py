@@ -433,6 +433,9 @@ def test_policies_are_chosen_for_users_and_for_battery(monkeypatch):
     found = validate(Training(population(scenario, *[run(scenario, i) for i in range(4)]), CPU))
     np.testing.assert_allclose(found.brought_home, [3.0, 3.01, 3.1, 0.0])
     assert np.argsort(-found.selection_score).tolist() == [2, 0, 1, 3]
+    # What versions before selected by: 1.1 J - 0.1
+    merit = found.brought_home / 4 - 0.1 * np.array([5.0, 7.0, 6.0, 8.0]) / 8
+    np.testing.assert_allclose(1.1 * found.selection_score - 0.1, merit)
 
 
 def test_nothing_is_chosen_on_the_missions_that_judge():

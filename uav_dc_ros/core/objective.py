@@ -15,6 +15,7 @@ from uav_dc_ros.errors import UavDcError
 
 # All users weigh ten times as much as all the time: a hundredth of the users as much as a tenth of the time.
 DEFAULT_WEIGHT = 10 / 11
+EXPECTED_WEIGHT = "a weight between 0 (time only) and 1 (users only)"
 
 
 def objective(
@@ -43,5 +44,5 @@ def check_weight(weight: float, name: str) -> float:
         UavDcError: it is no such number.
     """
     if not 0.0 <= weight <= 1.0:  # also NaN
-        raise UavDcError(f"{name} {weight:g}; expected a weight between 0 (time only) and 1 (users only)")
+        raise UavDcError(f"{name} {weight:g}; expected {EXPECTED_WEIGHT}")
     return weight

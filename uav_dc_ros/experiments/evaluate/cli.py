@@ -15,7 +15,7 @@ from rich.table import Table
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.core.reward import MISSION_REWARD
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT, EXPECTED_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act
 from uav_dc_ros.errors import PolicyError, UavDcError
@@ -49,8 +49,8 @@ from uav_dc_ros.planners import PLANNERS
 PROG = "python -m uav_dc_ros.evaluate"
 
 # Figures of the overview, and of the table of shifts.
-_MAIN_FIGURES = ("landing_rate", "users_collected", "arrival_step", "sum_rate_bps")
-_SHIFT_FIGURES = ("users_collected", "data_bits", "landing_rate", "arrival_step", "reward")
+_MAIN_FIGURES = ("objective", "landing_rate", "users_collected", "arrival_step")
+_SHIFT_FIGURES = ("objective", "users_collected", "data_bits", "landing_rate", "arrival_step")
 
 
 class Candidate(NamedTuple):
@@ -74,6 +74,9 @@ def main(argv: list[str] | None = None) -> None:
     text += "default: by the name of the policy's own"
     add("--scenario", nargs="+", default=[], metavar="NAME|FILE", help=text)
     add("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
+    text = "w of the objective J: 1 counts the users only, 0 the time only; default 10/11"
+    weight = cli.number(0.0, 1.0, EXPECTED_WEIGHT)
+    add("--objective", type=weight, default=DEFAULT_WEIGHT, metavar="W", help=text)
     add("--json", type=Path, metavar="FILE", help="write evaluations and comparisons")
     add("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
     text = "fly also with values of the scenario changed: KEY=+DELTA, KEY=-DELTA, KEY=xFACTOR, KEY=VALUE, or "
@@ -95,8 +98,9 @@ def main(argv: list[str] | None = None) -> None:
             candidate, scenario = pairs[0]
             save_mission_picture(candidate.act_in(scenario), scenario, 0, options.picture)
 
+        seeds = range(options.seeds)
         evaluated = [
-            evaluate_act(one.name, one.sha256, act, world.scenario, range(options.seeds), world.shift)
+            evaluate_act(one.name, one.sha256, act, world.scenario, seeds, world.shift, options.objective)
             for one, world, act in flights
         ]
         report = _report(evaluated)
@@ -234,7 +238,7 @@ def _overview(evaluations: Sequence[Evaluation], comparisons: Sequence[Compariso
 
 def _shifts(worlds: Sequence[Evaluation], effects: Sequence[ShiftEffect]) -> Table:
     """A policy in a scenario as it is and in the shifted worlds, by number, and the differences."""
-    table = _figures_table(_SHIFT_FIGURES, MISSION_REWARD[worlds[0].reward_data])
+    table = _figures_table(_SHIFT_FIGURES)
     for i, evaluation in enumerate(worlds):
         _add(table, str(i), _SHIFT_FIGURES, _figures(evaluation))
     table.add_section()
@@ -257,12 +261,11 @@ def _figures(evaluation: Evaluation) -> dict[str, Figure]:
     return {name: getattr(evaluation, name) for name in {*_MAIN_FIGURES, *_SHIFT_FIGURES}}
 
 
-def _figures_table(names: Sequence[str], reward_words: str = "") -> Table:
+def _figures_table(names: Sequence[str]) -> Table:
     table = _table()
     table.add_column("", overflow="fold")
     for name in names:
-        words = f" {reward_words}" if name == "reward" else ""
-        table.add_column(f"{TITLES[name]}{words}".replace(" ", "\n", 1), justify="right", no_wrap=True)
+        table.add_column(TITLES[name].replace(" ", "\n", 1), justify="right", no_wrap=True)
     return table
 
 

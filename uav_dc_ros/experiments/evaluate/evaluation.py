@@ -12,6 +12,7 @@ from msgspec import UNSET, UnsetType
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.reward import MISSION_REWARD, RewardData
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.stats import interval
@@ -53,6 +54,8 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     version: str  # of the package
     seeds: tuple[int, int]  # first seed and number of seeds
     users_total: int  # users in the field
+    objective: Figure  # J of a mission, see `core.objective`
+    objective_weight: float  # w in J
     landing_rate: Figure  # 1 for a mission that landed, else 0
     # users_collected, steps: counts per mission
     users_collected: Figure
@@ -140,13 +143,18 @@ def evaluate_act(
     scenario: Scenario,
     seeds: Sequence[int],
     shift: Shift | UnsetType = UNSET,
+    weight: float = DEFAULT_WEIGHT,
 ) -> EvaluatedMissions:
-    """Fly one mission per seed with the actions of a policy or a planner; `shift`: that of the scenario."""
+    """Fly one mission per seed with the actions of a policy or a planner.
+
+    `shift` is that of the scenario, and `weight` that of the objective.
+    """
     sends = transmitting(scenario, seeds, shift.missing) if shift is not UNSET and shift.missing else None
     missions = roll_out(scenario, act, seeds, transmitting=sends)
     of_missions = {f.name: getattr(missions, f.name) for f in fields(Missions)}
     values = {name: np.asarray(v, np.float64) for name, v in of_missions.items() if v is not None}
     values["landing_rate"] = values.pop("landed")
+    values["objective"] = missions.objective(scenario, weight)
     evaluation = Evaluation(
         policy=name,
         sha256=sha256,
@@ -156,6 +164,7 @@ def evaluate_act(
         version=__version__,
         seeds=(seeds[0], len(seeds)),
         users_total=scenario.n_users,
+        objective_weight=weight,
         reward_data=scenario.reward.data,
         **{name: _figure(each, _RANGES.get(name)) for name, each in values.items()},
     )
@@ -196,7 +205,7 @@ def _differences(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> d
     return {name: _figure(one - other) for name, (one, other) in pairs.items()}
 
 
-_RANGES = {"landing_rate": (0.0, 1.0), "fairness": (0.0, 1.0)}  # of possible values; the interval ends there
+_RANGES = dict.fromkeys(("objective", "landing_rate", "fairness"), (0.0, 1.0))  # intervals end there
 
 
 def _figure(values: Array, possible: tuple[float, float] | None = None) -> Figure:
@@ -212,6 +221,7 @@ def _figure(values: Array, possible: tuple[float, float] | None = None) -> Figur
 
 # Of each figure: title, what to divide by, decimals.
 _SHOWN = {
+    "objective": ("objective J", 1.0, 3),  # with its weight behind it
     "landing_rate": ("landing rate", 1.0, 2),
     "users_collected": ("users collected", 1.0, 1),
     "steps": ("steps", 1.0, 1),
@@ -228,6 +238,9 @@ _SHOWN = {
 }
 TITLES = {name: title for name, (title, _, _) in _SHOWN.items()}
 COLUMNS = ("", "mean", "95% interval", "min", "max")
+OBJECTIVE_IN_WORDS = (
+    "The objective J is w users / U + (1 - w) (1 - arrival / T_cons) of a mission that lands, else 0."
+)
 
 
 def rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
@@ -239,6 +252,8 @@ def rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
             continue
         if name == "reward":
             title = f"{title} {MISSION_REWARD[evaluation.reward_data]}"
+        elif name == "objective":
+            title = f"{title}, w = {evaluation.objective_weight:.3g}"
         # Extremes of landings, which are 0 or 1, carry no information.
         extremes = ("", "") if name == "landing_rate" else (_text(name, figure.min), _text(name, figure.max))
         table.append((title, *mean_and_interval(name, figure), *extremes))

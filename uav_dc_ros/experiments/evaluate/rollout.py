@@ -13,6 +13,7 @@ import numpy as np
 
 from uav_dc_ros.core import energy, mission, world
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT, objective
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.users.service import ServiceRecord
@@ -42,6 +43,17 @@ class Missions:
     # Energy used, joules, and for each Mbit collected (NaN where none was); None without a battery
     energy_used_j: Array | None = None
     energy_per_mbit_j: Array | None = None
+
+    def objective(self, scenario: Scenario, weight: float = DEFAULT_WEIGHT) -> Array:
+        """J of each mission, see `core.objective`."""
+        return objective(
+            self.users_collected,
+            self.arrival_step,
+            self.landed,
+            n_users=scenario.n_users,
+            max_steps=scenario.mission.max_steps,
+            weight=weight,
+        )
 
 
 def rollout_steps(

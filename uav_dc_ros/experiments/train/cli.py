@@ -50,13 +50,21 @@ class _SavedProgress(msgspec.Struct):
     """What a checkpoint holds beside the training; the file keeps the older names."""
 
     every: int  # episodes between checkpoints
-    selection_score: float | None = msgspec.field(default=None, name="merit")  # highest until now
+    selection_score: float | None = msgspec.field(default=None, name="objective")  # highest until now
     score: float | None = None  # users that the policy with that score brought home in validation
     run: int = 0  # index of its run
     best: str = ""  # its folder's name
     seconds: float = 0.0  # wall time
     # Recorded flights that the replay buffers began with.
     prefilled: PrefilledReplay | None = msgspec.field(default=None, name="remembered")
+
+
+def _saved_progress(values: dict[str, Any]) -> _SavedProgress:
+    """The progress in a checkpoint; those of version 0.2.0 hold `merit`, which is 1.1 J - 0.1."""
+    merit = values.get("merit")
+    return msgspec.convert(
+        values if merit is None else {**values, "objective": (merit + 0.1) / 1.1}, _SavedProgress
+    )
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -123,7 +131,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     every = options.checkpoint_every
     progress = _SavedProgress(every)
     if options.resume and saved.is_file():
-        progress = msgspec.convert(checkpoint.restore(saved, training), _SavedProgress)
+        progress = _saved_progress(checkpoint.restore(saved, training))
         checkpoint.refuse_other(saved, "checkpoint_every", progress.every, every)
         bags = list(progress.prefilled.bags) if progress.prefilled else None
         expected = list(map(str, options.from_bags)) if options.from_bags else None

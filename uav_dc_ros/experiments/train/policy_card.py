@@ -4,8 +4,15 @@ from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
 from uav_dc_ros.core import reward
 from uav_dc_ros.core.mobility import GaussMarkov, RandomWalk, RandomWaypoint, Static
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.experiments.evaluate.evaluation import COLUMNS, TEST_SEEDS, evaluate, rows
+from uav_dc_ros.experiments.evaluate.evaluation import (
+    COLUMNS,
+    OBJECTIVE_IN_WORDS,
+    TEST_SEEDS,
+    evaluate,
+    rows,
+)
 from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay
 
 _ALGORITHMS = {"dqn": "DQN", "dueling_dqn": "Dueling DQN"}
@@ -60,8 +67,8 @@ hidden layers of {hidden} units and {len(config.actions)} actions.
 
 - uav_dc_ros {__version__}; {seconds / 60:.1f} minutes for {n_runs} run(s) of {values.episodes} episodes
 - chosen among all runs and checkpoints by validation missions, which share no seed with those below, for the
-  share of users brought home, less a tenth of the share of the battery spent until the dock: the run with
-  seed {config.seed} after episode {config.episode}, which brought {score:.2f} of {n_users} users home
+  highest mean objective J with w = {DEFAULT_WEIGHT:.3f}: the run with seed {config.seed} after episode
+  {config.episode}, which brought {score:.2f} of {n_users} users home
 - gamma {values.gamma:g}, epsilon {values.epsilon:g} (probability of the greedy action)
 - batches of {values.batch_size}, learning rate {values.learning_rate:g}
 - target network copied every {values.target_every} iterations, replay buffer of {values.buffer_size}{began}
@@ -72,6 +79,7 @@ hidden layers of {hidden} units and {len(config.actions)} actions.
 {len(TEST_SEEDS)} missions, seeds {first} to {last}, flown greedily, each with a fresh layout of its users.
 Rewards are those of the scenario as it is shipped: {_reward(scenario)}.
 The arrival step is over missions that landed. Intervals of the mean are by the bootstrap.
+{OBJECTIVE_IN_WORDS}
 
 {table}
 

@@ -30,7 +30,6 @@ from uav_dc_ros.recordings.transitions import Transition
 _TRAINING_STREAM = 1
 # Missions that select among runs and checkpoints; seeds 0 to 99 evaluate the selected one.
 VALIDATION_SEEDS = range(1_000_000, 1_000_100)
-_BATTERY_WEIGHT = 0.1  # of the whole battery, relative to all users
 
 
 def prepare_torch(n_threads: int) -> None:
@@ -228,15 +227,11 @@ class Validation(NamedTuple):
     """Scores of each run's policy, `[N]` each."""
 
     brought_home: np.ndarray  # mean number of users collected; 0 for a mission that does not land
-    # Selects the policy: the share of users brought home, less a tenth of the share of the battery spent on
-    # arrival. A hundredth of the users weighs as much as a tenth of the battery.
-    selection_score: np.ndarray
+    selection_score: np.ndarray  # mean objective J with the default weight; it selects the policy
 
 
 def validate(training: Training) -> Validation:
     """Flies the validation missions with every run's greedy policy."""
     scenario, missions = training.population.scenario, roll_out_greedily(training, VALIDATION_SEEDS)
     brought_home = np.where(missions.landed, missions.users_collected, 0).mean(axis=-1)
-    max_steps = scenario.mission.max_steps
-    spent = np.where(missions.landed, missions.arrival_step, max_steps).mean(axis=-1) / max_steps
-    return Validation(brought_home, brought_home / scenario.n_users - _BATTERY_WEIGHT * spent)
+    return Validation(brought_home, missions.objective(scenario).mean(axis=-1))
