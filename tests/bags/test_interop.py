@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.bags.test_foreign import run
+from tests.recordings import made
 from tests.support.bags import STRING, in_bag, in_mcap, information, text
+from tests.support.worlds import tiny
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.salvage.recover import recover
 from uav_dc_ros.bags.write import BagWriter
@@ -81,3 +84,20 @@ def test_rosbags_and_mcap_and_we_read_the_same(bags: dict[str, Path], name: str)
     assert info["message_count"] == len(ours)
     assert info["starting_time"]["nanoseconds_since_epoch"] == ours[0][1]
     assert info["duration"]["nanoseconds"] == ours[-1][1] - ours[0][1]
+
+
+def test_node_validates_json_channels_against_their_schemas(
+    node_reader: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = tiny()
+    bag = made.write(tmp_path / "bag", made.flight(world), made.about(world))
+    run(capsys, "convert", bag, "--out", tmp_path / "json", "--json-channels")
+    done = subprocess.run(
+        ["node", node_reader.with_name("read_json.mjs"), tmp_path / "json" / "json_0.mcap"],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    with BagReader(bag) as reader:
+        counts = {name: topic.count for name, topic in reader.topics.items() if topic.type == STRING}
+    assert json.loads(done.stdout) == counts
+    assert set(counts) == {"/users", "/rates", "/mission", "/move"}

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from rosbags.rosbag2.metadata import parse_qos
 
-from tests.support.bags import TYPES
+from tests.support.bags import QOS, TYPES
 from uav_dc_ros import __version__, cdr, messages, payloads, topics
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
@@ -124,15 +125,21 @@ def about(scenario: Scenario, seed: int = 0, **values: str) -> dict[str, str]:
 
 
 def write(
-    folder: Path, recorded: Iterable[BagMessage], about: dict[str, str] | None = None, namespace: str = ""
+    folder: Path,
+    recorded: Iterable[BagMessage],
+    about: dict[str, str] | None = None,
+    namespace: str = "",
+    latched: bool = False,
 ) -> Path:
-    """A bag with messages, in their order; its folder."""
+    """A bag with messages, in their order; its folder. `latched`: topics have the durability of the table."""
     with BagWriter(folder, about or {}) as writer:
         known = set()
         for message in recorded:
             topic = namespace + message.topic
             if topic not in known:
-                writer.add_topic(topic, message.type)
+                row = topics.TOPICS[message.topic.removeprefix("/")]
+                offered = parse_qos(QOS.replace("volatile", "transient_local") if row.latched else QOS)
+                writer.add_topic(topic, message.type, offered if latched else ())
                 known.add(topic)
             writer.write(
                 topic,

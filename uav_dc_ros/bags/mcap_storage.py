@@ -1,17 +1,21 @@
 """MCAP files as storage of a bag, read by their index, or scanned without one."""
 
+from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
+from itertools import islice
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Message, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.summary import Summary
 
-from uav_dc_ros.bags.metadata import Part
+from uav_dc_ros import cdr, topics
+from uav_dc_ros.bags import json_channels, message_definitions
+from uav_dc_ros.bags.metadata import ABOUT_RECORD, DROPPED_RECORD, REPEATED_RECORD, ROSBAG2_RECORD, Part
 from uav_dc_ros.bags.records import CDR, CHUNK_COMPRESSIONS, HEADER, MAGIC, TIME_MAX_NS, decompress_payload
 from uav_dc_ros.bags.salvage.scan import Scan, has_end, metadata_records
 from uav_dc_ros.bags.storage import (
@@ -29,6 +33,7 @@ from uav_dc_ros.bags.storage import (
 from uav_dc_ros.errors import BagDamagedError, BagError
 
 WAITING_BYTES = 64 * 2**20  # of messages that wait for earlier ones
+OWN_RECORDS = (ABOUT_RECORD, REPEATED_RECORD, DROPPED_RECORD, ROSBAG2_RECORD)
 
 
 def open_mcap(path: Path, closing: ExitStack, *, torn: bool = False, repeats: bool = True) -> Storage:
@@ -83,44 +88,72 @@ def _open_indexed(
 ) -> Storage:
     statistics = summary.statistics
     assert statistics is not None, "it is an index"
-    part = Part(path.name)
+    part, others = Part(path.name), list[Metadata]()
     with damage_errors(path):
         indexed = statistics.metadata_count == len(summary.metadata_indexes) > 0
         for metadata in reader.iter_metadata() if indexed else metadata_records(path, file):
             part.add_metadata(metadata.name, metadata.metadata)
+            if metadata.name not in OWN_RECORDS:
+                others.append(metadata)
         library = reader.get_header().library
     for index in summary.chunk_indexes:
         if index.compression not in CHUNK_COMPRESSIONS:
             unsupported = f"unsupported compression type {index.compression!r}"
             raise BagError(f"{path}: {unsupported}; expected one of {CHUNK_COMPRESSIONS}")
     left_out = {} if repeats else part.repeated
-    topics: dict[str, RecordedTopic] = {}
+    by_name: dict[str, RecordedTopic] = {}
+    payloads: set[int] = set()  # channels
     for channel in summary.channels.values():
-        count = statistics.channel_message_counts.get(channel.id, 0)
-        merge_topic(topics, _topic(channel, summary.schemas.get(channel.schema_id), count))
+        count, schema = (
+            statistics.channel_message_counts.get(channel.id, 0),
+            summary.schemas.get(channel.schema_id),
+        )
+        merge_topic(by_name, _topic(channel, schema, count))
+        if _is_payload(channel, schema):
+            payloads.add(channel.id)
     for name, n in left_out.items():
-        if name in topics:
-            topics[name].count -= n
+        if name in by_name:
+            by_name[name].count -= n
 
     compressed: set[str] = set()
 
     def read(
-        topics: Collection[str] | None, start_ns: int | None, end_ns: int | None, *, sort: bool = True
+        wanted: Collection[str] | None,
+        start_ns: int | None,
+        end_ns: int | None,
+        *,
+        sort: bool = True,
+        reverse: bool = False,
+        head: bool = False,
     ) -> Iterator[BagMessage]:
-        stream = reader.iter_messages(topics, starting_at=start_ns, ending_before=end_ns, log_time_order=sort)
+        times: dict[str, Any] = {"starting_at": start_ns, "ending_before": end_ns}
+        stream = reader.iter_messages(wanted, **times, log_time_order=sort, reverse=reverse)
         while True:
             with damage_errors(path):
                 item = next(stream, None)
             if item is None:
                 return
             schema, channel, message = item
-            if message.sequence == 0 and channel.topic in left_out:
+            if (message.sequence == 0 and channel.topic in left_out) != head:
+                continue
+            if channel.id in payloads:
+                yield _message(channel.topic, topics.JSON, message, cdr.encode_string(message.data))
                 continue
             is_cdr = channel.message_encoding == CDR
             data = decompress_payload(message.data) if is_cdr else message.data
             if data is not message.data:
                 compressed.add(channel.topic)
             yield _message(channel.topic, schema.name if schema else "", message, data)
+
+    def latest(topic: str, n: int, before_ns: int) -> list[BagMessage]:
+        return list(islice(read([topic], None, before_ns, reverse=True), n))[::-1]
+
+    def repeated() -> list[BagMessage]:
+        return list(islice(read(left_out, None, None, sort=False, head=True), sum(left_out.values())))
+
+    def attachments() -> Iterator[Attachment]:
+        with damage_errors(path):
+            yield from reader.iter_attachments()
 
     def log_goes_back_ns() -> int:
         if all(chunk.message_index_offsets for chunk in summary.chunk_indexes):
@@ -131,15 +164,19 @@ def _open_indexed(
 
     return Storage(
         path=path,
-        topics=list(topics.values()),
+        topics=list(by_name.values()),
         first_ns=min(statistics.message_start_time, TIME_MAX_NS),
         last_ns=min(statistics.message_end_time, TIME_MAX_NS),
         messages=read,
-        recorded=lambda topics: read(topics, None, None, sort=False),
+        recorded=lambda wanted, *range_ns: read(wanted, *range_ns, sort=False),
+        latest=latest,
         goes_back_ns=log_goes_back_ns,
         about=part.about,
         dropped=part.dropped,
         repeated=left_out,
+        head=repeated,
+        metadata=others,
+        attachments=attachments,
         library=library,
         compressed=compressed,
     )
@@ -162,39 +199,66 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
     """Read a file once for its contents; each iteration over messages scans it again."""
     path = scan.path
 
-    def recorded(topics: Collection[str] | None) -> Iterator[BagMessage]:
+    def recorded(
+        wanted: Collection[str] | None, start_ns: int | None, end_ns: int | None, *, head: bool = False
+    ) -> Iterator[BagMessage]:
         with read_errors(path):
             again = Scan(path, file)
             for record in again:
-                if isinstance(record, Message):
-                    topic, type = again.channels[record.channel_id]
-                    is_repeated = record.sequence == 0 and topic in left_out
-                    if not is_repeated and (topics is None or topic in topics):
-                        yield _message(topic, type, record, record.data)
+                if not isinstance(record, Message):
+                    continue
+                topic, type = again.channels[record.channel_id]
+                is_repeated = record.sequence == 0 and topic in left_out
+                if is_repeated != head or (wanted is not None and topic not in wanted):
+                    continue
+                if record.channel_id in payloads:
+                    message = _message(topic, topics.JSON, record, cdr.encode_string(record.data))
+                else:
+                    message = _message(topic, type, record, record.data)
+                if _is_within(message.log_time_ns, start_ns, end_ns):
+                    yield message
+
+    def latest(topic: str, n: int, before_ns: int) -> list[BagMessage]:
+        ordered = _sorted(recorded([topic], None, before_ns), scan.lag_ns)
+        return list(deque(ordered, maxlen=n))
+
+    def attachments() -> Iterator[Attachment]:
+        with read_errors(path):
+            yield from (record for record in Scan(path, file) if isinstance(record, Attachment))
 
     schemas: dict[int, Schema] = {}
-    topics: dict[str, RecordedTopic] = {}
+    by_name: dict[str, RecordedTopic] = {}
+    payloads: set[int] = set()  # channels
+    others: list[Metadata] = []
     with read_errors(path):
         for record in scan:
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
-                merge_topic(topics, _topic(record, schemas.get(record.schema_id), 0))
+                merge_topic(by_name, _topic(record, schemas.get(record.schema_id), 0))
+                if _is_payload(record, schemas.get(record.schema_id)):
+                    payloads.add(record.id)
+            elif isinstance(record, Metadata) and record.name not in OWN_RECORDS:
+                others.append(record)
         ended = has_end(file)
     left_out = {} if repeats else scan.part.repeated
     for name, count in scan.part.counts.items():
-        topics[name].count = count - left_out.get(name, 0)
+        by_name[name].count = count - left_out.get(name, 0)
     return Storage(
         path=path,
-        topics=list(topics.values()),
+        topics=list(by_name.values()),
         first_ns=scan.part.first_ns or 0,
         last_ns=scan.part.last_ns,
-        messages=lambda topics, *range_ns: _sorted(recorded(topics), scan.lag_ns, *range_ns),
+        messages=lambda wanted, *range_ns: _sorted(recorded(wanted, *range_ns), scan.lag_ns),
         recorded=recorded,
+        latest=latest,
         goes_back_ns=lambda: scan.goes_back_ns,
         about=scan.part.about,
         dropped=scan.part.dropped,
         repeated=left_out,
+        head=lambda: list(recorded(left_out, None, None, head=True)),
+        metadata=others,
+        attachments=attachments,
         library=scan.library,
         damages=scan.damages,
         has_end=ended,
@@ -203,15 +267,34 @@ def _open_scanned(scan: Scan, file: IO[bytes], *, repeats: bool) -> Storage:
     )
 
 
+def _is_payload(channel: Channel, schema: Schema | None) -> bool:
+    """Whether a channel is one of `json_channels`."""
+    is_json = channel.message_encoding == json_channels.SERIALIZATION
+    return is_json and schema is not None and schema.name in json_channels.NAMES
+
+
+def _is_within(time_ns: int, start_ns: int | None, end_ns: int | None) -> bool:
+    return (start_ns is None or time_ns >= start_ns) and (end_ns is None or time_ns < end_ns)
+
+
 def _topic(channel: Channel, schema: Schema | None, count: int) -> RecordedTopic:
+    given = {
+        "offered_qos": channel.metadata.get("offered_qos_profiles", ""),
+        "type_hash": channel.metadata.get("topic_type_hash", ""),
+    }
+    if _is_payload(channel, schema):
+        definition = message_definitions.definition(topics.JSON)
+        return RecordedTopic(
+            name=channel.topic, type=topics.JSON, definition=definition, is_json=True, count=count, **given
+        )
     return RecordedTopic(
         name=channel.topic,
         type=schema.name if schema else "",
         definition=schema.data if schema else b"",
         encoding=schema.encoding if schema else "",
         serialization=channel.message_encoding,
-        offered_qos=channel.metadata.get("offered_qos_profiles", ""),
         count=count,
+        **given,
     )
 
 
@@ -220,19 +303,15 @@ def _message(topic: str, type: str, message: Message, data: bytes) -> BagMessage
     return BagMessage(topic, type, data, log_time_ns, publish_time_ns)
 
 
-def _sorted(
-    messages: Iterator[BagMessage], lag_ns: int, start_ns: int | None, end_ns: int | None
-) -> Iterator[BagMessage]:
-    """Messages of a range of log times, sorted; `messages` go back by at most `lag_ns`."""
+def _sorted(messages: Iterator[BagMessage], lag_ns: int) -> Iterator[BagMessage]:
+    """Messages sorted by log time; they go back by at most `lag_ns`."""
     newest_ns = 0
 
-    def in_range() -> Iterator[tuple[int, BagMessage]]:
+    def timed() -> Iterator[tuple[int, BagMessage]]:
         nonlocal newest_ns
         for message in messages:
-            time_ns = message.log_time_ns
-            newest_ns = max(newest_ns, time_ns)
-            if (start_ns is None or time_ns >= start_ns) and (end_ns is None or time_ns < end_ns):
-                yield time_ns, message
+            newest_ns = max(newest_ns, message.log_time_ns)
+            yield message.log_time_ns, message
 
-    for _, message in sorted_within(in_range(), WAITING_BYTES, lambda time_ns: time_ns <= newest_ns - lag_ns):
+    for _, message in sorted_within(timed(), WAITING_BYTES, lambda time_ns: time_ns <= newest_ns - lag_ns):
         yield message

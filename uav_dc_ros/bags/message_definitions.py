@@ -1,7 +1,7 @@
 """Definitions of ROS message types as text, for files and protocols that contain them; needs no ROS."""
 
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uav_dc_ros.errors import BagError
 
@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 ENCODING = "ros2msg"  # of the text, in MCAP and Foxglove
+_TEXTS = (ENCODING, "ros2idl")  # encodings of definitions that can be compared
 
 
 @cache
@@ -32,14 +33,35 @@ def matches_jazzy(type: str, encoding: str, definition: bytes) -> bool:
 
     True without a definition, and in another encoding than `ros2msg` and `ros2idl`.
     """
-    if not definition or encoding not in ("ros2msg", "ros2idl"):
+    if not definition or encoding not in _TEXTS:
         return True
+    recorded = _fields(type, encoding, definition)
+    jazzy = typestore().fielddefs
+    return recorded is not None and all(
+        name in jazzy and jazzy[name][1] == fields for name, fields in recorded.items()
+    )
+
+
+def have_same_fields(type: str, one: tuple[str, bytes], other: tuple[str, bytes]) -> bool:
+    """Whether two definitions of a type, each with its encoding, have the same fields, as far as is known."""
+    if one == other or not (one[1] and other[1]):
+        return True
+    if one[0] not in _TEXTS or other[0] not in _TEXTS:
+        return False
+    fields = _fields(type, *one)
+    return fields is not None and fields == _fields(type, *other)
+
+
+def _fields(type: str, encoding: str, definition: bytes) -> dict[str, Any] | None:
+    """Fields by type of a definition in one of `_TEXTS`; None if it is none.
+
+    Constants are left out: messages do not contain them.
+    """
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     try:
         text = definition.decode().replace("\r\n", "\n")  # of a checkout on Windows
-        recorded = get_types_from_msg(text, type) if encoding == "ros2msg" else get_types_from_idl(text)
+        found = get_types_from_msg(text, type) if encoding == ENCODING else get_types_from_idl(text)
     except Exception:  # of UTF-8, rosbags: no definition
-        return False
-    jazzy = typestore().fielddefs  # constants are not compared: messages do not contain them
-    return all(name in jazzy and jazzy[name][1] == fields for name, (_, fields) in recorded.items())
+        return None
+    return {name: fields for name, (_, fields) in found.items()}

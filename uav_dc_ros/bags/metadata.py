@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
@@ -17,11 +17,16 @@ from ruamel.yaml.error import YAMLError
 from uav_dc_ros import files
 from uav_dc_ros.errors import BagError, UavDcError
 
+if TYPE_CHECKING:
+    from rosbags.interfaces import Qos
+
 # Names of this package's metadata records in an MCAP file.
 ABOUT_RECORD = "uav_dc_ros"  # the bag's description, text by key
 REPEATED_RECORD = "uav_dc_ros_repeated"  # messages at the head that an earlier part has, by topic; sequence 0
 DROPPED_RECORD = "uav_dc_ros_dropped"  # messages lost while the part was recorded, by topic
 LOST_BYTES_KEY = "lost_bytes"  # of ABOUT_RECORD: bytes of the source that could not be recovered
+MADE_BY_KEY = "made_by"  # of ABOUT_RECORD: the verb that made the bag, and the names of its sources
+ROSBAG2_RECORD = "rosbag2"  # rosbag2's own: metadata.yaml of the part
 METADATA_FILE = "metadata.yaml"
 
 
@@ -51,11 +56,7 @@ class Part:
         """Add a topic, unless it is known; raises BagError if its QoS is not in rosbag2's format."""
         if topic in self.topics:
             return
-        offered = channel.get("offered_qos_profiles", "")
-        try:
-            qos = dump_qos_v9(parse_qos(offered))
-        except (ReaderError, KeyError, TypeError, AttributeError):
-            raise BagError(f"QoS of topic {topic} is {offered!r}; expected rosbag2's YAML") from None
+        qos = dump_qos_v9(offered_qos(topic, channel.get("offered_qos_profiles", "")))
         self.topics[topic] = {
             "name": topic,
             "type": type,
@@ -84,6 +85,14 @@ class Part:
 
 def _counts(content: Mapping[str, str]) -> dict[str, int]:
     return {topic: int(count) for topic, count in content.items() if count.isdecimal()}
+
+
+def offered_qos(topic: str, text: str) -> "list[Qos]":
+    """The QoS of a topic's publishers; raises BagError if the text is not in rosbag2's format."""
+    try:
+        return list(parse_qos(text))
+    except (ReaderError, KeyError, TypeError, AttributeError):
+        raise BagError(f"QoS of topic {topic} is {text!r}; expected rosbag2's YAML") from None
 
 
 def is_latched(topic: Mapping[str, Any]) -> bool:

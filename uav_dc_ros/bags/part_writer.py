@@ -11,7 +11,7 @@ from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
 from uav_dc_ros import __version__
-from uav_dc_ros.bags.metadata import Part, information, to_yaml
+from uav_dc_ros.bags.metadata import ROSBAG2_RECORD, Part, information, to_yaml
 from uav_dc_ros.errors import BagError
 
 CHUNK_BYTES = 128 * 1024  # a killed writer loses its unfinished chunk
@@ -132,7 +132,7 @@ class PartWriter:
 
     def finish(self) -> None:
         """Write the end of the file, with rosbag2's metadata record of this part, and sync it to disk."""
-        self._mcap.add_metadata("rosbag2", {"serialized_metadata": to_yaml(information([self.part]))})
+        self._mcap.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": to_yaml(information([self.part]))})
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())

@@ -18,8 +18,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Self
 
+from rosbags.rosbag2.metadata import dump_qos_v9
+
 from uav_dc_ros.bags import receive_order
 from uav_dc_ros.bags.mcap_storage import open_mcap
+from uav_dc_ros.bags.metadata import is_latched, offered_qos
 from uav_dc_ros.bags.sqlite_storage import open_sqlite
 from uav_dc_ros.bags.storage import (
     SQLITE_MAGIC,
@@ -41,13 +44,15 @@ class BagReader:
         path: the bag's folder, or one of its files.
         torn: read files without their end, or damaged ones, as far as possible. They are scanned once before
             their messages are read.
+        repeats: keep the latched messages at the head of the first file that repeat earlier ones, as those of
+            a bag that was cut; without, `held` has them.
 
     Raises:
         BagError: no bag; a part without its end, since its recorder was killed; a damaged one, or one of an
             unsupported kind.
     """
 
-    def __init__(self, path: Path, *, torn: bool = False) -> None:
+    def __init__(self, path: Path, *, torn: bool = False, repeats: bool = True) -> None:
         self.path = path
         self.topics: dict[str, RecordedTopic] = {}  # by name
         self.about: dict[str, str] = {}  # description by this package's recorder, text by key; else empty
@@ -55,7 +60,7 @@ class BagReader:
         self.dropped: dict[str, int] | None = None
         with ExitStack() as self._closing:
             files = storage_files(path)
-            opened = [self._open(part, torn, repeats=part is files[0]) for part in files]
+            opened = [self._open(part, torn, repeats=repeats and part is files[0]) for part in files]
             self._closing = self._closing.pop_all()
         self.storages: list[Storage] = opened  # contents of each part
         self.parts: tuple[Path, ...] = tuple(part.path for part in opened)  # storage files, in their order
@@ -118,7 +123,7 @@ class BagReader:
                 goes_back_ns = max(goes_back_ns, before.last_ns - after.first_ns)
         if goes_back_ns <= receive_order.MIN_SET_BACK_NS:
             return 0
-        return receive_order.set_back_ns(self._recorded(None))
+        return receive_order.set_back_ns(self.recorded())
 
     def received(self, topics: Collection[str]) -> Iterator[tuple[int, BagMessage]]:
         """Messages in the order of receipt, each with how often the clock had been set back before it.
@@ -131,14 +136,42 @@ class BagReader:
         """
         if not self.set_back_ns:
             return ((0, message) for message in self.messages(topics))
-        return receive_order.in_order(self._recorded(topics))
+        return receive_order.in_order(self.recorded(topics))
 
-    def _recorded(self, topics: Collection[str] | None) -> Iterator[BagMessage]:
-        """Messages in the order of recording."""
-        streams = [part.recorded(topics) for part in self.storages]
+    def recorded(
+        self, topics: Collection[str] | None = None, *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[BagMessage]:
+        """As `messages`, in the order of recording."""
+        streams = [part.recorded(topics, start_ns, end_ns) for part in self.storages]
         if self._is_side_by_side:
             return heapq.merge(*streams, key=attrgetter("log_time_ns"))
         return chain(*streams)
+
+    def held(self, before_ns: int | None = None) -> Iterator[BagMessage]:
+        """The messages of latched topics that held at a log time, by topic and in order.
+
+        Of each topic as many as its publishers offered different QoS. None: those at the head of the first
+        file that repeat earlier ones, if they are left out.
+
+        Raises:
+            BagError: the bag is damaged there, or a topic's QoS is not in rosbag2's format.
+        """
+        head = self.storages[0].head() if self.storages else []
+        if before_ns is None:
+            yield from head
+            return
+        for topic in self.topics.values():
+            offered = offered_qos(topic.name, topic.offered_qos)
+            if not is_latched({"offered_qos_profiles": dump_qos_v9(offered)}):
+                continue
+            repeated = [message for message in head if message.topic == topic.name]
+            n = max(len(offered), len(repeated))
+            found: list[BagMessage] = []
+            for part in reversed(self.storages):
+                found = part.latest(topic.name, n - len(found), before_ns) + found
+                if len(found) == n:
+                    break
+            yield from (repeated + found)[-n:]
 
     @property
     def _is_side_by_side(self) -> bool:

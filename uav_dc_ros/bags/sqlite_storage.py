@@ -41,7 +41,7 @@ def open_sqlite(path: Path, closing: ExitStack) -> Storage:
     compressed: set[str] = set()
 
     def read(
-        wanted: Collection[str] | None, start_ns: int | None, end_ns: int | None, order: str
+        wanted: Collection[str] | None, start_ns: int | None, end_ns: int | None, order: str, n: int = -1
     ) -> Iterator[BagMessage]:
         values = [id for id, topic in topics.items() if wanted is None or topic.name in wanted]
         marks = ", ".join("?" * len(values))
@@ -51,7 +51,7 @@ def open_sqlite(path: Path, closing: ExitStack) -> Storage:
                 query += f" AND timestamp {compare} ?"
                 values.append(limit)
         with damage_errors(path, ""):
-            cursor = database.execute(f"{query} ORDER BY {order}", values)
+            cursor = database.execute(f"{query} ORDER BY {order} LIMIT {n}", values)
         while True:
             with damage_errors(path, ""):
                 batch = [_message(topics[row["topic_id"]], row, compressed) for row in cursor.fetchmany(ROWS)]
@@ -69,21 +69,29 @@ def open_sqlite(path: Path, closing: ExitStack) -> Storage:
         first_ns=first_ns,
         last_ns=last_ns,
         messages=lambda wanted, start_ns, end_ns: read(wanted, start_ns, end_ns, "timestamp, id"),
-        recorded=lambda wanted: read(wanted, None, None, "id"),
+        recorded=lambda wanted, start_ns, end_ns: read(wanted, start_ns, end_ns, "id"),
+        latest=lambda topic, n, before_ns: list(read([topic], None, before_ns, "timestamp DESC, id DESC", n))[
+            ::-1
+        ],
         goes_back_ns=lambda: goes_back_ns(times()),
         compressed=compressed,
     )
 
 
 def _topic(row: sqlite3.Row, count: int) -> RecordedTopic:
-    """A row of the table `topics`; the first versions have no QoS."""
-    has_qos = "offered_qos_profiles" in tuple(row.keys())
+    """A row of the table `topics`; older versions have no QoS, or no hash of the type."""
+    columns = tuple(row.keys())
+
+    def text(column: str) -> str:
+        return _text(row[column]) if column in columns else ""
+
     return RecordedTopic(
         name=_text(row["name"]),
         type=_text(row["type"]),
         encoding="",
         serialization=_text(row["serialization_format"]),
-        offered_qos=_text(row["offered_qos_profiles"]) if has_qos else "",
+        offered_qos=text("offered_qos_profiles"),
+        type_hash=text("type_description_hash"),
         count=count,
     )
 

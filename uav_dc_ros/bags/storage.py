@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import zstandard
 from mcap.exceptions import McapError
+from mcap.records import Attachment, Metadata
 
 from uav_dc_ros.bags.part_writer import part_paths
 from uav_dc_ros.bags.salvage.scan import Damage
@@ -61,6 +62,8 @@ class RecordedTopic:
     definition: bytes = b""  # the type with all types inside it, as text in `encoding`; empty without one
     encoding: str = "ros2msg"  # of the definition: `ros2msg`, or `ros2idl`
     serialization: str = "cdr"  # of the messages, `cdr` in ROS 2
+    is_json: bool = False  # whether it is recorded as JSON, and read as std_msgs/String: see `json_channels`
+    type_hash: str = ""  # of the type (REP-2011); empty if the bag has none
     offered_qos: str = ""  # the publishers' QoS, rosbag2's YAML; empty if the bag has none
     count: int = 0  # messages
     other_types: tuple[str, ...] = ()  # further types of the topic's messages; ROS 2 allows only one
@@ -88,12 +91,17 @@ class Storage:
     last_ns: int
     # Those of some topics (None: all) from a log time on and before another, sorted by log time.
     messages: Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
-    # Those of some topics, or all, in the order of recording.
-    recorded: Callable[[Collection[str] | None], Iterator[BagMessage]]
+    # The same in the order of recording.
+    recorded: Callable[[Collection[str] | None, int | None, int | None], Iterator[BagMessage]]
+    # The last messages of a topic, at most a number of them, before a log time, in order.
+    latest: Callable[[str, int, int], list[BagMessage]]
     goes_back_ns: Callable[[], int]  # the longest step back in log time within a topic; reads the file
     about: dict[str, str] = field(default_factory=dict)
     dropped: dict[str, int] | None = None
     repeated: dict[str, int] = field(default_factory=dict)  # those left out
+    head: Callable[[], list[BagMessage]] = list  # the messages that are left out
+    metadata: Sequence[Metadata] = ()  # records of other software
+    attachments: Callable[[], Iterator[Attachment]] = lambda: iter(())
     library: str = ""  # name of the software that wrote the file
     damages: Sequence[Damage] = ()  # unusable places; only known of a file that was scanned
     has_end: bool = True  # whether the file is finished

@@ -26,6 +26,7 @@ from uav_dc_ros.bags.salvage.repair import repair_parts
 from uav_dc_ros.errors import BagError
 
 if TYPE_CHECKING:
+    from mcap.records import Attachment
     from rosbags.interfaces import Qos
 
 MIN_CHUNKS_PER_PART = 8  # keeps the size of a part close to the limit
@@ -36,6 +37,8 @@ MIN_CHUNK_BYTES = 1024
 class _WrittenTopic:
     type: str
     definition: bytes
+    encoding: str  # of the definition
+    serialization: str  # of the messages
     metadata: Mapping[str, str]  # rosbag2's, of the topic's channels
     latest: deque[tuple[bytes, int]] | None  # last messages with publish times; None unless it is latched
     sequence: int  # of the last message, counted from 1 over all parts
@@ -48,6 +51,7 @@ class BagWriter:
     `resume` continues a bag whose writer was killed: its parts are repaired, and a new one begins. Of
     `about`, the bag's description by key, values of earlier parts stay. The next part begins at `split_bytes`
     (a part exceeds them by at most a chunk, a message and the index) or after `split_s` of log time (0: off).
+    With a `name`, `folder` is an empty temporary one of the bag with that name.
 
     Raises BagError if the folder exists or cannot be made; when resuming, if there is none, or the bag was
     closed, is still being written, or cannot be repaired; in all methods, if the disk is full or gone.
@@ -58,12 +62,14 @@ class BagWriter:
         folder: Path,
         about: Mapping[str, str],
         *,
+        name: str = "",
         resume: bool = False,
         compression: str = "zstd",
         split_bytes: int = 0,
         split_s: float = 0.0,
     ) -> None:
         self.folder = folder
+        self._name = name or folder.name
         self._about = dict(about)
         self._compression = compression
         self._split_bytes, self._split_ns = split_bytes, round(split_s * 1e9)
@@ -76,7 +82,7 @@ class BagWriter:
         self._dropped_before: Counter[str] = Counter()  # in parts that this writer finished
         self._sync_thread = ThreadPoolExecutor(1, thread_name_prefix="fsync")
         self._last_sync: Future[None] | None = None
-        if not resume:
+        if not (resume or name):
             if folder.exists():
                 raise BagError(f"bag folder {folder} exists already; expected a new one")
             try:
@@ -133,14 +139,16 @@ class BagWriter:
         offered_qos: "Iterable[Qos]" = (),
         *,
         definition: bytes = b"",
+        encoding: str = message_definitions.ENCODING,
         type_hash: str = "",
+        serialization: str = "cdr",
     ) -> None:
         """Add a topic, once, before its first message.
 
         A topic with messages in earlier parts keeps their QoS: metadata.yaml has one QoS for a topic, and
-        rosbags skips channels with another one. A type that ROS 2 does not have needs its `definition`, with
-        all types inside it, as `ros2msg`, and its hash (REP-2011). Raises BagError without that, or if
-        earlier parts have another type.
+        rosbags skips channels with another one. A type that ROS 2 does not have needs its `definition` in
+        `encoding`, with all types inside it, and its hash (REP-2011); without an encoding, none is written.
+        Raises BagError without that, or if earlier parts have another type.
         """
         qos = dump_qos_v9(list(offered_qos))
         earlier = self._resumed.topics.get(name)
@@ -150,7 +158,7 @@ class BagWriter:
                 raise BagError(f"topic {name} is of type {type}; {expected}")
             if self._resumed.counts[name]:
                 qos = earlier["offered_qos_profiles"]
-        if not definition:
+        if encoding and not definition:
             try:
                 definition = message_definitions.definition(type)
             except BagError as error:
@@ -159,6 +167,8 @@ class BagWriter:
         topic = _WrittenTopic(
             type=type,
             definition=definition,
+            encoding=encoding,
+            serialization=serialization,
             metadata={"offered_qos_profiles": metadata.to_yaml(qos), "topic_type_hash": type_hash},
             latest=deque(maxlen=len(qos)) if is_latched({"offered_qos_profiles": qos}) else None,
             sequence=self._resumed.counts.get(name, 0) - self._resumed.repeated.get(name, 0),
@@ -174,6 +184,31 @@ class BagWriter:
         written = self._topics[topic]
         if written.latest is not None and n > (written.latest.maxlen or 0):
             written.latest = deque(written.latest, maxlen=n)
+
+    def hold(self, topic: str, data: bytes, publish_time_ns: int) -> None:
+        """Repeat a message of a latched topic that is older than the bag in each of its parts, the first too.
+
+        Before the first call of `write`; of a topic the older message first.
+        """
+        latest = self._topics[topic].latest
+        if latest is not None:
+            latest.append((data, publish_time_ns))
+            if topic not in self._to_repeat:
+                self._to_repeat.append(topic)
+
+    def holds(self, topic: str, data: bytes, publish_time_ns: int) -> bool:
+        """Whether a message is among the last ones of a latched topic."""
+        return (data, publish_time_ns) in (self._topics[topic].latest or ())
+
+    def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
+        """Append a metadata record of other software."""
+        with self._disk_errors():
+            self._writer.add_metadata(name, content)
+
+    def add_attachment(self, attachment: "Attachment") -> None:
+        """Append a copy of an attachment."""
+        with self._disk_errors():
+            self._writer.add_attachment(attachment)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:
         """Append a message of an added topic, serialised (CDR); times are nanoseconds since the epoch."""
@@ -246,21 +281,22 @@ class BagWriter:
         number = max((part_number(part.name) for part in self._finished), default=-1) + 1
         self._begun_ns = None
         self._unchecked_bytes = 0  # written since the file's size was checked
-        self._schemas: dict[str, int] = {}  # ids by type
+        # Ids by type, encoding and definition; 0: a channel without a schema.
+        self._schemas: dict[tuple[str, str, bytes], int] = {("", "", b""): 0}
         self._to_repeat: list[str] = []  # topics whose last messages are not repeated yet
         self._writer = PartWriter(
-            self.folder / f"{self.folder.name}_{number}.mcap",
+            self.folder / f"{self._name}_{number}.mcap",
             compression=self._compression,
             chunk_bytes=self._chunk_bytes,
         )
         self._writer.add_metadata(metadata.ABOUT_RECORD, self._about)
 
     def _add_channel(self, name: str, topic: _WrittenTopic) -> None:
-        if topic.type not in self._schemas:
-            self._schemas[topic.type] = self._writer.add_schema(
-                topic.type, message_definitions.ENCODING, topic.definition
-            )
-        topic.channel = self._writer.add_channel(name, "cdr", self._schemas[topic.type], topic.metadata)
+        schema = topic.type, topic.encoding, topic.definition
+        if schema not in self._schemas:
+            self._schemas[schema] = self._writer.add_schema(*schema)
+        given = self._schemas[schema], topic.metadata
+        topic.channel = self._writer.add_channel(name, topic.serialization, *given)
         if topic.latest:
             self._to_repeat.append(name)
 
@@ -310,6 +346,8 @@ class BagWriter:
         """Abandon the bag: what was written stays."""
         self._writer.abandon()
         self._closing.close()
+        if self._name != self.folder.name:
+            return BagError(f"bag {self._name} cannot be written: {error.strerror}; nothing is left of it")
         return BagError(
             f"bag {self.folder} cannot be written any further: {error.strerror}; its MCAP file has no "
             "index, and holds what was written so far"

@@ -117,7 +117,7 @@ def copy(scan: Scan, writer: PartWriter) -> None:
                 schema = schemas[record.schema_id]
                 channel = writer.add_channel(record.topic, record.message_encoding, schema, record.metadata)
                 channels[record.id] = channel
-            case Metadata(name="rosbag2") | Metadata(name=metadata.REPEATED_RECORD):
+            case Metadata(name=metadata.ROSBAG2_RECORD) | Metadata(name=metadata.REPEATED_RECORD):
                 pass  # counts of the unfinished part: the copy has its own
             case Metadata():
                 writer.add_metadata(record.name, record.metadata)

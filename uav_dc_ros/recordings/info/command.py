@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uav_dc_ros import files
+from uav_dc_ros.bags.metadata import MADE_BY_KEY
 from uav_dc_ros.bags.storage import RECOVER
 from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings.info.survey import MissionSurvey, Survey, survey
@@ -79,6 +80,10 @@ def _facts(found: Survey) -> dict[str, str]:
     facts["holds"] = f"{found.messages:,} messages, {_size(found.size_bytes)} in {parts}"
     if found.compressed:
         facts["compressed"] = f"message by message, on {len(found.compressed)} topics (zstd)"
+    if found.json_channels:
+        facts["payloads"] = f"{', '.join(found.json_channels)} as JSON"
+    if MADE_BY_KEY in about:
+        facts["made by"] = printable(about[MADE_BY_KEY])
     if bare := [part.name for part in found.parts if not part.has_index]:
         facts["index"] = f"none in {', '.join(bare)}: read sequentially"
     if found.set_back_s:

@@ -79,6 +79,7 @@ class Survey:
     duration_s: float
     set_back_s: float  # largest step back of the recorder's clock; 0: none
     compressed: list[str]  # topics whose messages rosbag2 compressed one by one
+    json_channels: list[str]  # topics whose payloads are recorded as JSON
     messages: int
     parts: list[PartSurvey]
     topics: list[TopicSurvey]
@@ -138,6 +139,7 @@ def _survey(reader: BagReader, error: BagDamagedError | None) -> Survey:
         duration_s=(reader.last_ns - reader.first_ns) / 1e9,
         set_back_s=reader.set_back_ns / 1e9,
         compressed=sorted({topic for storage in reader.storages for topic in storage.compressed}),
+        json_channels=sorted(name for name, topic in reader.topics.items() if topic.is_json),
         messages=sum(topic.messages for topic in found),
         parts=[
             PartSurvey(

@@ -1,0 +1,1 @@
+"""New bags from the messages of others: merged, filtered, converted."""
