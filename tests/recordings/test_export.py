@@ -241,8 +241,8 @@ def test_what_is_no_transition_is_skipped_and_counted(tmp_path, capsys):
     [
         (["--out", "{taken}"], "exists; expected a new name, nothing is overwritten"),
         (["--transitions", "--out", "{taken}/t.csv"], "expected a file NAME.npz for transitions"),
-        (["--transitions", "--out", "{new}.npz", "--tables", "steps"], "--tables applies only without --tr"),
-        (["--out", "{new}", "--observation", "map"], "--observation applies only with --transitions"),
+        (["--transitions", "--out", "{new}.npz", "--tables", "steps"], "--tables applies to tables only"),
+        (["--out", "{new}", "--observation", "map"], "--observation applies to --transitions only"),
         (["--out", "{new}", "--tables", "steps,poses"], "'poses'; expected some of steps, users, missions"),
         (["--out", "/proc/new"], "/proc/new cannot be written"),
         (

@@ -1,4 +1,4 @@
-"""Export a bag: missions as tidy tables, or as transitions for training."""
+"""Export a bag: missions as tidy tables, as transitions for training, or as a map."""
 
 import argparse
 import json
@@ -23,10 +23,21 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
+from uav_dc_ros.recordings.export import maps
 from uav_dc_ros.recordings.export.tables import Format, MissionRows, new_table, table_columns
 from uav_dc_ros.recordings.step_reader import EXTERNAL, Steps
 from uav_dc_ros.recordings.transitions import RecordedTransitions, Transition
+from uav_dc_ros.topics import SIMULATED
 
+# Kinds of export that options apply to; None: tables
+APPLY: dict[str, tuple[str | None, ...]] = {
+    "format": (None,),
+    "tables": (None,),
+    "observation": ("transitions",),
+    "reward_form": (None, "transitions"),
+    "reward_data": (None, "transitions"),
+    "datum": tuple(maps.WRITERS),
+}
 ALL = tuple(table_columns(EXTERNAL))
 _REWARDS = "; ".join(f"{data}: {words}" for data, words in MISSION_REWARD.items())
 EPILOG = f"""\
@@ -48,6 +59,10 @@ action (int64 [T]), reward (float64 [T]), terminated, truncated (bool [T]); flig
 the source of each; and metadata, a JSON text. The trainer reads bags directly:
 python -m uav_dc_ros.train --from-bags BAG.
 
+Maps (GPX, KML, GeoJSON) have the path and the users of each mission on WGS 84. The grid lies where the bridge
+of a real vehicle reports it, or else at the scenario's datum_deg; --datum replaces both. Without an altitude
+of the datum, heights are above the ground.
+
 Tables: {", ".join(ALL)}.
 """
 
@@ -57,10 +72,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
-    add("--out", type=Path, required=True, metavar="DIR|FILE", help="new folder; for transitions a .npz file")
+    out = "new folder; for transitions and maps a new file"
+    add("--out", type=Path, required=True, metavar="DIR|FILE", help=out)
     add("--format", choices=get_args(Format), help="of tables (default: parquet, which needs pyarrow)")
     add("--tables", type=cli.names("tables", among=ALL), metavar="NAME,...", help="default: all")
-    add("--transitions", action="store_true", help="write transitions (s, a, r, s', terminated), no tables")
+    kinds = parser.add_mutually_exclusive_group()
+    what = "write transitions (s, a, r, s', terminated), no tables"
+    kinds.add_argument("--transitions", action="store_true", help=what)
+    for name in maps.WRITERS:
+        what = f"write path and users as a map in a file NAME.{name}"
+        kinds.add_argument(f"--{name}", dest="map", action="store_const", const=name, help=what)
+    add("--datum", metavar="LAT,LON[,ALT]", help="of a map: position of x = 0, y = 0, degrees and metres")
     add("--observation", choices=get_args(Observation), help="of transitions (default: mission)")
     add("--reward-form", choices=get_args(RewardForm), help="reward form instead of the scenario's")
     add("--reward-data", choices=get_args(RewardData), help="data in r^t instead of the scenario's")
@@ -70,12 +92,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Export; the exit status."""
-    for name in ("format", "tables") if options.transitions else ("observation",):
-        if getattr(options, name) is not None:
-            which = "without" if options.transitions else "with"
-            raise ParameterError(f"--{name} applies only {which} --transitions")
-    if options.transitions and options.out.suffix != ".npz":
-        raise ParameterError(f"--out {options.out}: expected a file NAME.npz for transitions")
+    kind = "transitions" if options.transitions else options.map
+    for name, kinds in APPLY.items():
+        if getattr(options, name) is not None and kind not in kinds:
+            listed = ", ".join("tables" if one is None else f"--{one}" for one in kinds)
+            raise ParameterError(f"--{name.replace('_', '-')} applies to {listed} only")
+    suffix = {None: options.out.suffix, "transitions": ".npz"}.get(kind, f".{kind}")
+    if options.out.suffix != suffix:
+        raise ParameterError(f"--out {options.out}: expected a file NAME{suffix} for {kind}")
     _refuse_existing(options.out)
     with BagReader(options.bag) as reader:
         namespace = step_reader.namespace(reader, options.namespace)
@@ -84,10 +108,14 @@ def run(options: argparse.Namespace) -> int:
         own = {key: value for key, value in given.items() if value is not None}
         scenario = msgspec.structs.replace(scenario, reward=msgspec.structs.replace(scenario.reward, **own))
         recorded = Steps(reader, namespace, scenario.step_ns)
+        vehicle = step_reader.vehicle(reader, namespace)
         if options.transitions:
             _write_transitions(options, recorded, scenario)
+        elif options.map is not None:
+            datum = maps.find_datum(reader, namespace, scenario, options.datum)
+            missions = maps.read_missions(reader, namespace, recorded, datum, vehicle != SIMULATED)
+            _write_map(options, recorded, missions, datum)
         else:
-            vehicle = step_reader.vehicle(reader, namespace)
             _write_tables(options, recorded, scenario, reader.about, vehicle)
         for line in recorded.losses():
             print(f"  {line}")
@@ -145,6 +173,20 @@ def _write_tables(
                 raise BagError(f"the bag holds no step of any mission; {_reason(recorded)}")
     counts = ", ".join(f"{table.count} rows of {name}" for name, table in tables.items())
     print(f"{options.out}: {n_missions} mission{'s' * (n_missions != 1)}: {counts}")
+
+
+def _write_map(
+    options: argparse.Namespace, recorded: Steps, missions: list[maps.MapMission], datum: maps.Datum
+) -> None:
+    """Write missions as a new map."""
+    if not missions:
+        raise BagError(f"the bag holds no step of any mission; {_reason(recorded)}")
+    content = maps.WRITERS[options.map](missions, datum, printable(options.bag.absolute().stem))
+    with _new(options.out) as scratch:
+        (scratch / "result").write_bytes(content)
+    n, n_poses = len(missions), sum(len(mission.path) for mission in missions)
+    where = ", ".join(f"{value:g}" for value in datum if value is not None)
+    print(f"{options.out}: {n} mission{'s' * (n != 1)}, {n_poses} poses, datum {where}")
 
 
 def _write_transitions(options: argparse.Namespace, recorded: Steps, scenario: Scenario) -> None:
