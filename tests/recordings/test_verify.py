@@ -559,3 +559,28 @@ def test_a_monitor_that_outlives_a_flight_takes_no_pose_of_it_for_the_next(ros: 
     status, out = verify(capsys, bag)
     assert status == 0, out
     assert "2 missions, " in out
+
+
+def test_json_has_what_the_text_has(tmp_path, capsys):
+    """The status is the same; a difference, a gap and a clean check are told apart."""
+    bag = write(tmp_path / "bag", flight(TINY, missions=2), about(TINY))
+    status, out = verify(capsys, bag, "--json")
+    report = json.loads(out)
+    assert (status, report["result"], report["missions"]) == (0, "verified in part", 2)
+    assert (report["scenario"], report["fingerprint"]) == (TINY.name, TINY.fingerprint)
+    assert (report["policy"], report["other_policy"]) == (None, None)
+    assert "does not name the policy" in report["decisions_missing"]
+    for check in report["checks"]:
+        assert check["recomputed"] == report["steps"] == 18
+        assert (check["differing"], check["not_recomputed"], check["first_difference"]) == (0, {}, None)
+    assert report["service"]["fairness"] > 0
+    changed = copy(bag, tmp_path / "changed", changing("rates", 1, 3, nudged("sinr", 2)))
+    status, _ = verify(capsys, changed, "--json", tmp_path / "report.json")
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (status, report["result"]) == (1, "differs")
+    channel, world = report["checks"]
+    assert (channel["title"], channel["differing"], world["differing"]) == ("channel", 1, 0)
+    assert "rates: mission 1, step 3, user 2, sinr: recorded" in channel["first_difference"]
+    status, text = verify(capsys, changed)
+    assert (status, channel["first_difference"] in text) == (1, True)
+    assert verify(capsys, bag, "--json", "--complete")[0] == 1

@@ -4,10 +4,12 @@ import argparse
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
+from typing import Literal, NamedTuple
 
+import msgspec
 import numpy as np
 
-from uav_dc_ros import __version__, cli
+from uav_dc_ros import __version__, cli, files
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.agents.policy import CONFIG, Policy
 from uav_dc_ros.bags.read import BagReader
@@ -16,6 +18,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, PolicyError
+from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import Steps
@@ -56,6 +59,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     what = "relative, of numbers; 0: to the last bit"
     add("--tolerance", type=tolerance, default=0.0, metavar="X", help=what)
     add("--complete", action="store_true", help="exit status 1 also for what could not be recomputed")
+    json = "JSON instead, into a file or to the output"
+    add("--json", nargs="?", const="-", metavar="FILE", help=json)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -64,15 +69,60 @@ def run(options: argparse.Namespace) -> int:
         namespace = step_reader.namespace(reader, options.namespace)
         _check_topics(reader, namespace)
         scenario = step_reader.scenario(reader, namespace, options.scenario)
-        lines, differs, has_gaps = _verify(reader, namespace, scenario, options)
-        print(f"{options.bag}: {lines[0]}", *lines[1:], sep="\n")
-        if reader.about.get("version", __version__) != __version__ and differs:
-            print(f"  (recorded by version {reader.about['version']}; this is {__version__})")
-    if differs:
-        print("differs")
+        result = _verify(reader, namespace, scenario, options)
+    if options.json is not None:
+        text = msgspec.json.format(msgspec.json.encode(result.report), indent=2) + b"\n"
+        if options.json == "-":
+            print(text.decode(), end="")
+        else:
+            files.write(Path(options.json), text)
     else:
-        print("verified in part" if has_gaps else "verified")
-    return DIFFERS if differs or (options.complete and has_gaps) else 0
+        print(f"{options.bag}: {result.lines[0]}", *result.lines[1:], sep="\n")
+        if result.report.recorded_by not in (None, __version__) and result.report.result == "differs":
+            print(f"  (recorded by version {result.report.recorded_by}; this is {__version__})")
+        print(result.report.result)
+    gaps = options.complete and result.report.result == "verified in part"
+    return DIFFERS if gaps or result.report.result == "differs" else 0
+
+
+class CheckReport(msgspec.Struct, frozen=True, kw_only=True):
+    """One aspect of a bag."""
+
+    title: str  # channel, world, vehicle, decisions
+    recomputed: int  # steps
+    differing: int  # recomputed steps with a difference
+    within_tolerance: int  # values that are equal only within it
+    not_recomputed: dict[str, int]  # steps by reason
+    first_difference: str | None
+
+
+class VerifyReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The file of `--json`."""
+
+    bag: str
+    result: Literal["verified", "verified in part", "differs"]
+    namespace: str  # without a slash at its end
+    scenario: str
+    fingerprint: str
+    policy: str | None  # the one whose decisions are recomputed
+    policy_sha256: str | None
+    decisions_missing: str  # why no decisions are recomputed; empty
+    recorded_by: str | None  # version of this package
+    verified_by: str  # likewise
+    missions: int
+    steps: int
+    checks: list[CheckReport]
+    losses: list[str]  # messages that are part of no step
+    service: dict[str, float | None]  # figures of `core.users.service`, means over the missions
+    # Steps in which the policy of `--policy` decides differently, of those compared; null without it
+    other_policy: tuple[int, int] | None
+
+
+class Verified(NamedTuple):
+    """The result of a verification, and the same as text."""
+
+    report: VerifyReport
+    lines: list[str]
 
 
 class OtherPolicy(DecisionCheck):
@@ -110,14 +160,8 @@ class OtherPolicy(DecisionCheck):
         return [summary, *self._details, *more]
 
 
-def _verify(
-    reader: BagReader, namespace: str, scenario: Scenario, options: argparse.Namespace
-) -> tuple[list[str], bool, bool]:
-    """Recompute the missions in a namespace; raises BagError if nothing can be recomputed.
-
-    Returns the result as text, whether a recorded value differs from the recomputed one, and whether
-    something could not be recomputed.
-    """
+def _verify(reader: BagReader, namespace: str, scenario: Scenario, options: argparse.Namespace) -> Verified:
+    """Recompute the missions in a namespace; raises BagError if nothing can be recomputed."""
     other = OtherPolicy(scenario, policies.load(options.policy)) if options.policy else None
     about, tolerance = reader.about, options.tolerance
     vehicle = step_reader.vehicle(reader, namespace)
@@ -157,8 +201,36 @@ def _verify(
     by = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
     flown = f"{missions}, {n_steps} steps in scenario {scenario.name!r}{by}"
     has_gaps = any(check.skipped for check in checks) or not decisions or bool(losses) or seed is None
-    lines = [flown, *lines, *losses, *(other.lines() if other else [])]
-    return lines, any(check.differing for check in checks), has_gaps
+    differs = any(check.differing for check in checks)
+    report = VerifyReport(
+        bag=printable(str(options.bag)),
+        result="differs" if differs else "verified in part" if has_gaps else "verified",
+        namespace=namespace,
+        scenario=scenario.name,
+        fingerprint=scenario.fingerprint,
+        policy=policy and policy.name,
+        policy_sha256=policy and policy.sha256,
+        decisions_missing=missing_policy,
+        recorded_by=about.get("version"),
+        verified_by=__version__,
+        missions=n_missions,
+        steps=n_steps,
+        checks=[
+            CheckReport(
+                title=check.title,
+                recomputed=check.compared,
+                differing=check.differing,
+                within_tolerance=check.within,
+                not_recomputed=dict(check.skipped),
+                first_difference=check.first and check.first.text,
+            )
+            for check in checks
+        ],
+        losses=losses,
+        service=service.means(),
+        other_policy=(other.differing, other.compared) if other else None,
+    )
+    return Verified(report, [flown, *lines, *losses, *(other.lines() if other else [])])
 
 
 def _check_topics(reader: BagReader, namespace: str) -> None:

@@ -36,9 +36,16 @@ class ServiceSummary:
         self._missions.append(self._totals.service_figures(self._scenario))
         self._totals = MissionTotals()
 
+    def means(self) -> dict[str, float | None]:
+        """The figures; None where no mission has one."""
+        known = {name: [one[name] for one in self._missions if one[name] is not None] for name in FIGURES}
+        return {name: float(np.mean(values)) if values else None for name, values in known.items()}
+
     def lines(self) -> list[str]:
         """The figures as text; nothing where none is known."""
-        age_s, fairness, last = map(self._mean, FIGURES)
+        age_s, fairness, last = (
+            "-" if mean is None else f"{mean:.{_DIGITS[name]}f}" for name, mean in self.means().items()
+        )
         if age_s == "-":
             return []
         n = len(self._missions)
@@ -46,7 +53,3 @@ class ServiceSummary:
             f"users: age of information {age_s} s, fairness {fairness}, last user collected at step {last}"
             + (f" (means of {n} missions)" if n > 1 else "")
         ]
-
-    def _mean(self, name: str) -> str:
-        known = [mission[name] for mission in self._missions if mission[name] is not None]
-        return f"{np.mean(known):.{_DIGITS[name]}f}" if known else "-"

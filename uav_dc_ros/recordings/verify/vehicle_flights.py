@@ -16,6 +16,8 @@ from uav_dc_ros.recordings.verify.recompute import Check, Difference, difference
 class VehicleCheck(Check):
     """Checks the status reports of a real vehicle; `vehicle`: its name in the output."""
 
+    title = "vehicle"
+
     def __init__(self, scenario: Scenario, vehicle: str) -> None:
         super().__init__()
         self._scenario, self._vehicle = scenario, vehicle
