@@ -23,6 +23,7 @@ VERBS = {
     "recover": ("bags.salvage.recover", "make a whole bag of what a killed recorder left"),
     "verify": ("recordings.verify.command", "recompute everything that a bag holds of its missions"),
     "report": ("recordings.report", "write a page about missions, or compare several bags"),
+    "index": ("recordings.index", "make one table of the missions in many bags"),
     "export": ("recordings.export.command", "write missions as tables, or as transitions to learn from"),
 }
 

@@ -157,7 +157,9 @@ def _write_tables(
         n_missions = 0
         with ExitStack() as stack:
             tables = {
-                name: stack.enter_context(new_table(result, name, columns[name], format, about))
+                name: stack.enter_context(
+                    new_table(result / f"{name}.{format}", columns[name], format, about)
+                )
                 for name in names
             }
             for _, mission_steps in groupby(recorded, attrgetter("flight", "mission")):

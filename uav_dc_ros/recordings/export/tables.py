@@ -267,11 +267,8 @@ class Table:
 
 
 @contextmanager
-def new_table(
-    folder: Path, name: str, columns: Columns, format: Format, about: Mapping[str, str]
-) -> Iterator[Table]:
-    """Write a table into `folder/NAME.FORMAT`. Parquet keeps `about` beside its schema."""
-    path = folder / f"{name}.{format}"
+def new_table(path: Path, columns: Columns, format: Format, about: Mapping[str, str]) -> Iterator[Table]:
+    """Write a table. Parquet keeps `about` beside its schema."""
     with closing(_Csv(path, columns) if format == "csv" else _Parquet(path, columns, about)) as file:
         table = Table(file, columns)
         yield table
