@@ -24,6 +24,7 @@ VERBS = {
     "verify": ("recordings.verify.command", "recompute everything that a bag holds of its missions"),
     "report": ("recordings.report", "write a page about missions, or compare several bags"),
     "index": ("recordings.index", "make one table of the missions in many bags"),
+    "video": ("experiments.video", "draw a mission of a bag as GIF or MP4"),
     "export": ("recordings.export.command", "write missions as tables, or as transitions to learn from"),
 }
 

@@ -278,7 +278,7 @@ def _is_within(time_ns: int, start_ns: int | None, end_ns: int | None) -> bool:
 
 
 def _topic(channel: Channel, schema: Schema | None, count: int) -> RecordedTopic:
-    given = {
+    given: dict[str, Any] = {
         "offered_qos": channel.metadata.get("offered_qos_profiles", ""),
         "type_hash": channel.metadata.get("topic_type_hash", ""),
     }

@@ -239,10 +239,10 @@ def _copy_records(sources: Sequence[BagReader], writer: BagWriter) -> None:
     known: set[object] = set()
     for storage in (storage for source in sources for storage in source.storages):
         for record in storage.metadata:
-            key = record.name, *sorted(record.metadata.items())
-            if key not in known:
+            content = record.name, *sorted(record.metadata.items())
+            if content not in known:
                 writer.add_metadata(record.name, record.metadata)
-            known.add(key)
+            known.add(content)
         for attachment in storage.attachments():
             times = attachment.create_time, attachment.log_time
             key = (*times, attachment.name, attachment.media_type, hash(attachment.data))
