@@ -29,7 +29,7 @@ NAMED_MAX = 5  # sources
 
 
 @dataclass(frozen=True, kw_only=True)
-class Output:
+class NewBag:
     """Folder and format of a new bag; see `BagWriter`."""
 
     folder: Path
@@ -40,7 +40,7 @@ class Output:
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `Output`, except `json_channels`."""
+    """Add the options of `NewBag`, except `json_channels`."""
     add, size = parser.add_argument, cli.whole_number(0)
     add("--out", type=Path, required=True, metavar="DIR", help="folder of the new bag")
     add("--compression", choices=COMPRESSIONS, default="zstd", help="of its chunks (default: %(default)s)")
@@ -49,10 +49,10 @@ def add_output(parser: argparse.ArgumentParser) -> None:
     add("--split-s", type=seconds, default=0.0, metavar="S", help="seconds after which its next file begins")
 
 
-def output(options: argparse.Namespace) -> Output:
+def output(options: argparse.Namespace) -> NewBag:
     """The options as `add_output` adds them."""
     names = ("compression", "split_bytes", "split_s")
-    return Output(folder=options.out, **{name: getattr(options, name) for name in names})
+    return NewBag(folder=options.out, **{name: getattr(options, name) for name in names})
 
 
 @dataclass(kw_only=True)
@@ -68,7 +68,7 @@ class _CopiedTopic:
 class BagCopy:
     """A new bag that is being written."""
 
-    def __init__(self, writer: BagWriter, output: Output, topics: Mapping[str, _CopiedTopic]) -> None:
+    def __init__(self, writer: BagWriter, output: NewBag, topics: Mapping[str, _CopiedTopic]) -> None:
         self.unreadable = Unreadable()  # messages on channels for JSON that are no payloads
         self._writer = writer
         self._payloads: dict[str, type[messages.RunPayload]] = {}  # by topic, of those that become JSON
@@ -135,7 +135,7 @@ class BagCopy:
 @contextmanager
 def copying(
     sources: Sequence[BagReader],
-    output: Output,
+    output: NewBag,
     *,
     topics: Collection[str] | None = None,
     about: Mapping[str, str] | None = None,
