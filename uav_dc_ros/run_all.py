@@ -32,8 +32,8 @@ def parser(prog: str = PROG) -> cli.Parser:
     )
     options = cli.Parser(prog=prog, description=description)
     add = options.add_argument
-    scenario = "shipped scenario, or a TOML file (default: %(default)s)"
-    add("--scenario", default="five_clusters", metavar="NAME|FILE", help=scenario)
+    scenario = "shipped scenario, a TOML file, or the random field of a seed (default: %(default)s)"
+    add("--scenario", default="five_clusters", metavar="NAME|FILE|random:SEED", help=scenario)
     policy = "shipped policy, or its folder (default: the scenario's name with '_dueling')"
     add("--policy", metavar="NAME|DIR", help=policy)
     seed = "seed of the users (default: %(default)s)"

@@ -29,7 +29,7 @@ class RunConfig:
     `MissionRunner` checks what depends on this machine.
     """
 
-    scenario: str | Path = "five_clusters"  # name of a shipped scenario, or the path of a TOML file
+    scenario: str | Path = "five_clusters"  # a shipped one, the path of a TOML file, or `random:SEED`
     policy: str | Path | None = None  # shipped policy, or its folder; None: scenario's name with `_dueling`
     seed: int = 0  # seed of the first mission's users; each further mission takes the next one
     missions: int = 1  # number of missions

@@ -23,7 +23,7 @@ def parser() -> cli.Parser:
 
     verb("list", "the shipped scenarios").set_defaults(run=listing.run)
     shown = verb("show", "print a scenario's file")
-    shown.add_argument("scenario", metavar="NAME|FILE")
+    shown.add_argument("scenario", metavar="NAME|FILE|random:SEED")
     shown.set_defaults(run=listing.show)
     make.add_new(verb("new", "write a scenario with a comment for each key"))
     make.add_random(verb("random", "write a scenario of a random field that can be flown"))

@@ -12,10 +12,10 @@ import numpy as np
 from PIL import Image
 
 from uav_dc_ros.agents.policy import load
+from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.env.render import picture
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.experiments.evaluate.evaluation import greedy_act
-from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
 
 OUT = Path(__file__).parents[1] / "mission.gif"
 POLICY, SEED = "five_clusters_dueling", 0

@@ -14,6 +14,7 @@ from tests.support.worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.core.stats import interval
+from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.env.gym_env import DataCollectionEnv
 from uav_dc_ros.experiments.evaluate import cli
 from uav_dc_ros.experiments.evaluate.cli import main
@@ -27,7 +28,7 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     greedy_act,
     rows,
 )
-from uav_dc_ros.experiments.evaluate.rollout import roll_out, rollout_steps
+from uav_dc_ros.experiments.evaluate.rollout import roll_out
 
 
 def command(*arguments):

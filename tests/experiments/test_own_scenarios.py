@@ -21,9 +21,9 @@ from uav_dc_ros.core.keys import leaves
 from uav_dc_ros.core.scenario import Scenario, parse, read_values
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
-from uav_dc_ros.experiments.scenarios import document, field, flyable
 from uav_dc_ros.experiments.scenarios.rate_map import rate_map, scale_bar_m
 from uav_dc_ros.planners import PLANNERS
+from uav_dc_ros.scenarios.generation import document, field, flyable
 
 FIVE = scenarios.find("five_clusters_hover").read_text("utf-8")
 
@@ -79,6 +79,23 @@ def test_equal_seeds_give_equal_bytes_and_others_other_fields() -> None:
     assert text.startswith("# Made by: uav-dc scenario random --seed 5\n")
     assert parse(text, "") == field.at_random(5)
     assert len({field.at_random(seed).fingerprint for seed in range(5)}) == 5
+
+
+def test_a_random_field_has_a_name_everywhere(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    status, made, _ = run(capsys, "random", "--seed", 5)
+    assert (status, made) == (0, scenarios.read("random:5"))
+    assert run(capsys, "show", "random:5")[:2] == (0, made)
+    assert scenarios.load("random:5") == field.at_random(5)
+    status, out, _ = run(capsys, "check", "random:5")
+    assert (status, out.startswith("random:5: ")) == (0, True)
+    monkeypatch.chdir(tmp_path)
+    names = ("random:5", "farm", "own.toml", "random:x")
+    assert [scenarios.from_anywhere(one) for one in names] == [
+        *names[:2],
+        *(str(tmp_path / one) for one in names[2:]),
+    ]
 
 
 def test_what_is_given_is_not_drawn() -> None:

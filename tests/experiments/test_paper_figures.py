@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 
 from tests.experiments.paper_sweeps import of_the_data_of_the_step, realistic
 from uav_dc_ros import scenarios
+from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.env.trajectory import Trajectory
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
 from uav_dc_ros.experiments.paper.figures import draw, drawable
 from uav_dc_ros.experiments.paper.plan import FIGURES, runs
 from uav_dc_ros.experiments.paper.setting import FULL, SMOKE

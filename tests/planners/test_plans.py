@@ -8,8 +8,9 @@ import pytest
 from tests.support.worlds import changed
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.experiments.evaluate.cli import main
-from uav_dc_ros.experiments.evaluate.rollout import roll_out, rollout_steps
+from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.planners import ENOUGH, EXACT_TOUR_MAX, PLANNERS
 
 SEEDS = range(20)

@@ -324,13 +324,17 @@ def test_an_unreadable_file(tmp_path):
     assert refusal(path).startswith("cannot be read: ")
 
 
-@pytest.mark.parametrize("wanted", ["six_clusters", "missing/mine.toml", "", "Three_Clusters", "a\0b"])
+@pytest.mark.parametrize(
+    "wanted",
+    ["six_clusters", "missing/mine.toml", "", "Three_Clusters", "a\0b", "random:", "random:-1", "random:1e3"],
+)
 def test_no_such_name_or_file(wanted):
     with pytest.raises(ScenarioError) as caught:
         scenarios.load(wanted)
     assert str(caught.value) == (
         f"scenario {wanted!r}: no such name or file; expected one of farm, five_clusters, "
-        "five_clusters_hover, three_clusters, three_clusters_hover, town, or the path of a TOML file"
+        "five_clusters_hover, three_clusters, three_clusters_hover, town, random:SEED with a whole number, "
+        "or the path of a TOML file"
     )
 
 

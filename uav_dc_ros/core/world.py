@@ -4,9 +4,11 @@ Within a step, in this order: the UAV moves, the users walk, then rates hold for
 collected. The ROS nodes compose the same functions, split over processes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import TypeAlias
+
+import numpy as np
 
 from uav_dc_ros.core import channel, energy, mission, mobility, observations, radio, reward
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
@@ -57,6 +59,8 @@ class Outcome:
 
 # An action (its value) for each world, integers `[...]`, from their state `[...]`.
 Act: TypeAlias = Callable[[State], Array]
+# Of each run: the draws of its users' start, `[U, D]`, or None for those of the mission's seed.
+Layouts: TypeAlias = Sequence[Array | None]
 
 
 def initial(scenario: Scenario, draws: Array) -> State:
@@ -256,6 +260,42 @@ def select(where: Array, chosen: State, other: State) -> State:
         return xp.where(xp.reshape(where, (*where.shape, *(1,) * (a.ndim - where.ndim))), a, b)
 
     return State(**{f.name: pick(getattr(chosen, f.name), getattr(other, f.name)) for f in fields(State)})
+
+
+def rollout_steps(
+    scenario: Scenario,
+    act: Act,
+    seeds: Sequence[int],
+    layouts: Layouts = (),
+    rewards: Rewards | None = None,
+    transmitting: Array | None = None,
+) -> Iterator[tuple[State, Outcome | None]]:
+    """The S missions of `seeds` step by step: first their start, without an outcome, then every step.
+
+    Seed s draws from `numpy.random.default_rng(s)`: `(U, D)` numbers for the start, then `(U, D)` for each
+    step, see `Scenario.draws_shape`. The environment and the ROS nodes do the same: seed s is the same
+    mission everywhere.
+
+    With the `layouts` of R runs, each run flies all missions: `[R, S]`, otherwise `[S]`. `rewards` are the
+    reward settings of each run, `[R, 1]`; default: the scenario's. `transmitting`: the users that send in
+    each mission, bool `[S, U]`; None: all.
+    """
+    runs = (len(layouts),) if layouts else ()
+    rngs = [np.random.default_rng(seed) for seed in seeds]
+
+    def draws() -> Array:
+        one = np.stack([rng.random(scenario.draws_shape) for rng in rngs])
+        return np.broadcast_to(one, (*runs, *one.shape))
+
+    start = draws().copy()
+    for run, own in enumerate(layouts):
+        if own is not None:
+            start[run] = own
+    state = initial(scenario, start)
+    yield state, None
+    for _ in range(scenario.mission.max_steps):
+        state, outcome = step(scenario, state, act(state), draws(), rewards, transmitting)
+        yield state, outcome
 
 
 class BatchWorld:

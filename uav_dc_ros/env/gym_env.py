@@ -60,7 +60,7 @@ class DataCollectionEnv(gymnasium.Env[Array, np.int64]):
         At the end of a mission also mean_age_s, fairness and last_collected_step, see `core.users.service`.
 
     Args:
-        scenario: a shipped name, the path of a TOML file, or a Scenario.
+        scenario: a shipped name, the path of a TOML file, `random:SEED`, or a Scenario.
         observation: `position`, `mission`, `map` or `energy`.
         render_mode: None, or `rgb_array`: a picture of the mission so far, `[H, W, 3]` uint8.
 

@@ -255,11 +255,8 @@ class MissionRunner:
     def _parameters(self, folder: Path) -> dict[str, dict[str, object]]:
         """ROS parameters of the nodes to start."""
         config = self.config
-        scenario = str(config.scenario)
-        if scenario not in scenarios.names():
-            scenario = str(Path(scenario).absolute())
         values: dict[str, object] = {
-            "scenario": scenario,
+            "scenario": scenarios.from_anywhere(config.scenario),
             "policy": str(self.policy.folder.absolute()),
             "seed": config.seed,
             "missions": config.missions,

@@ -1,5 +1,11 @@
-"""The shipped scenario files, and the loader of any scenario."""
+"""The shipped scenario files, and the loader of any scenario.
 
+A scenario is named by the name of a shipped one, by the path of a TOML file, or as `random:SEED`: the random
+field of a seed, as the command `scenario random --seed SEED` writes it.
+"""
+
+import importlib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +18,8 @@ from uav_dc_ros.scenarios.user_files import with_users
 from uav_dc_ros.scenarios.zone_files import with_zones
 
 FOLDER = Path(__file__).parent
+RANDOM = "random:"  # before the seed of a random field
+_RANDOM_FIELD = re.compile(rf"{RANDOM}([0-9]{{1,18}})")
 
 
 def names() -> list[str]:
@@ -40,22 +48,34 @@ def find(name_or_path: str | Path) -> Path:
     if not path.is_file():
         raise ScenarioError(
             f"scenario {str(name_or_path)!r}: no such name or file; expected one of {', '.join(names())}, "
-            "or the path of a TOML file"
+            f"{RANDOM}SEED with a whole number, or the path of a TOML file"
         )
     return path
 
 
+def folder(name_or_path: str | Path) -> Path:
+    """The folder to which the files that a scenario names are relative; raises ScenarioError as `find`."""
+    return Path() if _seed(name_or_path) is not None else find(name_or_path).parent
+
+
+def from_anywhere(name_or_path: str | Path) -> str:
+    """The same scenario for a process in another folder: its name, or the absolute path of its file."""
+    text = str(name_or_path)
+    return text if text in names() or _seed(text) is not None else str(Path(text).absolute())
+
+
 def load(name_or_path: str | Path) -> Scenario:
-    """The scenario with a shipped name, or in the TOML file at a path, with the users of `users.file`
-    and the obstacles of `zones`.
+    """The scenario with a shipped name, of a random field, or in the TOML file at a path, with the users of
+    `users.file` and the obstacles of `zones`.
 
     Raises:
         ScenarioError: no such name or file, or a file that `core.scenario.parse`, `user_files` or
             `zone_files` rejects.
+        ParameterError: no field of the seed can be flown.
     """
     source = str(name_or_path)
     values = read_values(read(name_or_path), source)
-    return from_values(with_files(values, find(name_or_path).parent, source), source)
+    return from_values(with_files(values, folder(name_or_path), source), source)
 
 
 def with_files(values: dict[str, Any], folder: Path, source: str) -> dict[str, Any]:
@@ -68,8 +88,22 @@ def with_files(values: dict[str, Any], folder: Path, source: str) -> dict[str, A
 
 
 def read(name_or_path: str | Path) -> str:
-    """The text of a scenario's TOML file; raises ScenarioError for one that cannot be found or read."""
+    """The text of a scenario's TOML file; raises ScenarioError for one that cannot be found or read.
+
+    Also ParameterError, see `load`.
+    """
+    if (seed := _seed(name_or_path)) is not None:
+        # By its name: otherwise whatever trains in a scenario would depend on the code that draws fields.
+        generation = importlib.import_module("uav_dc_ros.scenarios.generation.random_field")
+        text: str = generation.text(seed)
+        return text
     try:
         return find(name_or_path).read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{name_or_path}: cannot be read: {error}") from None
+
+
+def _seed(name_or_path: str | Path) -> int | None:
+    """The seed of a random field; None: it is none."""
+    match = _RANDOM_FIELD.fullmatch(str(name_or_path))
+    return int(match[1]) if match else None

@@ -72,7 +72,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--policy", nargs="+", required=True, metavar="NAME|DIR", help=text)
     text = f"every policy flies in each; shipped: {', '.join(scenarios.names())}; "
     text += "default: by the name of the policy's own"
-    add("--scenario", nargs="+", default=[], metavar="NAME|FILE", help=text)
+    add("--scenario", nargs="+", default=[], metavar="NAME|FILE|random:SEED", help=text)
     add("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
     text = "w of the objective J: 1 counts the users only, 0 the time only; default 10/11"
     weight = cli.number(0.0, 1.0, EXPECTED_WEIGHT)

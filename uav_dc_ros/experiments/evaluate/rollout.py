@@ -1,13 +1,8 @@
-"""Missions flown side by side, one per seed, in numpy: the evaluation of every policy.
+"""Missions flown side by side to their end, one per seed, in numpy: the evaluation of every policy."""
 
-Seed s draws from `numpy.random.default_rng(s)`: `(U, D)` numbers for the start, then `(U, D)` for each step;
-`Scenario.draws_shape` has both.
-The environment and the ROS nodes do the same: seed s is the same mission everywhere.
-"""
-
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -17,11 +12,8 @@ from uav_dc_ros.core.objective import DEFAULT_WEIGHT, objective
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.users.service import ServiceRecord
-from uav_dc_ros.core.world import Act
+from uav_dc_ros.core.world import Act, Layouts, rollout_steps
 from uav_dc_ros.env.trajectory import Trajectory
-
-# Of each run: the draws of its users' start, `[U, D]`, or None for those of the mission's seed.
-Layouts: TypeAlias = Sequence[Array | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,38 +46,6 @@ class Missions:
             max_steps=scenario.mission.max_steps,
             weight=weight,
         )
-
-
-def rollout_steps(
-    scenario: Scenario,
-    act: Act,
-    seeds: Sequence[int],
-    layouts: Layouts = (),
-    rewards: Rewards | None = None,
-    transmitting: Array | None = None,
-) -> Iterator[tuple[world.State, world.Outcome | None]]:
-    """The S missions of `seeds` step by step: first their start, without an outcome, then every step.
-
-    With the `layouts` of R runs, each run flies all missions: `[R, S]`, otherwise `[S]`. `rewards` are the
-    reward settings of each run, `[R, 1]`; default: the scenario's. `transmitting`: the users that send in
-    each mission, bool `[S, U]`; None: all.
-    """
-    runs = (len(layouts),) if layouts else ()
-    rngs = [np.random.default_rng(seed) for seed in seeds]
-
-    def draws() -> Array:
-        one = np.stack([rng.random(scenario.draws_shape) for rng in rngs])
-        return np.broadcast_to(one, (*runs, *one.shape))
-
-    start = draws().copy()
-    for run, own in enumerate(layouts):
-        if own is not None:
-            start[run] = own
-    state = world.initial(scenario, start)
-    yield state, None
-    for _ in range(scenario.mission.max_steps):
-        state, outcome = world.step(scenario, state, act(state), draws(), rewards, transmitting)
-        yield state, outcome
 
 
 def roll_out(

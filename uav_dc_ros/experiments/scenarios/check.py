@@ -12,8 +12,9 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.keys import path_of
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import PolicyError
-from uav_dc_ros.experiments.scenarios import flyable, listing
-from uav_dc_ros.experiments.scenarios.flyable import Flyable
+from uav_dc_ros.experiments.scenarios import listing
+from uav_dc_ros.scenarios.generation import flyable
+from uav_dc_ros.scenarios.generation.flyable import Flyable
 from uav_dc_ros.scenarios.lines import Lines
 from uav_dc_ros.scenarios.problems import Problem, find, line_of
 
@@ -23,7 +24,7 @@ CLUSTERS_MAX = 30  # listed one by one
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.add_argument("scenario", metavar="FILE|NAME")
+    parser.add_argument("scenario", metavar="FILE|NAME|random:SEED")
     json = "JSON instead, into a file or to the output"
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help=json)
     parser.set_defaults(run=run)
@@ -33,7 +34,7 @@ def run(options: argparse.Namespace) -> int:
     """Print what a check of a scenario's file finds; the exit status."""
     name, json = options.scenario, options.json
     text = scenarios.read(name)
-    scenario, problems = find(text, scenarios.find(name).parent)
+    scenario, problems = find(text, scenarios.folder(name))
     found: dict[str, Any] = {"file": name, "valid": scenario is not None}
     if scenario is not None:
         examined = flyable.examine(scenario)

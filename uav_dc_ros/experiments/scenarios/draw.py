@@ -12,7 +12,7 @@ FORMATS = (".png", ".html")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.add_argument("scenario", metavar="FILE|NAME")
+    parser.add_argument("scenario", metavar="FILE|NAME|random:SEED")
     out = "a picture (.png) or a page (.html), which replaces an existing file"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=out)
     parser.set_defaults(run=run)

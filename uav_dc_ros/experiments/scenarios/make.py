@@ -13,11 +13,11 @@ import msgspec
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
-from uav_dc_ros.experiments.scenarios import document, field, listing
+from uav_dc_ros.experiments.scenarios import listing
 from uav_dc_ros.scenarios import user_files, zone_files
+from uav_dc_ros.scenarios.generation import document, field
 
 CLUSTERS, USERS, SIZE_M = 5, 10, (1000.0, 1000.0)  # those of the shipped field
-UNITS = "x is east, y is north, altitude is above the users. A key ends in its unit. Every key is checked."
 
 
 def add_new(parser: argparse.ArgumentParser) -> None:
@@ -109,8 +109,7 @@ def _write(options: argparse.Namespace, make: Callable[[], Scenario], given: str
             raise ParameterError(f"{path} exists; expected a new file")
         files.check_writable(path)
     scenario = make()
-    header = f"Made by: uav-dc scenario {options.verb}{given}\n{UNITS}"
-    text = document.text(scenario, header, **names)
+    text = document.text(scenario, document.header(f"{options.verb}{given}"), **names)
     if path is None:
         sys.stdout.write(text)
     else:

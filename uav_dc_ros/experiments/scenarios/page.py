@@ -8,9 +8,9 @@ import numpy as np
 from uav_dc_ros import __version__
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ScenarioError
-from uav_dc_ros.experiments.scenarios import flyable
 from uav_dc_ros.experiments.scenarios.rate_map import rate_map, scale_bar_m
 from uav_dc_ros.recordings.pages.page import Page, world_data
+from uav_dc_ros.scenarios.generation import flyable
 
 USERS_MAX = 5000  # drawn
 

@@ -14,9 +14,9 @@ from uav_dc_ros.core import channel
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.render import BUILDING, DOCK, FAINT, INK, NO_FLY, PAPER, WAITING
-from uav_dc_ros.experiments.scenarios import flyable
 from uav_dc_ros.experiments.scenarios.rate_map import Layer, RateMap, rate_map, scale_bar_m
 from uav_dc_ros.recordings.thinning import spread
+from uav_dc_ros.scenarios.generation import flyable
 
 PANELS_MAX = 4
 PANEL_IN = 4.6  # width of a panel, inches

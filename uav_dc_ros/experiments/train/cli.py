@@ -81,7 +81,8 @@ def options_parser() -> cli.Parser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    add("--scenario", required=True, metavar="NAME|FILE", help=f"shipped: {', '.join(scenarios.names())}")
+    text = f"shipped: {', '.join(scenarios.names())}"
+    add("--scenario", required=True, metavar="NAME|FILE|random:SEED", help=text)
     add("--algo", required=True, choices=get_args(Algorithm), help="the paper's algorithm 1 or 2")
     add("--out", required=True, type=Path, metavar="DIR", help="folder to make, such as policies/NAME")
     add("--observation", default="mission", choices=get_args(Observation), help="what the agent sees")

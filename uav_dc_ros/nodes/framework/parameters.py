@@ -114,7 +114,9 @@ COMMON = (
 )
 
 # Of the nodes of a mission.
-SCENARIO = Parameter("scenario", "five_clusters", "name of a shipped scenario, or path of a TOML file")
+SCENARIO = Parameter(
+    "scenario", "five_clusters", "name of a shipped scenario, path of a TOML file, or random:SEED"
+)
 SCENARIO_OF_POLICY = Parameter("scenario", "", "scenario of the mission; empty: the policy's own")
 POLICY = Parameter("policy", "five_clusters_dueling", "name of a shipped policy, or its folder")
 RECORDED_POLICY = Parameter("policy", "", "policy that flies, by name or folder; empty: not known")

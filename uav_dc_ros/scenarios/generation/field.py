@@ -25,7 +25,7 @@ from uav_dc_ros.core.obstacles import Obstacle
 from uav_dc_ros.core.obstacles.prisms import blocks
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import ParameterError
-from uav_dc_ros.experiments.scenarios import flyable
+from uav_dc_ros.scenarios.generation import flyable
 
 SHIPPED = "five_clusters_hover"
 CLUSTERS_MAX, USERS_MAX = 50, 1000  # clusters, and users of one

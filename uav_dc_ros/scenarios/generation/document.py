@@ -9,6 +9,7 @@ import numpy as np
 
 from uav_dc_ros.core.scenario import Scenario
 
+UNITS = "x is east, y is north, altitude is above the users. A key ends in its unit. Every key is checked."
 WIDTH = 100  # of a line with a comment beside the value
 COMMENTS = {
     "name": "names the world in bags, policies and reports: a to z, 0 to 9 and _",
@@ -67,10 +68,15 @@ ENERGY = """
 """
 
 
+def header(arguments: str) -> str:
+    """The first comment of a file that `uav-dc scenario` made with these arguments."""
+    return f"Made by: uav-dc scenario {arguments}\n{UNITS}"
+
+
 def text(
-    scenario: Scenario, header: str = "", users_file: str | None = None, zones_file: str | None = None
+    scenario: Scenario, comment: str = "", users_file: str | None = None, zones_file: str | None = None
 ) -> str:
-    """The file's text, which `scenario.parse` reads as the same scenario; `header` is its first comment.
+    """The file's text, which `scenario.parse` reads as the same scenario; `comment` comes first.
 
     With `users_file` or `zones_file` the text names that file instead of the users or obstacles in it.
     """
@@ -80,7 +86,7 @@ def text(
         values["users"] = {"file": users_file, **others}
     if zones_file is not None:
         values = {key: value for key, value in values.items() if key != "obstacles"} | {"zones": zones_file}
-    lines = [*(f"# {line}".rstrip() for line in header.splitlines()), *([""] if header else [])]
+    lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), *([""] if comment else [])]
     lines += _table(values, ())
     return "\n".join(lines) + "\n" + ("" if scenario.energy else ENERGY)
 

@@ -17,8 +17,7 @@ from uav_dc_ros.core import mission, observations, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.obstacles import UNREACHABLE, moves_to_dock
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.core.world import Act
-from uav_dc_ros.experiments.evaluate.rollout import rollout_steps
+from uav_dc_ros.core.world import Act, rollout_steps
 
 SEEDS = range(10)
 DISC_POINTS = 500  # of a disc, of equal area each

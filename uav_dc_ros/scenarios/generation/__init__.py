@@ -1,0 +1,1 @@
+"""Scenarios that are made: fields from a few numbers, their check, and their text."""
