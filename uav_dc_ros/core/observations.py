@@ -6,6 +6,7 @@ mission    position; remaining steps; for each cluster the share of users collec
            of users collected: 4 + 4 M + n_x + n_y + n_z numbers
 map        mission, and the vector from the UAV to each cluster's centre and to the dock: 2 M + 2 more
 energy     mission, and the battery's state of charge: 1 more; only in a scenario with a table `energy`
+entities   the clusters as a set, for policies that fly in fields they have not seen: see `core.entities`
 
 One-hot cells and closeness add no information. They spare a small network the work of deriving "this cell
 only" and "here, while users remain" from scaled indices. Closeness is a Gaussian of the horizontal distance
@@ -19,22 +20,26 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from uav_dc_ros.core import entities
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
 from uav_dc_ros.core.energy import state_of_charge
 from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.users.clusters import cluster_means as cluster_means
 
-Observation: TypeAlias = Literal["position", "mission", "map", "energy"]
+Observation: TypeAlias = Literal["position", "mission", "map", "energy", "entities"]
 
 
 def problem(kind: Observation, scenario: Scenario) -> str | None:
     """Why a scenario has no such observation; None: it has."""
     if kind == "energy" and scenario.energy is None:
         return f"the observation 'energy' in scenario {scenario.name!r}; expected a scenario with [energy]"
-    return None
+    return entities.problem(scenario) if kind == "entities" else None
 
 
 def size(kind: Observation, scenario: Scenario) -> int:
     """Length D of the encoding."""
+    if kind == "entities":
+        return entities.size(scenario)
     n_clusters = scenario.n_clusters
     mission = 4 + 4 * n_clusters + sum(scenario.grid.shape)
     sizes = {"position": 3, "mission": mission, "map": mission + 2 * n_clusters + 2, "energy": mission + 1}
@@ -43,6 +48,8 @@ def size(kind: Observation, scenario: Scenario) -> int:
 
 def bounds(kind: Observation, scenario: Scenario) -> tuple[Array, Array]:
     """Minimum and maximum of each entry of the encoding, float32 `[D]` each."""
+    if kind == "entities":
+        return entities.bounds(scenario)
     low, high = np.zeros(size(kind, scenario), np.float32), np.ones(size(kind, scenario), np.float32)
     if kind == "map":
         goals = np.asarray(scenario.goals_cells, np.float32)
@@ -62,12 +69,24 @@ def encode(
     data_bits: Array,
     collected: Array,
     energy_used_j: Array | None = None,
+    weight: Array | float | None = None,
 ) -> Array:
     """The observation of a mission, float32 `[..., D]` with D = `size(kind, scenario)`.
 
     `cell` `[..., 3]`, `step` `[...]`, `data_bits` and `collected` `[..., U]` are those of `world.State`, as
-    is `energy_used_j` `[...]`, which only `energy` needs.
+    is `energy_used_j` `[...]`, which `energy` needs, and `entities` in a scenario with a battery. `weight` is
+    w of the objective, a number or `[...]`, which only `entities` reads; None: `objective.DEFAULT_WEIGHT`.
     """
+    if kind == "entities":
+        return entities.encode(
+            scenario,
+            cell=cell,
+            step=step,
+            data_bits=data_bits,
+            collected=collected,
+            energy_used_j=energy_used_j,
+            weight=weight,
+        )
     xp = array_namespace(cell)
     cell_f = xp.astype(cell, xp.float32)
     span = constant(_spans(scenario), cell_f)
@@ -114,29 +133,3 @@ def _spans(scenario: Scenario) -> tuple[int, ...]:
 def _one_hot_entries(shape: tuple[int, int, int]) -> tuple[tuple[int, ...], ...]:
     """Direction (0 east, 1 north, 2 up) and index of each one-hot entry."""
     return tuple(zip(*((i, index) for i, n in enumerate(shape) for index in range(n)), strict=True))
-
-
-def cluster_means(scenario: Scenario, per_user: Array) -> Array:
-    """Mean over the users of each cluster: `[..., U]` to `[..., M]`."""
-    sizes, leading = scenario.users.sizes, per_user.shape[:-1]
-    if len(set(sizes)) == 1:
-        return per_user.reshape((*leading, len(sizes), sizes[0])).sum(axis=-1) / sizes[0]
-    xp, means = array_namespace(per_user), []
-    whole = xp.astype(per_user.reshape((-1,))[:1], xp.int64)
-    users_by_size, order = _by_size(sizes)
-    for size, users in users_by_size:
-        of_size = xp.take(per_user, constant(users, whole), axis=-1)
-        means.append(of_size.reshape((*leading, -1, size)).sum(axis=-1) / size)
-    return xp.take(xp.concat(means, axis=-1), constant(order, whole), axis=-1)
-
-
-@cache
-def _by_size(sizes: tuple[int, ...]) -> tuple[tuple[tuple[int, tuple[int, ...]], ...], tuple[int, ...]]:
-    """The users of all clusters of each size, and the place of each cluster among these clusters."""
-    starts = np.cumsum([0, *sizes])
-    clusters = {size: [i for i, n in enumerate(sizes) if n == size] for size in dict.fromkeys(sizes)}
-    users = tuple(
-        (size, tuple(int(starts[i]) + k for i in of_size for k in range(size)))
-        for size, of_size in clusters.items()
-    )
-    return users, tuple(np.argsort([i for of_size in clusters.values() for i in of_size]).tolist())

@@ -13,7 +13,7 @@ import reprlib
 import tomllib
 from collections.abc import Iterator
 from functools import cache, cached_property
-from typing import Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -31,6 +31,9 @@ from uav_dc_ros.core.pace import TIME_MAX_S
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.core.users.settings import UserSettings
 from uav_dc_ros.errors import ScenarioError, UnknownKeyError
+
+if TYPE_CHECKING:
+    from uav_dc_ros.core.entities.tables import EntityTables
 
 EpisodeEnd: TypeAlias = Literal["at_time_limit", "on_arrival"]
 
@@ -174,6 +177,13 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
     def buildings(self) -> Buildings | None:
         """The buildings, which cut lines of sight; None: there are none."""
         return Buildings(self.obstacles) if any(one.kind == "building" for one in self.obstacles) else None
+
+    @cached_property
+    def entity_tables(self) -> "EntityTables":
+        """What the observation `entities` looks up."""
+        from uav_dc_ros.core.entities.tables import EntityTables  # whose world has a scenario
+
+        return EntityTables(self)
 
     @property
     def ends_at_any_step(self) -> bool:

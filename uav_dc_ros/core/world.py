@@ -225,8 +225,10 @@ def step(
     )
 
 
-def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
-    """The observation of a state, float32 `[..., D]`; see `observations.encode`."""
+def observe(
+    kind: Observation, scenario: Scenario, state: State, weight: Array | float | None = None
+) -> Array:
+    """The observation of a state, float32 `[..., D]`; `weight` as in `observations.encode`."""
     return observations.encode(
         kind,
         scenario,
@@ -235,6 +237,7 @@ def observe(kind: Observation, scenario: Scenario, state: State) -> Array:
         data_bits=state.data_bits,
         collected=state.collected,
         energy_used_j=state.energy_used_j,
+        weight=weight,
     )
 
 
@@ -315,6 +318,6 @@ class BatchWorld:
         """Restart the worlds in `where` (bool `[N]`) from their part of `draws` `[N, U, D]`."""
         self.state = select(where, initial(self.scenario, draws), self.state)
 
-    def observe(self, kind: Observation) -> Array:
-        """The observation of each world, float32 `[N, D]`."""
-        return observe(kind, self.scenario, self.state)
+    def observe(self, kind: Observation, weight: Array | float | None = None) -> Array:
+        """The observation of each world, float32 `[N, D]`; `weight` as in `observations.encode`."""
+        return observe(kind, self.scenario, self.state, weight)
