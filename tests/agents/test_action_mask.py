@@ -41,7 +41,7 @@ def test_training_takes_and_expects_valid_actions_only():
     training = Training(population(scenario, run(scenario)), torch.device("cpu"))
     training.fly_episode()
     batch = training._buffer.sample(torch.linspace(0, 0.999, 8)[None])
-    mask = action_mask(scenario)
+    mask = action_mask(scenario, "mission")
     assert mask(batch.observation).gather(-1, batch.action[..., None]).all()
     learner, expected = training.learner, []
     next_q = learner._q(learner._forward(learner._theta_target, batch.next_observation)[-1]).mT[0]

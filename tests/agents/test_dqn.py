@@ -26,7 +26,9 @@ MIXED = [
 
 def member(dueling, values, seed, hidden=(16,)):
     architecture = Architecture(n_inputs=3, hidden=hidden, n_actions=4, dueling=dueling)
-    return Member(architecture, Hyperparameters(**values), np.random.default_rng(seed))
+    settings = Hyperparameters(**values)
+    double = settings.gamma >= 0.9  # three of the mixed runs
+    return Member(architecture, settings, np.random.default_rng(seed), double)
 
 
 def members(hidden=(16,), mixed=MIXED, **values):
@@ -53,7 +55,7 @@ def batches(n, mixed=MIXED):
 
 def of_run(batch, run, n_rows):
     """The first rows of a run's share of a mini-batch, without the dimension of the runs."""
-    return TransitionBatch(*(values[run, :n_rows] for values in batch))
+    return TransitionBatch(*(values[run, :n_rows] for values in batch[:5]))
 
 
 class Written:
@@ -79,7 +81,11 @@ class Written:
         q = network.q_values(architecture, self.theta, batch.observation.double())
         taken = q[torch.arange(len(batch.action)), batch.action]
         next_q = network.q_values(architecture, self.target, batch.next_observation.double())
-        future = torch.where(batch.terminated, 0.0, next_q.max(-1).values)
+        chosen = next_q
+        if self.member.double:
+            chosen = network.q_values(architecture, self.theta, batch.next_observation.double())
+        future = next_q.gather(-1, chosen.argmax(-1, keepdim=True))[:, 0]
+        future = torch.where(batch.terminated, 0.0, future.detach())
         return torch.mean((batch.reward.double() + values.gamma * future - taken) ** 2)
 
     def update(self, batch):
@@ -216,7 +222,7 @@ def test_a_run_learns_the_same_alone():
         alone = Learner(members(target_every=7)[run : run + 1], CPU)
         size = MIXED[run][1]["batch_size"]
         for batch in batches(30):
-            alone.update(TransitionBatch(*(values[run : run + 1, :size] for values in batch)))
+            alone.update(TransitionBatch(*(values[run : run + 1, :size] for values in batch[:5])))
         for name, values in alone.parameters(0).items():
             np.testing.assert_allclose(values, together.parameters(run)[name], rtol=1e-4, atol=1e-6)
 
@@ -235,7 +241,7 @@ def test_rows_beyond_a_run_s_batch_size_count_for_nothing():
     made, disturbed = Learner(members(), CPU), Learner(members(), CPU)
     for batch in batches(5):
         made.update(batch)
-        other = TransitionBatch(*(values.clone() for values in batch))
+        other = TransitionBatch(*(values.clone() for values in batch[:5]))
         for run, (_, values) in enumerate(MIXED):
             other.reward[run, values["batch_size"] :] = 1e6
             other.observation[run, values["batch_size"] :] = 7.0

@@ -21,7 +21,7 @@ def transitions(value, n_runs=2):
 def filled(n, capacity=10):
     buffer = ReplayBuffer(2, capacity, 3, torch.device("cpu"))
     for value in range(n):
-        buffer.add(transitions(value))
+        buffer.add(transitions(value), torch.zeros(2, dtype=torch.bool))
     return buffer
 
 
@@ -66,12 +66,34 @@ def test_a_restored_buffer_holds_the_same_in_the_same_places(n):
     draws = torch.rand((2, 40), generator=torch.Generator().manual_seed(0))
     for value in range(n, n + 12):
         for one in (buffer, restored):
-            one.add(transitions(value))
+            one.add(transitions(value), torch.zeros(2, dtype=torch.bool))
         assert len(buffer) == len(restored)
-        for expected, found in zip(buffer.sample(draws), restored.sample(draws), strict=True):
+        for expected, found in zip(buffer.sample(draws)[:5], restored.sample(draws)[:5], strict=True):
             assert torch.equal(expected, found)
 
 
 def test_what_it_hands_out_is_only_what_it_holds():
     assert filled(4).state()["rows"].shape == (2, 4, 9)
     assert filled(23).state()["rows"].shape == (2, 10, 9)
+
+
+@pytest.mark.parametrize("n_added", [7, 16, 23])
+@pytest.mark.parametrize("n_steps", [2, 4])
+def test_n_step_returns_are_sums_up_to_the_end_of_a_mission_or_of_what_is_stored(n_added, n_steps):
+    gamma, over_at = torch.tensor([[0.5], [0.9]]), {2, 9, 14, 20}
+    buffer = ReplayBuffer(2, 10, 3, torch.device("cpu"), n_steps, gamma)
+    for value in range(n_added):
+        buffer.add(transitions(value), torch.tensor([value in over_at, value + 1 in over_at]))
+    batch = buffer.sample(every_slot(buffer))
+    for run in range(2):
+        for i, first in enumerate((batch.observation[run, :, 0] - 1000.0 * run).int().tolist()):
+            steps = [first]
+            while len(steps) < n_steps and steps[-1] + run not in over_at and steps[-1] + 1 < n_added:
+                steps.append(steps[-1] + 1)
+            discounts = gamma[run].item() ** torch.arange(len(steps))
+            rewards = torch.tensor(steps) + 1000.0 * run
+            assert batch.reward[run, i].item() == pytest.approx((discounts * rewards).sum().item())
+            assert batch.discount[run, i].item() == pytest.approx(gamma[run].item() ** len(steps))
+            assert batch.next_observation[run, i, 0].item() == steps[-1] + 1000.0 * run + 0.5
+            assert batch.terminated[run, i].item() == (steps[-1] % 2 == 1)
+            assert batch.action[run, i].item() == first + 1000 * run

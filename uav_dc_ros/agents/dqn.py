@@ -35,11 +35,14 @@ def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, gamma: float |
 
 
 class Member(NamedTuple):
-    """A run of the learner. All runs have equal sizes; `dueling` and the hyperparameters may differ."""
+    """A run of the learner. All runs have equal sizes; everything else may differ."""
 
     architecture: network.Architecture
     hyperparameters: Hyperparameters
     rng: np.random.Generator
+    # Whether the network itself chooses the action at s' of which the target network gives the value: van
+    # Hasselt et al., "Deep Reinforcement Learning with Double Q-learning", AAAI 2016
+    double: bool = False
 
 
 class Learner:
@@ -71,6 +74,8 @@ class Learner:
         self._dueling = column([float(kind is not None) for kind in kinds])
         self._subtracts_max = column([float(kind == "max") for kind in kinds]) > 0
         self._any_dueling, self._any_max = any(kinds), "max" in kinds
+        self._double = column([float(member.double) for member in members])[..., None] > 0
+        self._any_double = any(member.double for member in members)
         sizes = [values.batch_size for values in settings]
         # Twice the weight of each row in its run's mean (the gradient of a square); 0 beyond the batch size.
         rows = torch.arange(max(sizes), device=device)
@@ -127,7 +132,11 @@ class Learner:
         """One gradient step on a mini-batch `[N, B, ...]`; returns each run's loss before the step, `[N]`."""
         next_q = self._q(self._forward(self._theta_target, batch.next_observation)[-1]).mT
         next_q = self._masked(next_q, batch.next_observation)
-        y = td_target(batch.reward, batch.terminated, next_q, self._gamma)
+        if self._any_double:
+            chosen = self.greedy(batch.next_observation)[..., None]
+            next_q = torch.where(self._double, next_q.gather(-1, chosen), next_q)
+        gamma = self._gamma if batch.discount is None else batch.discount
+        y = td_target(batch.reward, batch.terminated, next_q, gamma)
         *features, head = self._forward(self._theta, batch.observation)
         action = batch.action[:, None]  # [N, 1, B], as the head is [N, 1 + A, B]
         error = self._q(head).gather(1, action)[:, 0] - y

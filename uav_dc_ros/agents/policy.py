@@ -14,26 +14,26 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 import numpy as np
 import safetensors.numpy
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 from safetensors import SafetensorError
 
 from uav_dc_ros import files, scenarios
-from uav_dc_ros.agents import network
+from uav_dc_ros.agents import network, set_network
+from uav_dc_ros.agents.set_network import SetArchitecture
+from uav_dc_ros.agents.set_policy import NAME, Count, Probability, SetPolicyConfig
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.entities.encoding import FEATURES, allowed
 from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import PolicyError, ScenarioError
 
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z"
 NAME_IN_WORDS = "at most 64 letters (a to z, A to Z), digits, '_', '.' and '-', a letter or digit first"
 CONFIG, MODEL, CARD = "config.json", "model.safetensors", "README.md"
 LEARNING_CURVE, TRAJECTORY = "learning_curve.png", "trajectory.png"
 
-Algorithm: TypeAlias = Literal["dqn", "dueling_dqn"]
-Count: TypeAlias = Annotated[int, Meta(ge=1)]
-Probability: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
+Algorithm: TypeAlias = Literal["dqn", "dueling_dqn", "double_dqn", "dueling_double_dqn"]
 
 
 class Hyperparameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -48,6 +48,8 @@ class Hyperparameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     # Transitions in the replay buffer. The paper leaves it open; 50 000 is about 800 missions.
     buffer_size: Count = 50_000
     episodes: Count = 2000  # missions of training
+    # Steps of a return before the target network's value; absent: 1, as in the paper
+    n_step: Annotated[int, Meta(ge=2, le=1000)] | UnsetType = UNSET
 
 
 class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -55,8 +57,8 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     format: Literal[1] = 1  # version of this file's layout
     name: Annotated[str, Meta(pattern=NAME)]  # the policy's name
-    algorithm: Algorithm  # `dqn` or `dueling_dqn`
-    aggregation: network.Aggregation = "mean"  # subtracted by the dueling network; ignored for `dqn`
+    algorithm: Algorithm  # the network, plain or dueling, and its target; see `dqn`
+    aggregation: network.Aggregation = "mean"  # subtracted by a dueling network; ignored for a plain one
     observation: Observation  # encoding, see `core.observations`
     hidden: Annotated[tuple[network.Width, ...], Meta(min_length=1, max_length=16)]  # units of each layer
     actions: tuple[str, ...] = ACTION_LABELS  # labels of the actions, in the order of the network's outputs
@@ -72,7 +74,7 @@ class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
             n_inputs=observations.size(self.observation, scenario),
             hidden=self.hidden,
             n_actions=len(self.actions),
-            dueling=self.aggregation if self.algorithm == "dueling_dqn" else None,
+            dueling=self.aggregation if self.algorithm.startswith("dueling") else None,
         )
 
 
@@ -81,9 +83,9 @@ class Policy:
     """A trained policy."""
 
     folder: Path  # folder that it was loaded from
-    config: PolicyConfig  # everything except the parameters
-    scenario: Scenario  # the world it was trained in
-    parameters: Mapping[str, Array]  # of its network, float32, as named by `network.shapes`
+    config: PolicyConfig | SetPolicyConfig  # everything except the parameters
+    scenario: Scenario  # the world it was trained in; of one for any field that in which it flies by default
+    parameters: Mapping[str, Array]  # of its network, float32, as named by its `shapes`
     sha256: str  # hash of config and model, in hex: identifies exactly what flew
 
     @property
@@ -93,7 +95,7 @@ class Policy:
         return self.folder.name if shipped else self.config.name
 
     @cached_property
-    def _architecture(self) -> network.Architecture:
+    def _architecture(self) -> network.Architecture | SetArchitecture:
         return self.config.architecture(self.scenario)
 
     @cached_property
@@ -110,6 +112,7 @@ class Policy:
         data_bits: Array,
         collected: Array,
         energy_used_j: Array | None = None,
+        weight: Array | float | None = None,
     ) -> Array:
         """The policy's observation of a mission, float32 `[..., D]`; see `core.observations.encode`."""
         return observations.encode(
@@ -120,20 +123,28 @@ class Policy:
             data_bits=data_bits,
             collected=collected,
             energy_used_j=energy_used_j,
+            weight=weight,
         )
 
     def q_values(self, observation: Array) -> Array:
         """Q(s, a) of observations `[..., D]`, float64 `[..., A]`."""
-        rows = np.asarray(observation, np.float64).reshape(-1, self._architecture.n_inputs)
-        values = network.q_values(self._architecture, self._float64, rows)
+        rows = np.asarray(observation, np.float64).reshape(-1, observation.shape[-1])
+        if isinstance(self._architecture, SetArchitecture):
+            values = set_network.q_values(self._architecture, self._float64, rows)
+        else:
+            values = network.q_values(self._architecture, self._float64, rows)
         return values.reshape(*observation.shape[:-1], self._architecture.n_actions)
 
     def act(self, observation: Array, mask: Array | None = None) -> Array:
         """The greedy action for observations `[..., D]`: values of `core.grid.Action`, `[...]`.
 
-        Among obstacles it is the best one in a mask, bool `[..., A]`; see `core.world.action_mask`.
+        Among obstacles it is the best one in a mask, bool `[..., A]`; see `core.world.action_mask`. With the
+        observation `entities` it is the best one of those that the observation names, see
+        `core.entities.encoding.allowed`.
         """
         q_values = self.q_values(observation)
+        if self.config.observation == "entities":
+            mask = allowed(observation)
         return (q_values if mask is None else np.where(mask, q_values, -np.inf)).argmax(axis=-1)
 
     def check(self, scenario: Scenario) -> None:
@@ -141,11 +152,14 @@ class Policy:
 
         Raises:
             PolicyError: another grid or, unless it observes its position only, another number of clusters; or
-                no battery, which it observes.
+                no battery, which it observes. A policy for any field refuses one that is larger than what it
+                observes.
         """
         own = self.scenario
         if (problem := observations.problem(self.config.observation, scenario)) is not None:
             raise PolicyError(f"policy {self.name!r} needs {problem}")
+        if isinstance(self.config, SetPolicyConfig):
+            return
         facts: list[tuple[str, object, object]] = [
             ("the grid's number of cells east, north, up", own.grid.shape, scenario.grid.shape)
         ]
@@ -181,7 +195,7 @@ def load(name_or_path: str | Path) -> Policy:
     path, model_path = folder / CONFIG, folder / MODEL
     config_bytes, model_bytes = _read(path), _read(model_path)
     try:
-        config = msgspec.json.decode(config_bytes, type=PolicyConfig)
+        config = _config(config_bytes)
         scenario = scenarios.as_shipped(from_values(config.scenario, f"{path}: scenario"))
         if (problem := observations.problem(config.observation, scenario)) is not None:
             raise PolicyError(f"{path}: {problem}")
@@ -191,6 +205,8 @@ def load(name_or_path: str | Path) -> Policy:
         raise PolicyError(str(error)) from None
     if config.actions != ACTION_LABELS:
         raise PolicyError(f"{path}: actions = {list(config.actions)}; expected {list(ACTION_LABELS)}")
+    if isinstance(config, SetPolicyConfig) and config.features != FEATURES:
+        raise PolicyError(f"{path}: features = {config.features}; expected {FEATURES}, of this version")
     parameters = _parameters(model_bytes, config.architecture(scenario), model_path)
     sha256 = hashlib.sha256(config_bytes + model_bytes).hexdigest()
     return Policy(folder=folder, config=config, scenario=scenario, parameters=parameters, sha256=sha256)
@@ -198,7 +214,7 @@ def load(name_or_path: str | Path) -> Policy:
 
 def save(
     folder: Path,
-    config: PolicyConfig,
+    config: PolicyConfig | SetPolicyConfig,
     parameters: Mapping[str, Array],
     card: Callable[[Policy], str],
     draw: Callable[[Policy, Path], None] | None = None,
@@ -238,13 +254,29 @@ def _read(path: Path) -> bytes:
         raise PolicyError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _parameters(model: bytes, architecture: network.Architecture, path: Path) -> dict[str, Array]:
+class _Format(msgspec.Struct):
+    format: Any = 1
+
+
+def _config(text: bytes) -> PolicyConfig | SetPolicyConfig:
+    """The config in a file; `format` names its type."""
+    if msgspec.json.decode(text, type=_Format).format == 2:
+        return msgspec.json.decode(text, type=SetPolicyConfig)
+    return msgspec.json.decode(text, type=PolicyConfig)
+
+
+def _parameters(
+    model: bytes, architecture: network.Architecture | SetArchitecture, path: Path
+) -> dict[str, Array]:
     """The arrays in a model file, checked against the architecture."""
     try:
         arrays = safetensors.numpy.load(model)
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise PolicyError(f"{path}: damaged or not a safetensors file: {error}") from None
-    expected = network.shapes(architecture)
+    if isinstance(architecture, SetArchitecture):
+        expected = set_network.shapes(architecture)
+    else:
+        expected = network.shapes(architecture)
     for name in sorted(expected.keys() | arrays.keys()):
         if name not in arrays:
             raise PolicyError(f"{path}: tensor {name!r} is missing; expected shape {expected[name]}")

@@ -15,7 +15,12 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
 )
 from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay
 
-_ALGORITHMS = {"dqn": "DQN", "dueling_dqn": "Dueling DQN"}
+_ALGORITHMS = {
+    "dqn": "DQN",
+    "dueling_dqn": "Dueling DQN",
+    "double_dqn": "Double DQN",
+    "dueling_double_dqn": "Dueling double DQN",
+}
 _LIMITS = {
     "position": """\
 It sees its cell and nothing else: it cannot know what it has collected or how much time is left, so its
@@ -46,7 +51,9 @@ def card(
     `scenario`, without the overrides of `command`, evaluates the policy. `seconds` is the wall time of the
     training, and `score` the number of users brought home in validation.
     """
-    config, values = policy.config, policy.config.hyperparameters
+    config = policy.config
+    assert isinstance(config, PolicyConfig), "made by this trainer"
+    values = config.hyperparameters
     hidden = " and ".join(map(str, config.hidden))
     first, last = TEST_SEEDS[0], TEST_SEEDS[-1]
     users = _USERS[type(scenario.users.moves)]

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from msgspec import Meta
+from msgspec import UNSET, Meta
 
 from uav_dc_ros.agents import network
 from uav_dc_ros.agents.policy import Algorithm, Hyperparameters
@@ -22,7 +22,7 @@ class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     # Seed of the mission whose initial users start every mission; None for a fresh layout in every mission.
     environment: Annotated[int, Meta(ge=0)] | None = None
     algorithm: Algorithm
-    aggregation: network.Aggregation = "mean"  # what the dueling network subtracts; unused by `dqn`
+    aggregation: network.Aggregation = "mean"  # what a dueling network subtracts; unused by a plain one
     reward: RewardSettings
     hyperparameters: Hyperparameters
 
@@ -41,8 +41,9 @@ class Population(msgspec.Struct, frozen=True, kw_only=True):
             raise TrainingError(problem)
         if not self.runs:
             raise TrainingError("a population has 0 runs; expected at least 1")
-        for name in ("episodes", "buffer_size", "target_every"):
-            values = sorted({getattr(run.hyperparameters, name) for run in self.runs})
+        for name in ("episodes", "buffer_size", "target_every", "n_step"):
+            found = {getattr(run.hyperparameters, name) for run in self.runs}
+            values = sorted(1 if value is UNSET else value for value in found)
             if len(values) > 1:
                 raise TrainingError(
                     f"{name} of the runs of a population is {values}; expected one value for all"
@@ -65,5 +66,5 @@ def architecture(population: Population, run: Run) -> network.Architecture:
         n_inputs=observations.size(population.observation, population.scenario),
         hidden=population.hidden,
         n_actions=len(ACTION_LABELS),
-        dueling=run.aggregation if run.algorithm == "dueling_dqn" else None,
+        dueling=run.aggregation if run.algorithm.startswith("dueling") else None,
     )

@@ -12,12 +12,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from msgspec import UNSET
 from torch import Tensor
 
 from uav_dc_ros.agents.dqn import Learner, Mask, Member
 from uav_dc_ros.agents.replay import ReplayBuffer, TransitionBatch
 from uav_dc_ros.core import observations
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.entities.encoding import allowed
+from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import BatchWorld, State, observe
@@ -53,11 +56,18 @@ class Training:
             for run in population.runs
         ]
         architectures = [architecture(population, run) for run in population.runs]
-        members = zip(architectures, population.runs, self._rngs, strict=True)
-        mask = action_mask(population.scenario)
-        self.learner = Learner([Member(a, run.hyperparameters, rng) for a, run, rng in members], device, mask)
-        capacity = population.runs[0].hyperparameters.buffer_size
-        self._buffer = ReplayBuffer(len(population.runs), capacity, architectures[0].n_inputs, device)
+        members = [
+            Member(one, run.hyperparameters, rng, "double" in run.algorithm)
+            for one, run, rng in zip(architectures, population.runs, self._rngs, strict=True)
+        ]
+        mask = action_mask(population.scenario, population.observation)
+        self.learner = Learner(members, device, mask)
+        first = population.runs[0].hyperparameters
+        gammas = torch.tensor([[run.hyperparameters.gamma] for run in population.runs], device=device)
+        self._n_steps = 1 if first.n_step is UNSET else first.n_step
+        self._buffer = ReplayBuffer(
+            len(population.runs), first.buffer_size, architectures[0].n_inputs, device, self._n_steps, gammas
+        )
         reward = rewards(population.runs, self._world_array)
         self._worlds = BatchWorld(population.scenario, self._layouts(1)[0], reward)
         self._stats = EpisodeStats(population.scenario, self._worlds.state.total_reward)
@@ -85,7 +95,9 @@ class Training:
             torch.from_numpy(values).to(self.device).expand(n_runs, -1)
             for values in (transition.observation, transition.next_observation)
         )
-        self._buffer.add(TransitionBatch(observation, action, reward, next_observation, terminated))
+        transitions = TransitionBatch(observation, action, reward, next_observation, terminated)
+        # What is recorded may have gaps: its returns are of one step.
+        self._buffer.add(transitions, torch.ones_like(terminated, dtype=torch.bool))
 
     @torch.inference_mode()  # the learner computes its own gradient, so autograd need not record
     def fly_episode(self) -> None:
@@ -104,7 +116,9 @@ class Training:
             outcome = worlds.step(action.numpy() if self._on_host else action, walk[t])
             next_observation = self._tensor(worlds.observe(kind))
             reward, terminated = self._tensor(outcome.reward), self._tensor(outcome.terminated)
-            self._buffer.add(TransitionBatch(observation, action, reward, next_observation, terminated))
+            over = self._tensor(outcome.terminated | outcome.truncated) if self._n_steps > 1 else terminated
+            transitions = TransitionBatch(observation, action, reward, next_observation, terminated)
+            self._buffer.add(transitions, over)
             loss += self.learner.update(self._buffer.sample(replay[t]))
             self._stats.add_step(worlds.state, outcome)
             # Reading from the device which missions ended would make the host wait: under `at_time_limit`
@@ -184,8 +198,13 @@ class Training:
             rng.bit_generator.state = state
 
 
-def action_mask(scenario: Scenario) -> Mask | None:
-    """The learner's mask of actions; None: a scenario without obstacles."""
+def action_mask(scenario: Scenario, observation: Observation) -> Mask | None:
+    """The learner's mask of actions; None: a scenario without obstacles.
+
+    With the observation `entities` it is that of the actions from which the UAV can still land.
+    """
+    if observation == "entities":
+        return allowed
     if (moves := scenario.moves) is None:
         return None
     return lambda observation: moves.valid(observations.cell(scenario, observation))

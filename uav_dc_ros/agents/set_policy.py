@@ -1,0 +1,56 @@
+"""The config of a policy that observes `entities`, and so flies in fields that it has not seen."""
+
+from typing import Annotated, Any, Literal, TypeAlias
+
+import msgspec
+from msgspec import Meta
+
+from uav_dc_ros.agents import network
+from uav_dc_ros.agents.set_network import SetArchitecture
+from uav_dc_ros.core.entities.encoding import FEATURES
+from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.scenario import Scenario
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z"  # of a policy
+Count: TypeAlias = Annotated[int, Meta(ge=1)]
+Probability: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
+
+
+class PqnSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Hyperparameters of parallelised Q-learning on random layouts."""
+
+    iterations: Count = 450  # rounds of flying and fitting
+    layouts: Count = 12  # new ones of an iteration
+    missions: Count = 40  # in each layout
+    epochs: Count = 1  # passes over the decisions of an iteration
+    batch_size: Count = 512  # decisions in a mini-batch
+    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 1e-3  # of Adam; it falls to a fiftieth
+    trace: Probability = 0.95  # lambda of the returns
+    # Share of the missions that the planner `tour` flies at the start, as demonstrations
+    demonstrations: Probability = 1.0
+    shown: Annotated[float, Meta(gt=0, le=1)] = 0.6  # share of the iterations in which that share falls to 0
+    epsilon: Probability = 0.93  # probability of the greedy action, or the planner's
+
+
+class SetPolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A policy for any field without its parameters: format 2 of `config.json`."""
+
+    format: Literal[2] = 2
+    name: Annotated[str, Meta(pattern=NAME)]  # the policy's name
+    algorithm: Literal["pqn"] = "pqn"
+    observation: Literal["entities"] = "entities"  # see `core.entities`
+    features: int = FEATURES  # version of that encoding
+    width: network.Width  # units of the layers of a cluster
+    hidden: Annotated[
+        tuple[network.Width, ...], Meta(min_length=1, max_length=16)
+    ]  # units behind the pooling
+    actions: tuple[str, ...] = ACTION_LABELS  # labels of the actions, in the order of the network's outputs
+    hyperparameters: PqnSettings  # of training
+    seed: Annotated[int, Meta(ge=0)]  # of its run
+    iteration: Annotated[int, Meta(ge=0)]  # after which these parameters were taken
+    version: str  # version of the package that made it
+    scenario: dict[str, Any]  # the world in which it flies where no other is given, as plain values
+
+    def architecture(self, scenario: Scenario) -> SetArchitecture:
+        """Sizes of its network, which are those for every world."""
+        return SetArchitecture(width=self.width, hidden=self.hidden, n_actions=len(self.actions))
