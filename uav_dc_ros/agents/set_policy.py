@@ -24,7 +24,7 @@ class PqnSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     missions: Count = 40  # in each layout
     epochs: Count = 1  # passes over the decisions of an iteration
     batch_size: Count = 512  # decisions in a mini-batch
-    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 1e-3  # of Adam; it falls to a fiftieth
+    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 7e-4  # of Adam; it falls to a fiftieth
     trace: Probability = 0.95  # lambda of the returns
     # Share of the missions that the planner `tour` flies at the start, as demonstrations
     demonstrations: Probability = 1.0

@@ -19,16 +19,16 @@ from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Algorithm, Hype
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
-from uav_dc_ros.errors import FROM_TRAIN, TrainingError
+from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act, save_mission_picture
+from uav_dc_ros.experiments.train.generalist import cli as generalist
 from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run
 from uav_dc_ros.experiments.train.progress import TrainingProgress
 from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay, prefill_replay
+from uav_dc_ros.experiments.train.start import make_folder, torch_device
 
 if TYPE_CHECKING:
-    import torch
-
     from uav_dc_ros.experiments.train.training import Training
 
 PROG = "python -m uav_dc_ros.train"
@@ -70,7 +70,18 @@ def _saved_progress(values: dict[str, Any]) -> _SavedProgress:
 def main(argv: list[str] | None = None) -> None:
     """Runs the command line, and exits."""
     argv = sys.argv[1:] if argv is None else argv
-    cli.run(lambda: _train(options_parser().parse_args(argv), f"{PROG} {shlex.join(argv)}"), PROG)
+    command = f"{PROG} {shlex.join(argv)}"
+    # Its options are others.
+    algorithm = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    algorithm.add_argument("--algo")
+    try:
+        of_pqn = algorithm.parse_known_args(argv)[0].algo == "pqn"
+    except argparse.ArgumentError:
+        of_pqn = False
+    if of_pqn:
+        parser = generalist.options_parser(PROG)
+        cli.run(lambda: generalist.train(parser.parse_args(argv), command, PROG), PROG)
+    cli.run(lambda: _train(options_parser().parse_args(argv), command), PROG)
 
 
 def options_parser() -> cli.Parser:
@@ -81,9 +92,11 @@ def options_parser() -> cli.Parser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
+    algorithms = "the paper's algorithms 1 and 2, each with a double target, too; "
+    algorithms += "--algo pqn --help lists the options for a policy for any field"
     text = f"shipped: {', '.join(scenarios.names())}"
     add("--scenario", required=True, metavar="NAME|FILE|random:SEED", help=text)
-    add("--algo", required=True, choices=get_args(Algorithm), help="the paper's algorithm 1 or 2")
+    add("--algo", required=True, choices=[*get_args(Algorithm), "pqn"], help=algorithms)
     add("--out", required=True, type=Path, metavar="DIR", help="folder to make, such as policies/NAME")
     add("--observation", default="mission", choices=get_args(Observation), help="what the agent sees")
     add("--aggregation", default="mean", choices=get_args(network.Aggregation), help="of the dueling streams")
@@ -101,6 +114,7 @@ def options_parser() -> cli.Parser:
     for name, text in _LEARNING_OPTIONS.items():
         default = getattr(Hyperparameters(), name)
         learning.add_argument(_option(name), metavar="X", default=default, type=type(default), help=text)
+    learning.add_argument("--n-step", default=1, help="steps of a return", **count)
     title = "reward, instead of the scenario's own; kept in the policy's config"
     add = parser.add_argument_group(title, argument_default=argparse.SUPPRESS).add_argument
     add("--beta", metavar="X", type=float, help="weight of the data")
@@ -116,8 +130,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
     shipped = scenarios.load(options.scenario)
     config = _config(options, shipped)
     population = _population(config, shipped.name, options.runs)
-    device = _device(options.device, options.threads)
-    # These need torch, which _device() has found.
+    device = torch_device(options.device, options.threads)
+    # These need torch, which torch_device() has found.
     from uav_dc_ros.experiments.train import checkpoint
     from uav_dc_ros.experiments.train.tensorboard import TensorBoardLog
     from uav_dc_ros.experiments.train.training import Training, validate
@@ -141,7 +155,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     elif options.from_bags:
         progress.prefilled = prefill_replay(training, options.from_bags)
         print(f"replay starts with {progress.prefilled}")
-    _reserve(folder, options.resume, training.n_flown)
+    make_folder(folder, options.resume, "episode_", training.n_flown)
     started = time.monotonic() - progress.seconds
     try:
         with (
@@ -198,22 +212,6 @@ def _population(config: PolicyConfig, name: str, n_runs: int) -> Population:
     return Population(scenario=scenario, observation=config.observation, hidden=config.hidden, runs=runs)
 
 
-def _reserve(folder: Path, resume: bool, n_flown: int) -> None:
-    """Makes the folder of the checkpoints, or takes an existing one to resume.
-
-    Removes policies that a killed training saved after its last checkpoint.
-    """
-    if not resume:
-        policy.check_new(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=resume)
-    except OSError as error:
-        raise TrainingError(f"{folder} cannot be made: {error.strerror}") from None
-    for best in folder.glob("episode_" + 6 * "[0-9]"):
-        if int(best.name.removeprefix("episode_")) > n_flown:
-            shutil.rmtree(best)
-
-
 def _save_best(
     folder: Path, config: PolicyConfig, training: "Training", progress: _SavedProgress, command: str
 ) -> str:
@@ -255,7 +253,8 @@ def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
                 "aggregation": options.aggregation,
                 "observation": options.observation,
                 "hidden": options.hidden,
-                "hyperparameters": {name: getattr(options, name) for name in _LEARNING_OPTIONS},
+                "hyperparameters": {name: getattr(options, name) for name in _LEARNING_OPTIONS}
+                | ({"n_step": options.n_step} if options.n_step > 1 else {}),
                 "seed": options.seed,
                 "episode": 0,
                 "version": __version__,
@@ -277,21 +276,3 @@ def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
 
 def _option(key: str) -> str:
     return f"--{key.replace('_', '-')}"
-
-
-def _device(name: str, n_threads: int) -> "torch.device":
-    """The device to compute on; raises TrainingError without torch or the device."""
-    try:
-        import torch
-    except ModuleNotFoundError:
-        raise TrainingError(f"torch {FROM_TRAIN}") from None
-    from uav_dc_ros.experiments.train.training import prepare_torch
-
-    prepare_torch(n_threads)
-    if name.partition(":")[0] not in ("cpu", "cuda"):
-        raise TrainingError(f"--device is {name!r}; expected cpu, cuda or cuda:N")
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise TrainingError(f"--device is {name!r}; {str(error).splitlines()[0]}") from None
-    return torch.device(name)

@@ -27,6 +27,7 @@ It sees its cell and nothing else: it cannot know what it has collected or how m
 greedy mission is one fixed path, and where it stays for one step it stays for good.""",
     "mission": "It sees how far each cluster is collected, but not where single users are.",
     "energy": "It sees how far each cluster is collected and how full the battery is, but not single users.",
+    "entities": "It sees the clusters and which actions can still land, but it has met no other map.",
     "map": "It sees where the clusters are, but it has met no other map than this one.",
 }
 _USERS = {

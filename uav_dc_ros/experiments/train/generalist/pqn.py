@@ -3,6 +3,9 @@
 Gallici et al., "Simplifying Deep Temporal Difference Learning", ICLR 2025. Missions are flown to their end,
 and the network is fitted to their lambda-returns. Deviation: a batch holds whole missions, so no return is
 cut off, and the discount is 1: the return is the objective itself.
+
+Demonstrated actions have a margin over the others (Hester et al., "Deep Q-learning from Demonstrations", AAAI
+2018), so that the policy begins with what the planner does.
 """
 
 from typing import NamedTuple
@@ -16,8 +19,10 @@ from uav_dc_ros.agents import set_network
 from uav_dc_ros.agents.network import Parameters
 from uav_dc_ros.agents.set_network import SetArchitecture
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.entities.encoding import allowed
 
 GRADIENT_MAX = 10.0  # norm
+MARGIN = 0.1  # of a demonstrated action over others, in units of the returns
 
 
 class Batch(NamedTuple):
@@ -26,6 +31,7 @@ class Batch(NamedTuple):
     observation: Array  # float32 `[R, D]`
     action: Array  # integers `[R]`
     target: Array  # lambda-return, float32 `[R]`
+    demonstrated: Array  # the action is a planner's, which is to be preferred, bool `[R]`
 
 
 class PqnLearner:
@@ -49,14 +55,21 @@ class PqnLearner:
         self._optimiser.param_groups[0]["lr"] = learning_rate
         losses = []
         for part in np.array_split(order, max(1, round(len(order) / rows))):
-            observation, action, target = (torch.from_numpy(values[part]) for values in batch)
-            error = self._q(observation).gather(1, action[:, None])[:, 0] - target
-            loss = (error * error).mean()
+            observation, action, target, shown = (torch.from_numpy(values[part]) for values in batch)
+            q_values = self._q(observation)
+            taken = q_values.gather(1, action[:, None])
+            error = taken[:, 0] - target
+            squares = (error * error).mean()
+            loss = squares
+            if shown.any():
+                others = (q_values + MARGIN).scatter(1, action[:, None], taken)
+                best = others.masked_fill(~allowed(observation), -torch.inf).amax(dim=1)
+                loss = loss + ((best - taken[:, 0]) * shown).mean()
             self._optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(self._theta.values(), GRADIENT_MAX)
             self._optimiser.step()
-            losses.append(float(loss.detach()))
+            losses.append(float(squares.detach()))
         return sum(losses) / len(losses)
 
     def parameters(self) -> Parameters:

@@ -22,6 +22,7 @@ from uav_dc_ros.experiments.train.generalist.missions import LayoutMissions
 from uav_dc_ros.experiments.train.generalist.pqn import Batch, PqnLearner, lambda_returns
 
 BASELINES = ("nearest", "tour")
+PREFERRED_FROM = 0.5  # weight of the objective from which a tour of all clusters is to be preferred
 _REWARD_SCALE = np.float32(10.0)  # J lies in [0, 1]; errors of a tenth of that are large
 _STREAM = 2  # separates a run's generators from those of other trainings
 
@@ -73,15 +74,18 @@ class GeneralistTraining:
             drawn_action = (rng.random(mask.shape, np.float32) * mask).argmax(axis=-1)
             explore = rng.random(len(mask), np.float32) >= settings.epsilon
             action = np.where(explore, drawn_action, q_values.argmax(axis=-1))
+            follows = np.zeros(len(mask), bool)
             if n_shown:
                 toured = np.concatenate([act(one) for act, one in zip(tours, flown.states, strict=True)])
                 lands = np.take_along_axis(mask, toured[:, None], axis=-1)[:, 0]
-                action = np.where(shown & ~explore & lands, toured, action)
+                follows = shown & ~explore & lands
+                action = np.where(follows, toured, action)
             stepped = flown.step(action)
-            steps.append((*observed, action, q_values.max(axis=-1), *stepped))
-        observation, flying, action, best, reward, over = map(np.stack, zip(*steps, strict=True))
+            follows &= weights.reshape(-1) >= PREFERRED_FROM
+            steps.append((*observed, action, follows, q_values.max(axis=-1), *stepped))
+        observation, flying, action, shows, best, reward, over = map(np.stack, zip(*steps, strict=True))
         target = lambda_returns(_REWARD_SCALE * reward, over, best, settings.trace)
-        batch = Batch(observation[flying], action[flying], target[flying])
+        batch = Batch(*(values[flying] for values in (observation, action, target, shows)))
         rate = settings.learning_rate * max(1.0 - done, 0.02)
         losses = [
             self.learner.fit(batch, rng.permutation(len(batch.action)), settings.batch_size, rate)
