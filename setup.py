@@ -19,7 +19,7 @@ NAME = "uav_dc_ros"
 # `colcon build --symlink-install` links the package: its data is found beside what the link leads to.
 DATA_FOLDERS = () if "develop" in sys.argv else ("policies", "msgs_json")
 # Tests hold it equal to the node table.
-NODES = ("world", "bridge", "channel_monitor", "policy", "recorder", "visualizer", "live_view")
+NODES = ("world", "bridge", "channel_monitor", "policy", "recorder", "visualizer", "live_view", "web_view")
 
 
 class AmentDistribution(Distribution):
@@ -71,6 +71,7 @@ setup(
     package_data={
         NAME: ["py.typed", "resource/*", "share/*/*"],
         f"{NAME}.nodes.ros": ["*.xml"],
+        f"{NAME}.nodes.view.web": ["*.html", "*.css", "*.js"],
         f"{NAME}.recordings.pages": ["*.html", "*.css", "*.js"],
         f"{NAME}.scenarios": ["*.toml"],
         f"{NAME}.policies": ["*/*"],

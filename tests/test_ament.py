@@ -222,6 +222,8 @@ def test_the_launch_file_starts(given, started, peers):
 def test_the_launch_file_starts_a_live_view_if_asked():
     (view,) = (node for node in ament_launch.nodes(LAUNCH, {"live": "8765"}) if node.name == "live_view")
     assert view.parameters == {"port": 8765}
+    (view,) = (node for node in ament_launch.nodes(LAUNCH, {"view": "8766"}) if node.name == "web_view")
+    assert view.parameters == {"scenario": "five_clusters", "port": 8766}
 
 
 def test_the_launch_file_s_nodes_fly(workspace, ros):

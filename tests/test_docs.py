@@ -182,6 +182,7 @@ def test_the_diagrams_show_every_row_of_the_tables() -> None:
     assert {row.name for row in NODES.values()} - {*tool.SIMULATED, *tool.BESIDE} == {
         "bag_record",
         "live_view",
+        "web_view",
     }
     drawn = {(source, target) for source, target, _ in tool.transitions()}
     assert drawn == {(one.before.value, one.after.value) for one in TRANSITIONS}

@@ -126,6 +126,12 @@ class Pose:
         self.position_m: tuple[float, float, float] = (x_m, y_m, z_m)  # x, y, altitude
         check_position(FRAME, self.position_m)
 
+    @property
+    def orientation(self) -> tuple[float, float, float, float]:
+        """Quaternion x, y, z, w; level, facing east, where the message has no rotation."""
+        rotation: tuple[float, float, float, float] = _POSE.unpack(self.body)[-4:]
+        return rotation if 0.9 < math.hypot(*rotation) < 1.1 else _LEVEL
+
 
 def _reencoded(data: bytes) -> bytes:
     """A PoseStamped of either byte order in little endian; MessageError for any other message."""

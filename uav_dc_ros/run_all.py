@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the command line is parsed before slow imports
 
 PROG = "python -m uav_dc_ros.run_all"
 LIVE_PORT = 8765  # Foxglove's default
+VIEW_PORT = 8766
 
 
 def parser(prog: str = PROG) -> cli.Parser:
@@ -82,6 +83,8 @@ def parser(prog: str = PROG) -> cli.Parser:
     port = cli.whole_number(0, PORT_MAX, f"a TCP port from 0 (any) to {PORT_MAX}")
     live = "serve the mission to Foxglove over WebSocket (default port: %(const)s)"
     add("--live", type=port, nargs="?", const=LIVE_PORT, metavar="PORT", help=live)
+    view = "show the missions on a page in a browser, on this machine only (default port: %(const)s)"
+    add("--view", type=port, nargs="?", const=VIEW_PORT, metavar="PORT", help=view)
     summary = "write the summary as JSON, also to /dev/stdout, a FIFO or a device"
     add("--summary", type=Path, metavar="FILE", help=summary)
     add("--version", action="version", version=__version__)

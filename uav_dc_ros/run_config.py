@@ -18,8 +18,9 @@ RANGES = {  # of whole numbers
     "missions": (1, 2**62 - 1),
     "system": (1, SYSTEM_MAX),
     "live": (0, PORT_MAX),
+    "view": (0, PORT_MAX),
 }
-OPTIONAL = ("policy", "bag", "summary", "system", "live", "compose")
+OPTIONAL = ("policy", "bag", "summary", "system", "live", "view", "compose")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +49,7 @@ class RunConfig:
     # Whether world, channel monitor and policy share a process; None: in lockstep.
     compose: bool | None = None
     live: int | None = None  # TCP port of the Foxglove server; None: no server
+    view: int | None = None  # TCP port of the page that shows the mission; 0: any; None: no page
     summary: str | Path | None = None  # JSON file for the summary; None: no file
 
     def __post_init__(self) -> None:

@@ -34,6 +34,8 @@ class Topic:
     lease_s: float | None = None
     recorded: bool = True  # by the recorder
     exclusive: bool = False  # a mission has exactly one publisher of it
+    # Not every mission has a publisher of it: the recorder records it once it finds one.
+    optional: bool = False
 
 
 # The world node's simulated vehicle, and the interfaces to a real one.
@@ -47,6 +49,12 @@ PATH = "nav_msgs/msg/Path"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 CLOCK = "rosgraph_msgs/msg/Clock"
+FLOAT = "std_msgs/msg/Float64"
+INTEGER = "std_msgs/msg/Int32"
+ODOMETRY = "nav_msgs/msg/Odometry"
+BATTERY = "sensor_msgs/msg/BatteryState"
+FIX = "sensor_msgs/msg/NavSatFix"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"  # not among ROS 2's wheels on PyPI
 
 TOPICS: dict[str, Topic] = {
     topic.name: topic
@@ -60,6 +68,13 @@ TOPICS: dict[str, Topic] = {
         Topic(name="ready", type=JSON, latched=True, depth=10, recorded=False),
         Topic(name="path", type=PATH, latched=True, depth=1),
         Topic(name="markers", type=MARKERS, latched=True, depth=1),
+        Topic(name="sum_rate", type=FLOAT, latched=True, depth=10),
+        Topic(name="users_collected", type=INTEGER, latched=True, depth=10),
+        Topic(name="remaining_steps", type=INTEGER, latched=True, depth=10),
+        Topic(name="odom", type=ODOMETRY, depth=100),
+        Topic(name="battery", type=BATTERY, latched=True, depth=10, optional=True),
+        Topic(name="fix", type=FIX, depth=100, optional=True),
+        Topic(name="tf", type=TRANSFORMS, depth=100, optional=True),
         Topic(name="diagnostics", type=DIAGNOSTICS, depth=10),
         Topic(
             name="clock",

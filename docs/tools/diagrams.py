@@ -35,6 +35,13 @@ CONTENT = {
     "ready": "a node has matched all its peers",
     "path": "the UAV's path in this mission",
     "markers": "users by state, clusters, range, dock, UAV, status text",
+    "sum_rate": "sum of the rates of the served users, bit/s",
+    "users_collected": "number of users whose data is collected",
+    "remaining_steps": "steps that the battery still allows",
+    "odom": "the pose, and the mean velocity since the one before it",
+    "battery": "the vehicle's charge, or of a simulated one by the scenario's model; where there is one",
+    "fix": "a real vehicle's latitude and longitude, without altitude; only where the grid has a datum",
+    "tf": "`map` to `base_link`; only where tf2_msgs is installed",
     "diagnostics": "state, process, rates, latencies (p50, p99), rejected messages, restarts",
     "clock": "mission time, for nodes with `use_sim_time`",
 }

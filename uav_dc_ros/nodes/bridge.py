@@ -20,6 +20,7 @@ from uav_dc_ros.nodes import vehicles
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.ros import numeric_messages
 from uav_dc_ros.nodes.ros.liveliness import LivelinessMonitor
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
@@ -35,6 +36,7 @@ from uav_dc_ros.topics import TOPICS
 
 TICK_S = 0.02  # vehicle time
 MIN_TICK_S = 0.005  # steady time, for a simulated vehicle whose time is faster
+NUMBERS_PERIOD_S = 0.2  # of battery and fix, for plots and maps
 SPEED_OVER_S = 0.5  # steady time over which the speed of the vehicle's time is measured
 STOP_TIMEOUT_S = 2.5  # for a vehicle to change its mode when the bridge stops
 
@@ -94,6 +96,7 @@ class AutopilotBridge(MissionNode):
         self._plausibility = PlausibilityFilter(settings.max_speed_mps, settings.max_position_jump_m)
         self._position_s: float | None = None  # of the pose published last
         self._last_stamp_ns = 0
+        self._numbers_s = 0.0  # time of the next battery and fix
         self._setpoint: Enu | None = None  # published last as `target`
         self._grid = ""  # its position, as logged last
         self._datum_saved, self._is_restarted = False, bool(grid_origin)
@@ -169,6 +172,7 @@ class AutopilotBridge(MissionNode):
         self._telemetry = self.vehicle.telemetry()
         self._adapt_rate()
         self._publish_pose()
+        self._publish_numbers()
         self._log_grid()
         if not self._started and self.all_ready:
             self.check_other_publishers()
@@ -208,6 +212,20 @@ class AutopilotBridge(MissionNode):
         now_ns: int = self.get_clock().now().nanoseconds
         self._last_stamp_ns = max(now_ns - age_ns, self._last_stamp_ns + 1)
         self.publish("pose", cdr.encode_pose(np.asarray(position), self._last_stamp_ns))
+
+    def _publish_numbers(self) -> None:
+        """Publish what the vehicle reports of its battery, and its position on the Earth."""
+        now_s, telemetry = time.monotonic(), self._telemetry
+        if now_s < self._numbers_s:
+            return
+        self._numbers_s = now_s + NUMBERS_PERIOD_S
+        now_ns: int = self.get_clock().now().nanoseconds
+        if telemetry.battery is not None:
+            charge = numeric_messages.battery(telemetry.battery, now_ns, telemetry.battery_v)
+            self.publish("battery", charge)
+        if telemetry.position is not None and telemetry.datum is not None:
+            latitude_deg, longitude_deg, _ = telemetry.datum.at(telemetry.position)
+            self.publish("fix", numeric_messages.fix(latitude_deg, longitude_deg, now_ns))
 
     def _log_grid(self) -> None:
         """Log the grid's position once it is known, and its distance from that of the last flight."""

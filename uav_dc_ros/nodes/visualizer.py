@@ -1,4 +1,5 @@
-"""The visualizer: publishes `path` and `markers`, with which RViz and Foxglove draw the mission.
+"""The visualizer: publishes `path` and `markers`, with which RViz and Foxglove draw the mission, and its
+numbers as standard messages, which any tool plots.
 
 It decodes every pose, for the path: see `PathHistory`. Of the other topics it keeps the newest message,
 serialised, until it draws: a lockstep of a thousand steps a second is drawn a few times a second.
@@ -8,13 +9,17 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from uav_dc_ros import cdr, messages, payloads, scenarios
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.node_table import NUMERIC
+from uav_dc_ros.nodes.ros import numeric_messages
 from uav_dc_ros.nodes.view import markers
 from uav_dc_ros.nodes.view.path_history import PathHistory
+from uav_dc_ros.nodes.view.rate_limiter import RateLimiter
 from uav_dc_ros.topics import Topic
 
 P = TypeVar("P", bound=messages.Payload)
@@ -29,7 +34,7 @@ class _UsersHeader(msgspec.Struct):
 
 
 class VisualizerNode(MissionNode):
-    """Draws what changed, at most `rate` times a second."""
+    """Draws what changed, at most `rate` times a second, and publishes numbers, at most `numeric_rate`."""
 
     drain_quiet_s = 0.1  # it draws the end of a mission, too
     pause_s = 0.05  # no node waits for it
@@ -40,6 +45,10 @@ class VisualizerNode(MissionNode):
     def configure(self) -> None:
         """Load the scenario whose clusters and dock are drawn."""
         self.scenario = scenarios.load(self.values["scenario"])
+        has_model = self.scenario.energy is not None and "bridge" not in self.values["peers"]
+        applies = {"battery": has_model, "tf": self.values["tf"], **dict.fromkeys(NUMERIC, True)}
+        is_on = self.values["numeric_rate"] > 0
+        self.not_published = {name for name, does in applies.items() if not (does and is_on)}
 
     def activate(self) -> None:
         """Start drawing."""
@@ -47,10 +56,13 @@ class VisualizerNode(MissionNode):
         self._newest: dict[str, tuple[int, bytes]] = {}  # by topic: publication time and message
         self._has_changed = False
         self._drawn_version = -1  # of the path
+        self._pose: cdr.Pose | None = None  # published last as `odom`
+        self._numbers = RateLimiter(self.values["numeric_rate"], self._publish_numbers)
         self.timer(1.0 / self.values["rate"], self._draw)
 
     def deactivate(self) -> None:
-        """Draw the last state."""
+        """Publish the last state."""
+        self._numbers.flush(at_once=True)
         self._draw()
 
     def subscribe(self, topic: Topic) -> Any:
@@ -67,6 +79,7 @@ class VisualizerNode(MissionNode):
                     self._add_users(data, published_ns)
                 self._newest[topic.name] = (published_ns, data)
             self._has_changed = True
+            self._numbers.request(topic.name)
 
         return self.subscribe_serialised(topic, handle)
 
@@ -78,6 +91,8 @@ class VisualizerNode(MissionNode):
         began_ns = self._path.add_users(
             mission=header.mission, step=header.step, stamp_ns=header.stamp_ns, published_ns=published_ns
         )
+        if began_ns is not None:
+            self._pose = None  # no velocity from the end of one mission to the start of the next
         if began_ns is not None and self._newest.get("rates", (began_ns + 1, b""))[0] <= began_ns:
             del self._newest["rates"]  # of another mission, maybe with the same number
 
@@ -94,7 +109,24 @@ class VisualizerNode(MissionNode):
             return None
         return payload
 
+    def _publish_numbers(self, topic: str) -> None:
+        """Publish the numbers of a topic's newest message."""
+        if topic == "pose" and (pose := self._path.newest) is not None:
+            self.publish("odom", numeric_messages.odometry(pose, self._pose))
+            self._pose = pose
+            if "tf" in self.publishers_of:
+                self.publish("tf", numeric_messages.transform(pose))
+        elif topic == "rates" and (rates := self._payload("rates", messages.Rates)) is not None:
+            self.publish("sum_rate", numeric_messages.float64(rates.sum_rate_bps))
+            self.publish("users_collected", numeric_messages.int32(sum(rates.collected)))
+        elif topic == "mission" and (mission := self._payload("mission", messages.Mission)) is not None:
+            self.publish("remaining_steps", numeric_messages.int32(mission.remaining_steps))
+            if "battery" in self.publishers_of and mission.state_of_charge is not UNSET:
+                now_ns: int = self.get_clock().now().nanoseconds
+                self.publish("battery", numeric_messages.battery(mission.state_of_charge, now_ns))
+
     def _draw(self) -> None:
+        self._numbers.flush()
         if not self._has_changed:
             return
         self._has_changed = False

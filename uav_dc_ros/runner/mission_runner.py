@@ -22,9 +22,10 @@ from uav_dc_ros.nodes.framework.other_publishers import AnotherMissionError
 from uav_dc_ros.nodes.framework.parameters import ADDRESS, EXTERNAL
 from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 from uav_dc_ros.run_config import RunConfig
-from uav_dc_ros.runner import node_locks, run_options
+from uav_dc_ros.runner import node_locks, run_options, web_page
 from uav_dc_ros.runner.monitor import MissionMonitor, MonitoredMission
 from uav_dc_ros.runner.supervisor import Supervisor
+from uav_dc_ros.runner.web_page import WebPage
 from uav_dc_ros.runner.working_folder import working_folder
 from uav_dc_ros.topics import SIMULATED, TOPICS
 
@@ -83,6 +84,9 @@ class MissionRunner:
             from uav_dc_ros.nodes.view import foxglove_server  # imports rosbags
 
             foxglove_server.check(address=str(ADDRESS.default), port=config.live)
+        self._page: WebPage | None = None
+        if config.view is not None:
+            self._page = WebPage(config.view, self._settings.get(web_page.NODE, {}))
         bag = None if config.bag is None else Path(config.bag)
         self.bag = run_options.new_bag(bag) if "recorder" in self.nodes else None
         if config.summary is not None:
@@ -108,7 +112,7 @@ class MissionRunner:
 
     def run(self) -> int:
         """Fly, in a ROS context of its own and without signal handlers; returns the command's exit status."""
-        status = 0
+        status, view = 0, None
         with working_folder() as folder, ExitStack() as stack:
             network = Network(self.config.namespace, self._create_monitor)
             stack.callback(network.leave)
@@ -133,13 +137,19 @@ class MissionRunner:
             is_complete = len(self.summaries) >= self.config.missions
             if is_complete and self._elsewhere():
                 time.sleep(RESEND_S)  # what the monitor has received, the recorder may not yet have
+            if self._page is not None and web_page.is_attended() and self._show and not self.interrupted:
+                view = supervisor.release(web_page.NODE)
             exits = supervisor.stop(network.leave if is_complete else lambda: None)
             status = max(status, self._check_exits(exits))
             if not is_complete:
                 self._complete_summaries(network.node, network.executor)
         status = max(status, self._repair_bag(), int(self._aborted))
         self._write_summary()
-        return cli.INTERRUPTED if self.interrupted else status
+        status = cli.INTERRUPTED if self.interrupted else status
+        if self._page is not None and view is not None:
+            self._note(f"the page stays at {self._page.url} until Ctrl-C")
+            self._page.keep(view, lambda: self.interrupted)
+        return status
 
     def _create_monitor(self, context: Context) -> MissionMonitor:
         seed = self.config.seed if "world" in self.nodes else None
@@ -166,7 +176,7 @@ class MissionRunner:
     def _follow(self, supervisor: Supervisor, node: MissionMonitor, executor: DirectExecutor) -> None:
         """Spin until all missions are over, or the run is interrupted."""
         self._step_s = time.monotonic()
-        check_s = 0.0
+        check_s, is_page_open = 0.0, False
         while not (self.interrupted or (node.is_alone and len(self.summaries) >= self.config.missions)):
             tick_s = TICK_S if supervisor.brought_up else BRING_UP_TICK_S
             executor.spin_once(tick_s)
@@ -175,6 +185,9 @@ class MissionRunner:
                 check_s = now_s + tick_s
                 node.check_publishers(supervisor.have_started)
                 supervisor.tick(node.is_alone)
+                if supervisor.brought_up and self._page is not None and not is_page_open:
+                    is_page_open = True
+                    self._page.open_browser()
                 # The timeout of a step starts when the mission may begin, and with each restart of a node.
                 if not node.is_alone or node.restarts_of != supervisor.restarts:
                     node.restarts_of, self._step_s = supervisor.restarts, now_s
@@ -284,6 +297,7 @@ class MissionRunner:
                 "use_sim_time": self.is_simulated and "clock" not in row.publishes,
                 **own,
                 **self._settings.get(name, {}),
+                **(self._page.parameters if self._page is not None and name == web_page.NODE else {}),
             }
         return parameters
 

@@ -37,6 +37,8 @@ def nodes(config: RunConfig) -> list[str]:
         raise ParameterError(f"--nodes: 'bridge'; expected it with --vehicle {', '.join(VEHICLES)} only")
     if config.live is not None:
         selected.append("live_view")
+    if config.view is not None:
+        selected.append("web_view")
     if "recorder" in selected and not config.record:
         raise ParameterError("--nodes: 'recorder', with --no-record; expected one or the other")
     if "recorder" not in selected and config.bag is not None:

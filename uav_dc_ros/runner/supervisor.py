@@ -179,6 +179,14 @@ class Supervisor:
             node.process.wait(time.monotonic() + node.row.stop_timeout_s)
         self.nodes.remove(node)
 
+    def release(self, name: str) -> NodeProcess | None:
+        """Supervise a node no more: the caller stops its process. None: it does not run."""
+        for node in self.nodes:
+            if node.row.name == name:
+                self.nodes.remove(node)
+                return node.process
+        return None
+
     def stop(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, int]:
         """Stop all nodes, higher ranks first; returns exit statuses by process name.
 

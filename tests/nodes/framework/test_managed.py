@@ -15,7 +15,7 @@ from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
 from uav_dc_ros.nodes.framework.parameters import COMMON
 from uav_dc_ros.nodes.world import WorldNode
 
-PROCESSES = [name for name, row in NODES.items() if row.process and name != "live_view"]
+PROCESSES = [name for name, row in NODES.items() if row.process and name not in ("live_view", "web_view")]
 NO_AUTOPILOT = "tcp:127.0.0.1:9"  # nothing listens there
 
 

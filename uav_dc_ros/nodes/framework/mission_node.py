@@ -53,6 +53,7 @@ class MissionNode(ManagedNode):
         self.restarts = int(os.environ.get(SUPERVISED) or 0)  # of its process
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.message_bytes: dict[str, int] = {}  # about, of large messages, by topic; `configure` sets it
+        self.not_published: set[str] = set()  # topics of the row that do not apply; `configure` sets it
         self.published_ns = 0  # publication time of the message being handled, nanoseconds since the epoch
         # Handles callbacks for so many seconds, inside a callback; `node_main` sets it.
         self.spin_once: Callable[[float], None] = time.sleep
@@ -76,7 +77,9 @@ class MissionNode(ManagedNode):
         self._until_cleanup.callback(self.publishers_of.clear)
         for name in self.row.publishes:
             topic = TOPICS[name]
-            kind, profile = qos.MESSAGE_TYPES[topic.type], qos.offered(topic, self.message_bytes.get(name, 0))
+            kind, profile = qos.message_class(topic), qos.offered(topic, self.message_bytes.get(name, 0))
+            if kind is None or name in self.not_published:
+                continue
             with qos.overridable(name) as options:
                 publisher = qos.create_publisher(self, kind, name, profile, **options)
             self.publishers_of[name] = publisher
@@ -95,6 +98,8 @@ class MissionNode(ManagedNode):
         super()._activate()
         self._until_inactive.callback(self.subscriptions_of.clear)
         for name in self.row.subscribes:
+            if qos.message_class(TOPICS[name]) is None:
+                continue
             subscription = self.subscribe(TOPICS[name])
             self.subscriptions_of[name] = subscription
             self._until_inactive.callback(self.destroy_subscription, subscription)
@@ -166,7 +171,7 @@ class MissionNode(ManagedNode):
 
     def create_raw_subscription(self, topic: Topic, callback: Callable[[bytes, Any], None]) -> Any:
         """Subscribe with the table's QoS, as overridden; the callback takes serialised messages and info."""
-        kind, profile = qos.MESSAGE_TYPES[topic.type], qos.requested(topic, keep_all=self.row.keeps_all)
+        kind, profile = qos.message_class(topic), qos.requested(topic, keep_all=self.row.keeps_all)
         with qos.overridable(topic.name) as options:
             return qos.create_subscription(self, kind, topic.name, callback, profile, **options)
 
@@ -193,7 +198,7 @@ class MissionNode(ManagedNode):
         self.publish(topic, cdr.encode_string(text))
 
     def publish(self, topic: str, message: Any) -> None:
-        """Publish a message, or its serialised form, on any topic."""
+        """Publish a message, or its serialised form, on a topic that applies."""
         self.statistics.published[topic] += 1
         self.publishers_of[topic].publish(message)
 

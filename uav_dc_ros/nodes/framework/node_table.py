@@ -6,6 +6,9 @@ from dataclasses import dataclass, field, replace
 from uav_dc_ros.nodes.framework import parameters as p
 from uav_dc_ros.topics import TOPICS
 
+# Numbers of the mission as standard messages.
+NUMERIC = ("sum_rate", "users_collected", "remaining_steps", "odom")
+
 
 @dataclass(frozen=True, kw_only=True)
 class NodeRow:
@@ -44,7 +47,7 @@ NODES: dict[str, NodeRow] = {
         ),
         NodeRow(
             name="bridge",
-            publishes=("pose", "mission", "target", "diagnostics"),
+            publishes=("pose", "mission", "target", "battery", "fix", "diagnostics"),
             subscribes=("move", "ready"),
             parameters=p.BRIDGE,
             rank=2,
@@ -67,7 +70,7 @@ NODES: dict[str, NodeRow] = {
         NodeRow(
             name="recorder",
             publishes=("ready", "diagnostics"),
-            subscribes=tuple(topic.name for topic in TOPICS.values() if topic.recorded),
+            subscribes=tuple(one.name for one in TOPICS.values() if one.recorded and not one.optional),
             parameters=(
                 *(p.SCENARIO, p.RECORDED_POLICY, p.SEED, p.MISSIONS, p.PACE, p.RECORDED_VEHICLE),
                 *p.BAG_WRITER,
@@ -91,9 +94,9 @@ NODES: dict[str, NodeRow] = {
         ),
         NodeRow(
             name="visualizer",
-            publishes=("path", "markers", "ready", "diagnostics"),
+            publishes=("path", "markers", *NUMERIC, "battery", "tf", "ready", "diagnostics"),
             subscribes=("pose", "target", "users", "rates", "mission"),
-            parameters=(p.SCENARIO, p.RATE_HZ),
+            parameters=(p.SCENARIO, p.RATE_HZ, p.NUMERIC_RATE_HZ, p.TF),
             keeps_all=True,
             needed=False,
         ),
@@ -102,6 +105,14 @@ NODES: dict[str, NodeRow] = {
             publishes=("diagnostics",),
             subscribes=tuple(topic.name for topic in TOPICS.values() if topic.name != "ready"),
             parameters=(p.PORT, p.ADDRESS),
+            needed=False,
+            on_request=True,
+        ),
+        NodeRow(
+            name="web_view",
+            publishes=("diagnostics",),
+            subscribes=("mission", "users", "rates"),
+            parameters=(p.SCENARIO, p.WEB_PORT, p.ADDRESS, p.TOKEN),
             needed=False,
             on_request=True,
         ),

@@ -138,9 +138,26 @@ RECORDED_VEHICLE = Parameter(
     "vehicle", SIMULATED, "vehicle that flies, or its interface", choices=(SIMULATED, *VEHICLES)
 )
 RATE_HZ = Parameter("rate", 5.0, "maximum rate of path and markers", "Hz", 0.1, 60.0)
+NUMERIC_RATE_HZ = Parameter(
+    "numeric_rate",
+    20.0,
+    "maximum rate of each topic of numbers, from sum_rate to tf; faster steps are left out; 0: none",
+    "Hz",
+    0.0,
+    1000.0,
+)
+TF = Parameter(
+    "tf", True, "publish map to base_link where tf2_msgs is installed; false: another node publishes it"
+)
 PORT = Parameter("port", 8765, "TCP port of the Foxglove WebSocket server; 0: any that is free", "", 0, 65535)
 ADDRESS = Parameter(
     "address", "127.0.0.1", "network address that the server listens on; 0.0.0.0: all of this machine's"
+)
+WEB_PORT = Parameter("port", 8766, "TCP port of the page; 0: any that is free", "", 0, 65535)
+TOKEN = Parameter(
+    "token",
+    "",
+    "secret that the page's address must hold; empty: none on 127.0.0.1, and a random one on other addresses",
 )
 
 # Of the nodes that write a bag.

@@ -8,7 +8,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Path
+from nav_msgs.msg import Odometry, Path
 from rclpy.duration import Duration, Infinite
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
@@ -27,11 +27,12 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import String
+from std_msgs.msg import Float64, Int32, String
 from visualization_msgs.msg import MarkerArray
 
 from uav_dc_ros import topics
 from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.nodes.ros import message_types
 from uav_dc_ros.topics import Topic
 
 MESSAGE_TYPES: dict[str, type] = {
@@ -41,6 +42,9 @@ MESSAGE_TYPES: dict[str, type] = {
     topics.MARKERS: MarkerArray,
     topics.DIAGNOSTICS: DiagnosticArray,
     topics.CLOCK: Clock,
+    topics.FLOAT: Float64,
+    topics.INTEGER: Int32,
+    topics.ODOMETRY: Odometry,
 }
 NEWEST = 100  # depth of a subscription: a burst of invalid messages must not displace a valid one
 HISTORY_BYTES = 64 * 2**20  # that a publisher keeps of one topic for late subscribers
@@ -49,6 +53,11 @@ UNKNOWN = "UNKNOWN_"  # in a name that the graph does not know yet
 OVERRIDES = QoSOverridingOptions(
     [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY]
 )
+
+
+def message_class(topic: Topic) -> Any:
+    """The Python class of a topic's messages; None if their package is not installed."""
+    return MESSAGE_TYPES.get(topic.type) or message_types.find(topic.type)  # rare ones take time to import
 
 
 def offered(topic: Topic, message_bytes: int = 0) -> QoSProfile:
