@@ -18,7 +18,7 @@ class Chart {
   }
 
   redraw() {
-    if (!this.asked) { this.asked = true; requestAnimationFrame(() => { this.asked = false; this.paint(); }); }
+    if (!this.scheduled) { this.scheduled = true; requestAnimationFrame(() => { this.scheduled = false; this.paint(); }); }
   }
 
   paint() {
@@ -30,7 +30,7 @@ class Chart {
     const pen = canvas.getContext("2d");
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.font = "11px system-ui, sans-serif";
-    const step = niceStep((this.top ?? Math.max(1e-9, ...y.filter(known))) / 3.999);
+    const step = niceStep((this.top ?? (Math.max(0, ...y.filter(known)) || 4)) / 3.999);
     const top = this.top ?? step * 4;
     const values = Array.from({ length: 5 }, (_, i) => i * step).filter((value) => value <= top * 1.0001);
     const labels = values.map((value) => `${Number(value.toPrecision(3)).toLocaleString("en")}`);

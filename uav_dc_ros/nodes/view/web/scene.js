@@ -3,6 +3,8 @@
 
 const LIGHT = [0.35, -0.5, 0.79];
 const TURN = 0.008; // radians for a pixel
+const EYE = 3.4; // distance of the eye, in units of the field's size
+const ROOM = 34; // pixels on each side
 const BACK = { yaw: -0.6, pitch: 0.85, zoom: 1 };
 const USERS = [["0", "waiting", "waiting"], ["1", "served", "being served"], ["2", "collected", "collected"]];
 
@@ -58,22 +60,29 @@ class Scene {
   draw(what) { this.drawn = what; this.redraw(); }
 
   redraw() {
-    if (!this.asked) { this.asked = true; requestAnimationFrame(() => { this.asked = false; this.paint(); }); }
+    if (!this.scheduled) { this.scheduled = true; requestAnimationFrame(() => { this.scheduled = false; this.paint(); }); }
   }
 
-  // The projection: metres to pixels, and the distance from the eye, in units of the field's size.
+  // The projection: metres to pixels, and the distance from the eye, in units of the field's size. The field fills
+  // the canvas, with room for the labels.
   fit(bounds, width, height) {
     const { yaw, pitch, zoom } = this.camera;
     const [cx, cy] = [(bounds.x[0] + bounds.x[1]) / 2, (bounds.y[0] + bounds.y[1]) / 2];
     const size = Math.hypot(bounds.x[1] - bounds.x[0], bounds.y[1] - bounds.y[0], bounds.z) / 2 || 1;
     const [sy, cyaw, sp, cp] = [Math.sin(yaw), Math.cos(yaw), Math.sin(pitch), Math.cos(pitch)];
-    const EYE = 3.4;
-    const focal = 1.62 * zoom * Math.min(width, 1.35 * height);
-    return (x, y, z) => {
-      const [dx, dy, dz] = [(x - cx) / size, (y - cy) / size, (z - 0.3 * bounds.z) / size];
+    const project = (x, y, z) => {
+      const [dx, dy, dz] = [(x - cx) / size, (y - cy) / size, z / size];
       const [rx, ry] = [cyaw * dx - sy * dy, sy * dx + cyaw * dy];
       const depth = EYE + cp * ry - sp * dz;
-      return [width / 2 + (focal * rx) / depth, height / 2 - (focal * (sp * ry + cp * dz)) / depth, depth];
+      return [rx / depth, -(sp * ry + cp * dz) / depth, depth];
+    };
+    const corners = bounds.x.flatMap((x) => bounds.y.flatMap((y) => [0, bounds.z].map((z) => project(x, y, z))));
+    const range = (i) => [Math.min(...corners.map((one) => one[i])), Math.max(...corners.map((one) => one[i]))];
+    const [[left, right], [top, bottom]] = [range(0), range(1)];
+    const scale = zoom * Math.min((width - 2 * ROOM) / (right - left), (height - 2 * ROOM) / (bottom - top));
+    return (x, y, z) => {
+      const [px, py, depth] = project(x, y, z);
+      return [width / 2 + scale * (px - (left + right) / 2), height / 2 + scale * (py - (top + bottom) / 2), depth];
     };
   }
 
@@ -120,7 +129,7 @@ class Scene {
 
   ground(pen, at, line, bounds) {
     const step = niceStep((bounds.x[1] - bounds.x[0]) / 6);
-    const first = ([low]) => Math.ceil(low / step) * step;
+    const first = ([low]) => Math.ceil(low / step) * step + 0; // no -0
     pen.strokeStyle = colour("faint"); pen.lineWidth = 1; pen.fillStyle = colour("muted"); pen.font = "11px system-ui, sans-serif";
     pen.textAlign = "center";
     for (let x = first(bounds.x); x <= bounds.x[1]; x += step) {

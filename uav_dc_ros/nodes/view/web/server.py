@@ -85,7 +85,7 @@ class ViewServer:
     """A running server of a page and its feed.
 
     With a `token`, pages need `?token=TOKEN` in their address. Without one, the server answers only browsers
-    that ask for it by a name of this machine: a page of another site cannot reach it under a name of its own.
+    whose address names this machine: a page of another site cannot reach it under a name of its own.
     Raises ParameterError if the port is in use, or the address belongs to another machine.
     """
 
@@ -136,7 +136,7 @@ class _HttpServer(ThreadingHTTPServer):
         super().__init__((address, port), _Handler)
 
     def server_bind(self) -> None:
-        """Bind, without the name server that the base class asks for this machine's name."""
+        """Bind, without the name server that the base class queries for this machine's name."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
@@ -152,13 +152,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer a browser."""
-        view, asked = self.server.view, urlsplit(self.path)
-        if not self._is_allowed(asked.query):
+        view, target = self.server.view, urlsplit(self.path)
+        if not self._is_allowed(target.query):
             expected = "the address that run_all printed, with its token" if view.token else "localhost"
             self._answer(HTTPStatus.FORBIDDEN, "text/plain", f"expected {expected}\n".encode())
-        elif asked.path == "/":
+        elif target.path == "/":
             self._answer(HTTPStatus.OK, "text/html; charset=utf-8", view.page)
-        elif asked.path != "/news":
+        elif target.path != "/news":
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected / or /news\n")
         elif not view.admit(1):
             self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages are open\n")

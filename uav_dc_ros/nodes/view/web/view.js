@@ -5,7 +5,7 @@
 const at = (id) => document.getElementById(id);
 const missions = new Map(); // by key
 const panels = new Map(); // by namespace
-const state = { step: null, asked: false }; // step: null means now
+const state = { step: null, scheduled: false }; // step: null means now
 window.view = { missions, panels, state }; // for tests and the curious
 
 function take(news) {
@@ -22,11 +22,11 @@ function take(news) {
     mission.events = [...mission.events, ...(one.events ?? [])].slice(-200);
     if (one.path) mission.path = [...mission.path.slice(0, one.path_from), ...one.path];
   }
-  ask();
+  schedule();
 }
 
-function ask() {
-  if (!state.asked) { state.asked = true; requestAnimationFrame(() => { state.asked = false; show(); }); }
+function schedule() {
+  if (!state.scheduled) { state.scheduled = true; requestAnimationFrame(() => { state.scheduled = false; show(); }); }
 }
 
 const title = (mission) => (mission.head.namespace === "/" ? mission.head.scenario : mission.head.namespace.slice(1));
@@ -45,19 +45,20 @@ function show() {
   at("transport").hidden = !missions.size;
   at("step").max = last;
   if (state.step === null) at("step").value = last;
+  at("transport").classList.toggle("past", state.step !== null);
   at("live").setAttribute("aria-pressed", String(state.step === null));
   const shown = state.step ?? last;
   at("position").textContent = state.step === null ? `step ${shown}, now` : `step ${shown} of ${last}`;
   at("step").setAttribute("aria-valuetext", at("position").textContent);
 }
 
-function go(step) { state.step = step; if (step !== null) at("step").value = step; ask(); }
+function go(step) { state.step = step; if (step !== null) at("step").value = step; schedule(); }
 
 class Panel {
   constructor(namespace) {
     this.namespace = namespace;
     this.chosen = null; // key of a mission; null: the newest
-    this.select = make("select", { "aria-label": "Mission", onchange: () => { this.chosen = this.select.selectedIndex === 0 ? null : Number(this.select.value); ask(); } });
+    this.select = make("select", { "aria-label": "Mission", onchange: () => { this.chosen = this.select.selectedIndex === 0 ? null : Number(this.select.value); schedule(); } });
     this.about = make("p", { class: "sub" });
     this.tiles = make("div");
     this.note = make("p", { class: "note" });
@@ -103,7 +104,6 @@ class Panel {
     let i = steps.length - 1;
     while (past && i > 0 && steps[i].step > state.step) i--;
     const step = steps[i] ?? null;
-    this.element.classList.toggle("past", past);
     this.showNumbers(mission, step, past, max);
     this.showScene(mission, i, past);
     this.showCharts(mission, step, max);
@@ -210,5 +210,5 @@ function connect() {
 
 at("step").addEventListener("input", () => go(Number(at("step").value)));
 at("live").addEventListener("click", () => go(null));
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { for (const panel of panels.values()) panel.listedEvents = null; ask(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { for (const panel of panels.values()) panel.listedEvents = null; schedule(); });
 connect();

@@ -1,0 +1,117 @@
+"""What it costs a mission to publish its numbers as standard messages, and to be watched on a page.
+
+    python benchmarks/watching.py [ROUNDS]
+
+Each round flies missions in lockstep in four ways, one after another, in an order that changes from round to
+round, and then one mission at pace 1 with steps of a second in three of them. It prints medians over the
+rounds of the ratio to the first way within a round. The page's reader is a client of its stream: it reads all
+that a browser would, and draws nothing. The last way has one more client that never reads.
+"""
+
+import contextlib
+import http.client
+import os
+import statistics
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from flights import NODES, Flown, fly
+
+from uav_dc_ros import files
+from uav_dc_ros.nodes.view.web.server import free_port
+
+MISSIONS = 60
+SECONDS = 20
+WITH = (*NODES, "visualizer")
+NO_NUMBERS = ("--set", "visualizer.numeric_rate=0")
+
+
+@contextlib.contextmanager
+def watched(port: int, reads: bool) -> Iterator[None]:
+    """A client of a page that appears at this port, and stays connected."""
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.05):
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+                connection.request("GET", "/news")
+                response = connection.getresponse()
+                while reads and response.fp.readline():
+                    pass
+                over.wait()
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+
+
+def flown(folder: Path, way: str, *options: object) -> Flown:
+    """One flight in a way."""
+    if way == "without numbers":
+        return fly(folder, *options, *NO_NUMBERS, nodes=WITH)
+    if way == "with numbers":
+        return fly(folder, *options, nodes=WITH)
+    port = free_port("127.0.0.1")
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(watched(port, reads=True))
+        if way == "with a slow page":
+            stack.enter_context(watched(port, reads=False))
+        return fly(folder, *options, "--view", port, nodes=WITH)
+
+
+WAYS = ("without numbers", "with numbers", "with a page", "with a slow page")
+
+
+def report(title: str, unit: str, rounds: list[dict[str, float]]) -> None:
+    """Print the median of each way, and of its ratio to the first and to the second."""
+    print(f"{title}, {len(rounds)} rounds, {os.cpu_count()} cores")
+    for way in rounds[0]:
+        value = statistics.median(one[way] for one in rounds)
+        ratios = [
+            statistics.median(one[way] / one[base] for one in rounds)
+            for base in WAYS[:2]
+            if base in rounds[0]
+        ]
+        print(f"  {way}: {value:.3f} {unit}, " + " and ".join(f"{ratio:.3f}" for ratio in ratios) + " times")
+
+
+def main() -> None:
+    """Fly the rounds, and print what they took."""
+    rounds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    steps: list[dict[str, float]] = []
+    late: list[dict[str, float]] = []
+    shipped = (Path(files.__file__).parent / "scenarios" / "five_clusters_hover.toml").read_text("utf-8")
+    text = shipped.replace("step_s = 15.0", "step_s = 1.0").replace(
+        "max_steps = 60", f"max_steps = {SECONDS}"
+    )
+    assert "step_s = 1.0" in text, "the scenario has changed"
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        scenario = folder / "seconds.toml"
+        scenario.write_text(text)
+        for i in range(rounds):
+            order = WAYS[i % len(WAYS) :] + WAYS[: i % len(WAYS)]
+            lockstep = ("--pace", "lockstep", "--missions", MISSIONS)
+            found = {way: statistics.median(flown(folder, way, *lockstep).step_ms) for way in order}
+            steps.append({way: found[way] for way in WAYS})
+            print(", ".join(f"{way} {ms:.3f} ms" for way, ms in steps[-1].items()), flush=True)
+        real = ("--scenario", scenario, "--policy", "five_clusters_hover_dueling", "--pace", 1)
+        for _ in range(min(rounds, 3)):
+            found = {way: flown(folder, way, *real) for way in WAYS[:3]}
+            late.append({way: one.last("world", "step lateness p50 [ms]") for way, one in found.items()})
+            print(", ".join(f"{way} {ms:.2f} ms" for way, ms in late[-1].items()), flush=True)
+            overruns = {way: one.last("world", "step overruns") for way, one in found.items()}
+            print(f"overruns: {overruns}", flush=True)
+    report("a step in lockstep, median", "ms", steps)
+    report("a step at pace 1 starts late by, median", "ms", late)
+
+
+if __name__ == "__main__":
+    main()
