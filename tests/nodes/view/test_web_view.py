@@ -17,9 +17,11 @@ import pytest
 
 from tests.conftest import Ros, finish, wait_for
 from tests.nodes.view.foxglove_client import is_free
+from uav_dc_ros import scenarios
 
 LINE = re.compile(r"live view: http://127\.0\.0\.1:(\d+)/\n")
 STEPS = 30  # of the small world
+SHIPPED = "three_clusters_hover"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 ROOT = ("--no-sandbox",) if os.geteuid() == 0 else ()
 # Where the UAV is drawn, and how much of the canvas is.
@@ -80,19 +82,14 @@ class Opened:
 
 
 @pytest.mark.long
-def test_a_browser_sees_two_uavs_move_and_goes_back_in_time(
-    ros: Ros, small_scenario: Path, small_policy: Path
-) -> None:
+def test_a_browser_sees_two_uavs_move_and_goes_back_in_time(ros: Ros) -> None:
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine")
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
-    given = ("--pace", 20, "--missions", 2)
-    flight, port = start(ros, small_scenario, small_policy, *given, "--namespace", "uav1")
-    other = ros.start(
-        "uav_dc_ros.run_all",
-        *("--scenario", small_scenario, "--policy", small_policy, "--no-record", "--seed", 5),
-        *(*given, "--namespace", "uav2"),
-    )
+    given = ("--scenario", SHIPPED, "--pace", 15, "--no-record")
+    flight, port = start(ros, SHIPPED, f"{SHIPPED}_dueling", "--pace", 15, "--namespace", "uav1")
+    other = ros.start("uav_dc_ros.run_all", *given, "--seed", 5, "--missions", 9, "--namespace", "uav2")
+    begin = ",".join(f"{value:g}" for value in scenarios.load(SHIPPED).mission.start_m)
     try:
         with playwright.sync_playwright() as started:
             browser = started.chromium.launch(executable_path=CHROMIUM, args=ROOT)
@@ -105,10 +102,10 @@ def test_a_browser_sees_two_uavs_move_and_goes_back_in_time(
             desktop.page.get_by_label("Step", exact=True).focus()
             desktop.page.keyboard.press("Home")
             desktop.wait("() => window.view.state.step === 0")
-            desktop.wait(f"() => String(({UAV})('/uav1')) === '0,0,100'")
+            desktop.wait(f"() => String(({UAV})('/uav1')) === '{begin}'")
             assert desktop.page.locator("#position").inner_text().startswith("step 0 of")
             desktop.page.get_by_role("button", name="Live").click()
-            desktop.wait(f"() => String(({UAV})('/uav1')) !== '0,0,100'")
+            desktop.wait(f"() => String(({UAV})('/uav1')) !== '{begin}'")
 
             phone = Opened(browser, port, viewport={"width": 360, "height": 640}, color_scheme="dark")
             phone.wait(f"() => ({UAV})('/uav1')")
@@ -125,7 +122,7 @@ def test_a_browser_sees_two_uavs_move_and_goes_back_in_time(
                 opened.page.locator("#link", has_text="The run has ended").wait_for(timeout=60_000)
             desktop.page.get_by_label("Step", exact=True).focus()
             desktop.page.keyboard.press("Home")
-            desktop.wait(f"() => String(({UAV})('/uav1')) === '0,0,100'")
+            desktop.wait(f"() => String(({UAV})('/uav1')) === '{begin}'")
             assert desktop.wrong == phone.wrong == []
             browser.close()
     finally:
