@@ -31,6 +31,7 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.registration import ENV_ID
+from uav_dc_ros.offboard.frames import Enu, Geodetic
 
 STEPS = 7  # of the low world's missions
 NODES = ("--nodes", "bridge,world,channel_monitor,policy,recorder")  # without the visualizer
@@ -62,6 +63,18 @@ def check_steps(bag: Path, steps: int = STEPS) -> None:
     assert used_j == pytest.approx({step: step * used_j[1] for step in range(steps + 1)})
     assert 1500.0 < used_j[1] < 1700.0
     assert reported[-1]["state_of_charge"] == pytest.approx(1.0 - used_j[steps] / LOW_BATTERY_J)
+
+
+def check_numbers(bag: list[tuple[str, Any]], datum: Geodetic, at_the_end: Enu) -> None:
+    """The battery that the vehicle reports falls, and its last position on the Earth is that of the grid."""
+    charges = [message.percentage for topic, message in bag if topic == "/battery"]
+    assert len(charges) > 5
+    assert 1.0 >= charges[0] >= charges[-1] >= 0.0
+    fix = [message for topic, message in bag if topic == "/fix"][-1]
+    expected = datum.at(at_the_end)
+    assert fix.latitude == pytest.approx(expected.latitude_deg, abs=3e-5)  # three metres
+    assert fix.longitude == pytest.approx(expected.longitude_deg, abs=5e-5)
+    assert np.isnan(fix.altitude)
 
 
 def killed(ros: Ros, node: str, run_all: subprocess.Popen[str]) -> float:
@@ -141,6 +154,7 @@ def test_a_whole_mission(ros: Ros, kind: str, wire: str, name: str, least: int) 
     assert phases[5:-2] == ["moving", "ready"] * (steps - 1) + ["moving"]
     assert phases[-2:] == ["landing", "landed"]
     assert all(p["reason"] for t, p in bag if t == "/mission")
+    check_numbers(bag, Geodetic.parse(kept["datum"]), Enu(*scenario.mission.dock_m, 0.0))
     crowd = WalkingUsers(scenario, 3)
     users = {p["step"]: p for t, p in bag if t == "/users"}
     assert users.keys() == set(range(steps + 1))

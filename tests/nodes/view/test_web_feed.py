@@ -14,7 +14,7 @@ from tests.support.worlds import tiny
 from uav_dc_ros import cdr, messages
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import FaultKind, Mission, Phase, Rates, Users
-from uav_dc_ros.nodes.view.web import mission_history
+from uav_dc_ros.nodes.view.web import inbox, mission_history
 from uav_dc_ros.nodes.view.web.feed import MISSIONS_MAX, Cursor, Feed
 from uav_dc_ros.nodes.view.web.inbox import Inbox
 
@@ -217,6 +217,20 @@ def test_namespaces_stand_side_by_side_and_each_keeps_its_last_missions() -> Non
         range(3, 3 + MISSIONS_MAX)
     )
     assert [head["namespace"] for head in heads].count("/uav2") == 1
+
+
+def test_users_without_rates_take_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inbox, "PENDING_BYTES", 5000)
+    flight = Flight()
+    for step in range(300):
+        flight.send(users(step), users(step), status(step))
+    kept = flight.inbox._pending
+    assert 0 < sum(len(text) for topics in kept.values() for text, _ in topics.values()) <= 5000
+    assert flight.inbox._pending_bytes <= 5000
+    flight.send(rates(299))
+    flight.update()
+    (mission,) = Page(flight.feed).read().values()
+    assert [(one["step"], xs(one)) for one in mission["steps"]] == [(299, users(299).x_m)]
 
 
 def test_what_is_no_message_of_the_mission_is_rejected() -> None:

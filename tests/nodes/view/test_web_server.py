@@ -90,7 +90,7 @@ def test_other_machines_need_a_token() -> None:
     drawn = server.token_for("0.0.0.0", "")
     assert len(drawn) >= 16
     assert drawn != server.token_for("0.0.0.0", "")
-    assert server.url("0.0.0.0", 8766, drawn) == f"http://127.0.0.1:8766/?token={drawn}"
+    assert server.url("0.0.0.0", 8766, drawn) == f"http://{socket.gethostname()}:8766/?token={drawn}"
     assert server.url("::1", 1, "") == "http://[::1]:1/"
 
 

@@ -13,7 +13,8 @@ from uav_dc_ros.nodes.view.web.feed import Feed
 from uav_dc_ros.nodes.view.web.mission_history import MissionHistory, is_routine
 
 VALUES_MAX = 2000  # steps times users that one update decodes; at least one step
-PENDING_MAX = 2000  # steps that wait for their other messages
+PENDING_MAX = 2000  # steps that wait for their other messages ...
+PENDING_BYTES = 64 * 2**20  # ... and their bytes: a dead channel monitor leaves users without rates
 
 Step = tuple[str, int, int]  # run, mission and step
 
@@ -46,6 +47,7 @@ class Inbox:
         self.namespace = namespace
         self._feed, self._find_scenario, self._clock_s = feed, find_scenario, clock_s
         self._pending: dict[Step, dict[str, tuple[bytes, float]]] = {}  # messages by topic, with their times
+        self._pending_bytes = 0
         self._statuses: list[tuple[bytes, float]] = []  # that are decoded with the next update
         self._newest: MissionHistory | None = None
         self._began_s: dict[int, float] = {}  # by key of the mission
@@ -65,13 +67,13 @@ class Inbox:
             raise MessageError("malformed", messages.one_line(str(error))) from None
         now_s = self._clock_s()
         step = header.run, header.mission, header.step
-        self._pending.setdefault(step, {})[topic] = text, now_s
+        self._keep(step, topic, text, now_s)
         if topic == "mission":
             if self._statuses and is_routine(self._statuses[-1][0]):
                 self._statuses.pop()  # only the newest one of many is shown
             self._statuses.append((text, now_s))
-        while len(self._pending) > PENDING_MAX:
-            del self._pending[next(iter(self._pending))]
+        while len(self._pending) > PENDING_MAX or self._pending_bytes > PENDING_BYTES:
+            self._drop(next(iter(self._pending)))
         del self._statuses[:-PENDING_MAX]
         self.has_new = True
 
@@ -97,7 +99,15 @@ class Inbox:
         for step in _sampled(complete, self._steps_max()):
             self._add_step(step, reject)
         for step in complete:
-            del self._pending[step]
+            self._drop(step)
+
+    def _keep(self, step: Step, topic: str, text: bytes, now_s: float) -> None:
+        topics = self._pending.setdefault(step, {})
+        self._pending_bytes += len(text) - (len(topics[topic][0]) if topic in topics else 0)
+        topics[topic] = text, now_s
+
+    def _drop(self, step: Step) -> None:
+        self._pending_bytes -= sum(len(text) for text, _ in self._pending.pop(step).values())
 
     def _find(self, step: Step) -> MissionHistory | None:
         run, mission, _ = step

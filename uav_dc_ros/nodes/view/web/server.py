@@ -64,8 +64,8 @@ def free_port(address: str) -> int:
 
 
 def url(address: str, port: int, token: str) -> str:
-    """Address of the page, for a browser."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address, address)  # those that stand for all
+    """Address of the page, for a browser; an address that stands for all is this machine's name."""
+    host = socket.gethostname() if address in ("0.0.0.0", "::") else address
     host = f"[{host}]" if ":" in host else host
     return f"http://{host}:{port}/" + (f"?token={token}" if token else "")
 
