@@ -14,6 +14,7 @@ DESCRIPTION = "Record, play, recover, verify and explain bags."
 # Module and description by verb; the module has `add_options(parser)` and `run(options) -> exit status`.
 VERBS = {
     "record": ("nodes.record.bag_record", "record topics into a new bag"),
+    "mark": ("nodes.record.bag_mark", "put an annotation into a recording that runs"),
     "play": ("nodes.play.bag_play", "publish a bag's messages again, with their timing and QoS"),
     "info": ("recordings.info.command", "show what a bag holds, and whether it is complete"),
     "cut": ("recordings.cut", "copy a time, missions or steps of a bag into a new one"),

@@ -137,8 +137,9 @@ def write(
         for message in recorded:
             topic = namespace + message.topic
             if topic not in known:
-                row = topics.TOPICS[message.topic.removeprefix("/")]
-                offered = parse_qos(QOS.replace("volatile", "transient_local") if row.latched else QOS)
+                row = topics.TOPICS.get(message.topic.removeprefix("/"))
+                held = row is not None and row.latched
+                offered = parse_qos(QOS.replace("volatile", "transient_local") if held else QOS)
                 writer.add_topic(topic, message.type, offered if latched else ())
                 known.add(topic)
             writer.write(

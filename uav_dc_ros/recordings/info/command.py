@@ -62,6 +62,9 @@ def show(found: Survey, console: Console) -> None:
     console.print(_topics(found))
     if found.missions:
         console.print(_missions(found.missions))
+    for mark in found.marks[:MISSIONS_MAX]:
+        where = f" in {mark.namespace}" if mark.namespace else ""
+        console.print(Text(f" mark{where} at {mark.s:.3f} s: {mark.text}"), soft_wrap=True)
     for mission in found.missions[:MISSIONS_MAX]:
         if mission.reason:
             where = f" in {mission.namespace}" if mission.namespace else ""

@@ -18,6 +18,7 @@ from uav_dc_ros.bags.records import TIME_MAX_NS
 from uav_dc_ros.bags.storage import Storage
 from uav_dc_ros.errors import BagDamagedError, BagError, UavDcError
 from uav_dc_ros.messages import printable
+from uav_dc_ros.recordings.marks import Mark, read_marks
 from uav_dc_ros.recordings.recorded_step import MissionTotals, RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps, namespaces, scenario
 
@@ -85,6 +86,7 @@ class Survey:
     topics: list[TopicSurvey]
     missions: list[MissionSurvey]
     restarts: dict[str, int]  # restarts of nodes during the recording
+    marks: list[Mark]  # annotations
     ros_distro: str | None  # of metadata.yaml
     about: dict[str, str]  # metadata that our recorder wrote
 
@@ -156,6 +158,7 @@ def _survey(reader: BagReader, error: BagDamagedError | None) -> Survey:
         topics=found,
         missions=missions,
         restarts=restarts,
+        marks=read_marks(reader),
         ros_distro=distro if isinstance(distro, str) and distro else None,
         about=reader.about,
     )

@@ -11,6 +11,7 @@ from uav_dc_ros import topics
 from uav_dc_ros.bags.message_definitions import typestore
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.messages import TEXT_MAX, Phase
+from uav_dc_ros.recordings.marks import read_marks
 from uav_dc_ros.recordings.pages.missions import MissionData
 from uav_dc_ros.recordings.recorded_step import UNFINISHED, RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import STEP_TOPICS, Steps
@@ -241,6 +242,7 @@ class Health:
                 for at_ns, source, what in sorted(self._faults)
             ],
             "faults_total": self._n_faults,
+            "marks": [{"s": mark.s, "text": mark.text} for mark in read_marks(self._reader, self._namespace)],
         }
 
     def _add_diagnostics(self, message: BagMessage) -> None:

@@ -33,6 +33,10 @@ function system(health) {
         { name: "until handled: p50 (worst p99), ms", cls: "text", text: (row) => row.latencies.map((one) => `${one.topic} ${fixed(one.p50_ms, 2)} (${fixed(one.p99_ms, 1)})`).join(", ") || NONE },
         { name: "counters", cls: "text", text: (row) => Object.entries(row.counters).map(([name, value]) => `${name} ${value}`).join(", ") || NONE },
       ], nodes, { label: "Nodes" }) : make("p", { class: "note" }, "The bag holds no diagnostics."))),
+    ...(health.marks.length ? [make("div", { class: "grid" }, card("Marks", table([
+      { name: "at, s", text: (row) => fixed(row.s, 2), value: by("s") },
+      { name: "mark", cls: "text", text: by("text") },
+    ], health.marks, { label: "Marks" })))] : []),
     make("div", { class: "grid halves" },
       card("CPU of each node's process", nodes.some((node) => node.cpu.length > 1) ? make("div", { class: "chart", id: "cpu", style: "height: 300px" }) : make("p", { class: "note" }, "The recording is too short for a curve: nodes report once a second.")),
       card("Faults", health.faults.length ? table([
