@@ -313,3 +313,10 @@ def test_nothing_is_overwritten_or_left_behind(
     error = run(capsys, "convert", source, "--out", tmp_path / "other", status=2)
     assert "bag other cannot be written: No space left on device; nothing is left of it" in error
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("uav_dc_ros.bags.part_writer.PartWriter.add_message", stopped)
+    assert "stopped" in run(capsys, "convert", source, "--out", tmp_path / "other", status=130)
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]

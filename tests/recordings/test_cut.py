@@ -75,6 +75,17 @@ def test_all_missions_cut_and_merged_are_the_original(flown: Path, tmp_path: Pat
     assert about == made.about(WORLD, 5, missions="4", made_by="")
 
 
+def test_a_mission_in_two_bags_is_one_mission_of_the_merged(
+    flown: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    for wanted in ("0-1", "1-3"):
+        run(capsys, "cut", flown, "--out", tmp_path / wanted, "--missions", wanted)
+    run(capsys, "merge", tmp_path / "0-1", tmp_path / "1-3", "--out", tmp_path / "all")
+    assert messages(tmp_path / "all") == messages(flown)
+    found = survey(tmp_path / "all")
+    assert (found.complete, len(found.missions)) == (True, 4)
+
+
 def test_a_cut_of_steps_begins_with_the_state_before_them(
     flown: Path, tmp_path: Path, capsys: Capture
 ) -> None:

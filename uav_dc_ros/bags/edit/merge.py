@@ -32,12 +32,15 @@ def run(options: argparse.Namespace) -> int:
     with ExitStack() as closing:
         readers = [closing.enter_context(BagReader(path, repeats=False)) for path in options.bags]
         readers.sort(key=lambda reader: (reader.first_ns, reader.last_ns, str(reader.path)))
-        with copying(readers, output(options), made_by="bag merge") as copy:
+        groups, about = list(_overlapping(readers)), merged_about(readers)
+        if len(groups) < len(readers):
+            about.pop("missions", None)  # they may have the same missions
+        with copying(readers, output(options), about=about, made_by="bag merge") as copy:
             copy.hold(readers[0].held())
-            for group in _overlapping(readers):
+            for group in groups:
                 _write(copy, group, is_first=group[0] is readers[0])
         named = {key for reader in readers for key in reader.about} - {MADE_BY_KEY, "missions"}
-        if differing := sorted(named - merged_about(readers).keys()):
+        if differing := sorted(named - about.keys()):
             print(f"  the bags differ in {', '.join(differing)}: the new bag does not name it")
     return 0
 
