@@ -3,7 +3,7 @@
     python benchmarks/edit_bags.py [--megabytes N]
 
 The bag has missions with 50 users, as a recorder writes them. Each command is a process of its own; the bare
-one reads the same bag in the order of its file and writes every message into a file of the same chunks and
+one reads the same bag in the order of time and writes every message into a file of the same chunks and
 compression. Times are CPU seconds; memory is the peak of the resident set.
 """
 
@@ -46,7 +46,7 @@ with open(sys.argv[1], "rb") as source, open(sys.argv[2], "xb") as file:
     writer = Writer(file, chunk_size=128 * 1024, compression=CompressionType.ZSTD)
     writer.start("ros2")
     channels = {}
-    for schema, channel, message in reader.iter_messages(log_time_order=False):
+    for schema, channel, message in reader.iter_messages():
         if channel.id not in channels:
             own = writer.register_schema(schema.name, schema.encoding, schema.data)
             channels[channel.id] = writer.register_channel(

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 
 from uav_dc_ros import cdr, topics
@@ -126,8 +128,11 @@ def _open_indexed(
         reverse: bool = False,
         head: bool = False,
     ) -> Iterator[BagMessage]:
-        times: dict[str, Any] = {"starting_at": start_ns, "ending_before": end_ns}
-        stream = reader.iter_messages(wanted, **times, log_time_order=sort, reverse=reverse)
+        if sort:
+            times: dict[str, Any] = {"starting_at": start_ns, "ending_before": end_ns}
+            stream = reader.iter_messages(wanted, **times, reverse=reverse)
+        else:
+            stream = _in_file_order(file, summary, wanted, start_ns, end_ns)
         while True:
             with damage_errors(path):
                 item = next(stream, None)
@@ -180,6 +185,37 @@ def _open_indexed(
         library=library,
         compressed=compressed,
     )
+
+
+def _in_file_order(
+    file: IO[bytes],
+    summary: Summary,
+    wanted: Collection[str] | None,
+    start_ns: int | None,
+    end_ns: int | None,
+) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Messages in the order of the file, a chunk at a time: mcap would read all chunks before the first one.
+
+    May raise errors of libraries.
+    """
+    channels = {
+        channel.id: (summary.schemas.get(channel.schema_id), channel)
+        for channel in summary.channels.values()
+        if wanted is None or channel.topic in wanted
+    }
+    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+        is_later = end_ns is not None and index.message_start_time >= end_ns
+        is_earlier = start_ns is not None and index.message_end_time < start_ns
+        offsets = index.message_index_offsets  # empty: the chunk's topics are unknown
+        if is_later or is_earlier or (offsets and not offsets.keys() & channels.keys()):
+            continue
+        file.seek(index.chunk_start_offset + HEADER.size)
+        for record in breakup_chunk(Chunk.read(ReadDataStream(file)), validate_crc=True):
+            if isinstance(record, Message) and (found := channels.get(record.channel_id)) is not None:
+                if _is_within(record.log_time, start_ns, end_ns):
+                    yield *found, record
+            elif isinstance(record, Message) and record.channel_id not in summary.channels:
+                raise LookupError(f"a message of channel {record.channel_id}, which is not in the summary")
 
 
 def _indexed_times(file: IO[bytes], summary: Summary) -> Iterator[tuple[int, int]]:
