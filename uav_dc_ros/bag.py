@@ -25,6 +25,7 @@ VERBS = {
     "verify": ("recordings.verify.command", "recompute everything that a bag holds of its missions"),
     "report": ("recordings.report", "write a page about missions, or compare several bags"),
     "index": ("recordings.index", "make one table of the missions in many bags"),
+    "log": ("recordings.flight_log.command", "align an autopilot's log with the bag of its flight"),
     "video": ("experiments.video", "draw a mission of a bag as GIF or MP4"),
     "export": ("recordings.export.command", "write missions as tables, or as transitions to learn from"),
 }

@@ -4,9 +4,11 @@ import random
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
@@ -14,6 +16,7 @@ from rosbags.rosbag2.metadata import parse_qos
 
 from tests.bags.test_foreign import run
 from tests.support.bags import QOS, STRING, TYPES, content, in_bag, in_mcap, information, text
+from uav_dc_ros.bags import mcap_storage
 from uav_dc_ros.bags.read import BagMessage, BagReader
 from uav_dc_ros.bags.write import BagWriter
 
@@ -258,6 +261,32 @@ def test_what_others_write_beside_messages_is_kept(tmp_path: Path, capsys: Captu
     )  # fmt: skip
     assert "topic /x has the types own_msgs/msg/X, std_msgs/msg/String; expected one" in error
     assert not list(tmp_path.glob("*no*"))
+
+
+def test_memory_holds_a_chunk_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reader of mcap decompresses all chunks before it yields the first message in the file's order."""
+    with BagWriter(tmp_path / "bag", {}, compression="none") as bag:
+        bag.add_topic("/a", STRING)
+        bag.add_topic("/b", STRING)
+        for i in range(40):
+            data = text(40_000 * "x")
+            bag.write("/ab"[0] + "ab"[i >= 20], data, log_time_ns=1000 - i, publish_time_ns=i)
+    read: list[int] = []
+
+    def breakup(*arguments: Any, **options: Any) -> Any:
+        read.append(1)
+        return breakup_chunk(*arguments, **options)
+
+    monkeypatch.setattr(mcap_storage, "breakup_chunk", breakup)
+    with BagReader(tmp_path / "bag") as reader:
+        recorded = reader.recorded()
+        assert (next(recorded).log_time_ns, len(read)) == (1000, 1)
+        assert [message.log_time_ns for message in recorded] == list(range(999, 960, -1))
+        n_chunks = len(read)
+        assert n_chunks >= 10
+        read.clear()
+        assert len(list(reader.recorded(["/b"], start_ns=970, end_ns=975))) == 5
+        assert len(read) < n_chunks / 3, "by the index"
 
 
 def test_the_same_command_writes_the_same_bytes(source: Path, tmp_path: Path, capsys: Capture) -> None:
