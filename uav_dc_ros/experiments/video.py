@@ -18,16 +18,16 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.trajectory import Trajectory
-from uav_dc_ros.errors import FROM_TRAIN, BagError, MessageError, ParameterError, UavDcError
+from uav_dc_ros.errors import FROM_TRAIN, BagError, MessageError, UavDcError
 from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
+from uav_dc_ros.recordings.export.tables import check_new
 from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import Steps
 
 FRAMES_MAX = 600
 LAST_S = 3.0  # for which the last frame stays
 COLOURS = 256
-SUFFIXES = (".gif", ".mp4")
 # Neither the encoder's version nor the time: the same bag gives the same bytes.
 EXACT = ["-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1"]
 
@@ -57,11 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the file; the exit status."""
     out: Path = options.out or Path(f"{options.bag.absolute().stem}.gif")
-    if out.suffix not in SUFFIXES:
-        raise ParameterError(f"--out {out}: expected a file NAME.gif or NAME.mp4")
-    if out.exists() or out.is_symlink():
-        raise BagError(f"{out} exists; expected a new name, nothing is overwritten")
-    files.check_writable(out)
+    check_new(out, ".gif", ".mp4")
     write = _write_gif if out.suffix == ".gif" else _write_mp4
     _module("PIL.Image", "Pillow", FROM_TRAIN)
     with BagReader(options.bag) as reader:

@@ -14,17 +14,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from uav_dc_ros import files
 from uav_dc_ros.bags.metadata import METADATA_FILE
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import mission as core_mission
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT, objective
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.errors import BagDamagedError, BagError, MessageError, ParameterError, UavDcError
+from uav_dc_ros.errors import BagDamagedError, BagError, MessageError, UavDcError
 from uav_dc_ros.messages import Phase, printable
 from uav_dc_ros.payloads import check
 from uav_dc_ros.recordings import step_reader
-from uav_dc_ros.recordings.export.tables import Columns, new_table
+from uav_dc_ros.recordings.export.tables import Columns, check_new, write_table
 from uav_dc_ros.recordings.recorded_step import MissionTotals
 from uav_dc_ros.recordings.step_reader import Steps
 
@@ -67,19 +66,12 @@ def run(options: argparse.Namespace) -> int:
     """Print and write the table; the exit status."""
     out: Path | None = options.out
     if out is not None:
-        if out.suffix not in (".parquet", ".csv"):
-            raise ParameterError(f"--out {out}: expected a file NAME.parquet or NAME.csv")
-        if out.exists() or out.is_symlink():
-            raise BagError(f"{out} exists; expected a new name, nothing is overwritten")
-        files.check_writable(out)
+        check_new(out, ".parquet", ".csv")
     rows = [row for bag in find_bags(options.folder) for row in bag_rows(bag, options.folder)]
     if not rows:
         raise BagError(f"{options.folder} holds no bag; expected folders or files with {', '.join(SUFFIXES)}")
     if out is not None:
-        columns = {name: [row.get(name) for row in rows] for name in COLUMNS}
-        format: Any = out.suffix.removeprefix(".")
-        with files.replacing(out) as partial, new_table(partial, COLUMNS, format, {}) as table:
-            table.add(columns)
+        write_table(out, COLUMNS, {name: [row[name] for row in rows] for name in COLUMNS})
     if options.json:
         print(msgspec.json.format(msgspec.json.encode(rows), indent=2).decode())
     else:

@@ -12,10 +12,10 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from uav_dc_ros import payloads
+from uav_dc_ros import files, payloads
 from uav_dc_ros.core import reward as core_reward
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.errors import BagError, MessageError, UavDcError
+from uav_dc_ros.errors import BagError, MessageError, ParameterError, UavDcError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.phases import BEFORE_START
 from uav_dc_ros.recordings.recorded_step import MissionTotals, RecordedStep
@@ -273,6 +273,23 @@ def new_table(path: Path, columns: Columns, format: Format, about: Mapping[str, 
         table = Table(file, columns)
         yield table
         table.flush()
+
+
+def check_new(path: Path, *suffixes: str) -> None:
+    """Raise ParameterError for another suffix, and BagError or UavDcError for a file that cannot be made."""
+    if path.suffix not in suffixes:
+        expected = " or ".join(f"NAME{suffix}" for suffix in suffixes)
+        raise ParameterError(f"--out {path}: expected a file {expected}")
+    if path.exists() or path.is_symlink():
+        raise BagError(f"{path} exists; expected a new name, nothing is overwritten")
+    files.check_writable(path)
+
+
+def write_table(path: Path, columns: Columns, rows: Rows) -> None:
+    """Write a whole table that `check_new` accepts as .parquet or .csv."""
+    format: Any = path.suffix.removeprefix(".")
+    with files.replacing(path) as partial, new_table(partial, columns, format, {}) as table:
+        table.add(rows)
 
 
 class _Csv:

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from uav_dc_ros import cli, files
+from uav_dc_ros import cli
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.errors import BagError, MessageError, ParameterError
+from uav_dc_ros.errors import BagError, MessageError
 from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
-from uav_dc_ros.recordings.export.tables import Columns, new_table
+from uav_dc_ros.recordings.export.tables import Columns, check_new, write_table
 from uav_dc_ros.recordings.flight_log.align import Alignment, align
 from uav_dc_ros.recordings.flight_log.read import FlightLog, read
 
@@ -54,11 +54,7 @@ def run(options: argparse.Namespace) -> int:
     """Align; the exit status. Raises BagError if the paths do not match."""
     out: Path | None = options.out
     if out is not None:
-        if out.suffix not in (".parquet", ".csv"):
-            raise ParameterError(f"--out {out}: expected a file NAME.parquet or NAME.csv")
-        if out.exists() or out.is_symlink():
-            raise BagError(f"{out} exists; expected a new name, nothing is overwritten")
-        files.check_writable(out)
+        check_new(out, ".parquet", ".csv")
     with BagReader(options.bag) as reader:
         times_s, path_m = _path(reader, step_reader.namespace(reader, options.namespace))
         start_s = reader.first_ns / 1e9
@@ -72,10 +68,8 @@ def run(options: argparse.Namespace) -> int:
         )
     print("\n".join(_lines(options, log, found, start_s)))
     if out is not None:
-        format: Any = out.suffix.removeprefix(".")
-        with files.replacing(out) as partial, new_table(partial, COLUMNS, format, {}) as table:
-            table.add(_rows(log, found, times_s, path_m))
-        print(f"{out}: {table.count} rows")
+        write_table(out, COLUMNS, _rows(log, found, times_s, path_m))
+        print(f"{out}: {len(log.position_s)} rows")
     return 0
 
 
