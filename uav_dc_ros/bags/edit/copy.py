@@ -69,6 +69,7 @@ class BagCopy:
     """A new bag that is being written."""
 
     def __init__(self, writer: BagWriter, output: NewBag, topics: Mapping[str, _CopiedTopic]) -> None:
+        self.duplicates: set[str] = set()  # topics with messages of several sources that are written once
         self.unreadable = Unreadable()  # messages on channels for JSON that are no payloads
         self._writer = writer
         self._payloads: dict[str, type[messages.RunPayload]] = {}  # by topic, of those that become JSON
@@ -93,6 +94,10 @@ class BagCopy:
                 serialization=serialization,
             )
             writer.keep_latched(name, copied.repeated)
+
+    def add_about(self, about: Mapping[str, str]) -> None:
+        """Add to the description of the new bag."""
+        self._writer.add_about(about)
 
     def hold(self, held: Iterable[BagMessage]) -> None:
         """Repeat latched messages from before the new bag at its head; see `BagWriter.hold`."""

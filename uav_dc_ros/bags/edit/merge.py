@@ -32,13 +32,14 @@ def run(options: argparse.Namespace) -> int:
     with ExitStack() as closing:
         readers = [closing.enter_context(BagReader(path, repeats=False)) for path in options.bags]
         readers.sort(key=lambda reader: (reader.first_ns, reader.last_ns, str(reader.path)))
-        groups, about = list(_overlapping(readers)), merged_about(readers)
-        if len(groups) < len(readers):
-            about.pop("missions", None)  # they may have the same missions
+        about = merged_about(readers)
+        n_missions = about.pop("missions", None)
         with copying(readers, output(options), about=about, made_by="bag merge") as copy:
             copy.hold(readers[0].held())
-            for group in groups:
+            for group in _overlapping(readers):
                 _write(copy, group, is_first=group[0] is readers[0])
+            if n_missions is not None and not any(map(_is_status, copy.duplicates)):
+                copy.add_about({"missions": n_missions})
         named = {key for reader in readers for key in reader.about} - {MADE_BY_KEY, "missions"}
         if differing := sorted(named - about.keys()):
             print(f"  the bags differ in {', '.join(differing)}: the new bag does not name it")
@@ -73,6 +74,11 @@ def _write(copy: BagCopy, group: Sequence[BagReader], *, is_first: bool) -> None
     copy.write(_merged(copy, group, is_first=is_first))
 
 
+def _is_status(topic: str) -> bool:
+    """Whether it is the topic on which vehicles report missions."""
+    return topic.endswith("/mission")
+
+
 def _head(reader: BagReader) -> Iterator[BagMessage]:
     """Latched messages at the head of a bag, with the log time of its first message."""
     return (message._replace(log_time_ns=reader.first_ns) for message in reader.held())
@@ -103,3 +109,5 @@ def _merged(copy: BagCopy, group: Sequence[BagReader], *, is_first: bool) -> Ite
         if read[number][message] > written[message]:
             written[message] += 1
             yield message
+        else:
+            copy.duplicates.add(message.topic)
