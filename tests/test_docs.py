@@ -38,7 +38,20 @@ REFUSED = re.compile(
 )
 # Programs of others, which are not run here.
 OTHERS = {
-    *("pip", "python", "python3", "source", "sudo", "cd", "export", "touch", "rosdep", "ros2", "zensical"),
+    *(
+        "docker",
+        "pip",
+        "python",
+        "python3",
+        "source",
+        "sudo",
+        "cd",
+        "export",
+        "touch",
+        "rosdep",
+        "ros2",
+        "zensical",
+    ),
     *(
         "sim_vehicle.py",
         "build/sitl/bin/arducopter",

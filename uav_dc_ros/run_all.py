@@ -68,6 +68,8 @@ def parser(prog: str = PROG) -> cli.Parser:
         "--arm the option is required)"
     )
     real("--datum", metavar="here|last|LAT,LON,ALT", help=datum)
+    fence = "upload the fence to the autopilot before take-off; with --vehicle mavlink only"
+    real("--upload-fence", action="store_true", help=fence)
     setting = "any parameter of a node, such as bridge.failsafe_action=land; repeatable"
     form = "NODE.PARAMETER=VALUE"
     real("--set", dest="settings", type=_setting, action="append", default=[], metavar=form, help=setting)

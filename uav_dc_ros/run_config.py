@@ -40,6 +40,7 @@ class RunConfig:
     system: int | None = None  # its MAVLink system number; None: the only autopilot on the link
     arm: bool = False  # whether the bridge arms the vehicle and takes off
     datum: str | None = None  # position of the grid's corner: `here`, `last` or `LAT,LON,ALT`
+    upload_fence: bool = False  # whether the bridge uploads its fence to an autopilot on MAVLink
     # Parameters of nodes by `NODE.PARAMETER`. Text is parsed as by `--set`.
     settings: Mapping[str, object] = field(default_factory=dict)
     bag: str | Path | None = None  # folder of the new bag; None: a dated one in `bags/`
@@ -56,7 +57,7 @@ class RunConfig:
         """Check each value."""
         for name in ("scenario", "policy", "bag", "summary"):
             self._check_type(name, str | Path, "text or a path")
-        for name in ("arm", "record", "compose"):
+        for name in ("arm", "upload_fence", "record", "compose"):
             self._check_type(name, bool, "True or False")
         for name, (minimum, maximum) in RANGES.items():
             value = getattr(self, name)

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from tests.conftest import Ros
 from tests.support.fake_autopilot.mavros_flight import node_in
 from uav_dc_ros import cdr, messages
+from uav_dc_ros.core.grid import Action
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes import bridge, vehicles
@@ -20,9 +23,11 @@ from uav_dc_ros.nodes.bridge import AutopilotBridge
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.offboard import datums
 from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.ground_station import Severity, StatusText
 from uav_dc_ros.offboard.mavlink.connection import Address
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
-from uav_dc_ros.offboard.vehicle import Command, Mode, Telemetry
+from uav_dc_ros.offboard.mission.controller import MissionController
+from uav_dc_ros.offboard.vehicle import Command, Mode, SetMode, Telemetry
 
 DATUM = Geodetic(latitude_deg=47.4, longitude_deg=8.5, altitude_m=400.0)
 FLIES = Telemetry(
@@ -313,3 +318,93 @@ def test_a_transport_is_closed_whatever_became_of_it(monkeypatch: pytest.MonkeyP
 
 def refuse_link(address: Address) -> None:
     raise VehicleError("no such device")
+
+
+def call(made: Made, service: str) -> tuple[bool, str]:
+    """Call a service over ROS."""
+    client = made.node.create_client(Trigger, service)
+    made.until(client.service_is_ready)
+    future = client.call_async(Trigger.Request())
+    made.until(future.done)
+    made.node.destroy_client(client)
+    return future.result().success, future.result().message
+
+
+@pytest.mark.parametrize("service", ["stop", "abort"])
+def test_a_service_ends_the_mission_as_ctrl_c_does_and_the_landing_is_monitored(
+    made: Made, service: str
+) -> None:
+    activate(made)
+    made.until(lambda: made.node._started)
+    assert call(made, service) == (
+        True,
+        f"landing: {'stopped' if service == 'stop' else 'aborted'} by a service call",
+    )
+    made.until(lambda: SetMode(Mode.RETURN) in made.vehicle.asked)
+    assert call(made, service)[0], "once more changes nothing"
+    made.vehicle.known = replace(FLIES, mode=Mode.RETURN, mode_name="RTL")
+    made.until(lambda: made.node.bridge.can_be_released(made.node._telemetry))
+    made.vehicle.known = replace(FLIES, mode=Mode.RETURN, armed=False, on_ground=True)
+    made.until(lambda: made.node.bridge.phase is Phase.ABORTED)
+    success, text = call(made, service)
+    assert not success
+    assert text.startswith("the mission is over (aborted: ")
+
+
+def test_a_pilot_s_vehicle_is_left_alone_by_the_services(made: Made) -> None:
+    made.vehicle.known = replace(FLIES, mode=Mode.OTHER, mode_name="LOITER")
+    activate(made)
+    assert call(made, "abort") == (True, "aborted: aborted by a service call")
+    made.until(lambda: made.vehicle.setpoints)
+    assert made.vehicle.asked == []
+    assert set(made.vehicle.setpoints) == {None}
+
+
+def test_stop_completes_the_move_in_progress_also_after_a_restart(made: Made, tmp_path: Path) -> None:
+    made.node.set_parameters([Parameter("journal", value=str(tmp_path / "journal"))])
+    activate(made)
+    made.until(lambda: made.node.bridge.phase is Phase.TAKEOFF)
+    bridge = made.node.bridge
+    bridge.phase = Phase.READY
+    assert bridge.move(0, Action.RIGHT) is None
+    assert call(made, "stop") == (True, f"moving: {bridge.reason}")
+    assert made.vehicle.asked == []
+    checkpoint = bridge.checkpoint
+    assert checkpoint.stop_reason == "stopped by a service call"
+    again = MissionController(made.node.scenario, made.node.settings, checkpoint=checkpoint)
+    assert again.checkpoint.stop_reason == checkpoint.stop_reason
+    for controller in (bridge, again):
+        controller.phase = Phase.READY
+        assert "the mission ends" in str(controller.move(controller.step, Action.HOVER))
+        controller.tick(time.monotonic(), made.vehicle.telemetry())
+        assert (controller.phase, controller.reason) == (Phase.LANDING, "stopped by a service call")
+
+
+def test_a_mission_waits_for_the_service_start(made: Made) -> None:
+    made.node.set_parameters([Parameter("wait_for_start", value=True)])
+    activate(made)
+    made.until(lambda: made.node.all_ready)
+    made.until(lambda: "the service start" in made.node._status.reason)
+    assert made.node.bridge.phase is Phase.IDLE
+    assert call(made, "start") == (True, "the mission begins")
+    made.until(lambda: made.node.bridge.phase is not Phase.IDLE)
+    assert not call(made, "start")[0]
+
+
+def test_ground_stations_are_shown_the_mission_and_its_rates(made: Made) -> None:
+    texts: list[StatusText] = []
+    values: list[Any] = []
+    made.vehicle.report_text = texts.append  # type: ignore[attr-defined]
+    made.vehicle.report_values = values.append  # type: ignore[attr-defined]
+    activate(made)
+    made.until(lambda: made.node.bridge.phase is Phase.TAKEOFF)
+    assert texts[-1].severity is Severity.NOTICE
+    assert texts[-1].text.startswith("uav_dc takeoff: in the air when the bridge started")
+    n = made.node.scenario.n_users
+    columns = {name: [0.0] * n for name in ("sinr", "rate_bps", "data_bits")}
+    collected = [True] * 3 + [False] * (n - 3)
+    rates = messages.Rates(
+        mission=0, step=0, sum_rate_bps=2.5e6, served=[True] * n, collected=collected, **columns
+    )
+    made.node.on_rates(rates)
+    assert values == [{"collected": 3.0, "rate_mbps": 2.5}]

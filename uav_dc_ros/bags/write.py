@@ -210,6 +210,11 @@ class BagWriter:
         with self._disk_errors():
             self._writer.add_attachment(attachment)
 
+    def latched_depth(self, topic: str) -> int:
+        """How many messages of a topic each part repeats; 0: it is not latched."""
+        latest = self._topics[topic].latest
+        return 0 if latest is None else latest.maxlen or 0
+
     def write(self, topic: str, data: bytes, *, log_time_ns: int, publish_time_ns: int) -> None:
         """Append a message of an added topic, serialised (CDR); times are nanoseconds since the epoch."""
         written = self._topics[topic]
@@ -227,6 +232,14 @@ class BagWriter:
             raise self._abandoned(error) from None
         if written.latest is not None:
             written.latest.append((data, publish_time_ns))
+
+    def split(self) -> bool:
+        """Begin the next part, unless this one has no message yet; returns whether it did."""
+        if self._begun_ns is None:
+            return False
+        with self._disk_errors():
+            self._split()
+        return True
 
     def add_about(self, about: Mapping[str, str]) -> None:
         """Add to the description of the bag."""

@@ -22,11 +22,11 @@ from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.ros import numeric_messages
 from uav_dc_ros.nodes.ros.liveliness import LivelinessMonitor
-from uav_dc_ros.offboard import datums
+from uav_dc_ros.offboard import datums, ground_station
 from uav_dc_ros.offboard.frames import Enu, Geodetic
 from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
-from uav_dc_ros.offboard.mission.geofence import Geofence
+from uav_dc_ros.offboard.mission.geofence import UPLOAD_MARGIN_M, Geofence
 from uav_dc_ros.offboard.mission.keep_out import cell_conflict
 from uav_dc_ros.offboard.mission.plausibility import PlausibilityFilter
 from uav_dc_ros.offboard.mission.progress import Checkpoint
@@ -69,7 +69,8 @@ class AutopilotBridge(MissionNode):
         self.fence = Geofence.around(self.scenario, values["fence_margin_m"])
         if (conflict := cell_conflict(self.scenario, self.fence, self.settings)) is not None:
             raise NodeError(conflict)
-        vehicles.check(*(values[name] for name in ("vehicle", "connect", "system", "arm")))
+        names = "vehicle", "connect", "system", "arm", "upload_fence"
+        vehicles.check(*(values[name] for name in names))
         self._datum(self._restore())
 
     def activate(self) -> None:
@@ -83,10 +84,15 @@ class AutopilotBridge(MissionNode):
         datum = self._datum(saved)
         self.run = self.values["run"] or (self.run if saved is None else saved.run)
         self.bridge = MissionController(self.scenario, self.settings, self._on_change, checkpoint, self.fence)
-        self.vehicle: Vehicle = vehicles.make(
-            self, self.values, self.scenario, datum, grid_origin, system, saved is not None
-        )
         self._started = checkpoint is not None and checkpoint.airborne
+        self._may_start = not self.values["wait_for_start"] or saved is not None
+        uploads = self.values["upload_fence"] and not self._started
+        outline = self.fence.outline(UPLOAD_MARGIN_M) if uploads else ()
+        self.vehicle: Vehicle = vehicles.make(
+            self, self.values, self.scenario, datum, grid_origin, system, saved is not None, outline
+        )
+        self._station = self.vehicle if isinstance(self.vehicle, ground_station.GroundStationLink) else None
+        self._texts = ground_station.MissionTexts()
         self._journal_failed = False
         self._telemetry = Telemetry(system_id=system, grid_origin=grid_origin)
         self._status: messages.Mission | None = None  # published last
@@ -157,6 +163,35 @@ class AutopilotBridge(MissionNode):
             )
         return saved
 
+    # Services.
+
+    def call_start(self) -> str:
+        """Begin the mission: with `arm`, the bridge arms and takes off from here on."""
+        if self._may_start or self._started:
+            expected = "expected a first call, and the parameter wait_for_start"
+            raise NodeError(f"the mission starts without this call, or has started; {expected}")
+        if not self.all_ready:
+            raise NodeError(f"not all of {', '.join(self.peers)} are ready yet; expected a later call")
+        self._may_start = True
+        return "the mission begins"
+
+    def call_stop(self) -> str:
+        """End the mission as `abort` does, but first complete the move in progress."""
+        return self._end_mission("stopped by a service call", at_once=False)
+
+    def call_abort(self) -> str:
+        """Request return or land at once, as Ctrl-C of run_all does."""
+        return self._end_mission("aborted by a service call", at_once=True)
+
+    def _end_mission(self, reason: str, *, at_once: bool) -> str:
+        bridge = self.bridge
+        if bridge.is_over:
+            raise NodeError(f"the mission is over ({bridge.phase.value}: {bridge.reason})")
+        if bridge.phase is not Phase.LANDING:
+            self._started = True  # also for a vehicle that flies before the mission has started
+            (bridge.stop if at_once else bridge.stop_after_step)(reason, self._telemetry)
+        return f"{bridge.phase.value}: {bridge.reason}"
+
     # In flight.
 
     def on_move(self, payload: messages.Move) -> None:
@@ -167,6 +202,12 @@ class AutopilotBridge(MissionNode):
         if (why := self.bridge.move(payload.step, Action[payload.action.upper()])) is not None:
             raise MessageError("not_now", why)
 
+    def on_rates(self, payload: messages.Rates) -> None:
+        """Show the data collection to ground stations."""
+        payloads.check(payload, self.scenario)
+        if self._station is not None:
+            self._station.report_values(ground_station.values(payload))
+
     def _tick(self) -> None:
         """Update telemetry, decide, and send commands and setpoint."""
         self._telemetry = self.vehicle.telemetry()
@@ -175,8 +216,11 @@ class AutopilotBridge(MissionNode):
         self._publish_numbers()
         self._log_grid()
         if not self._started and self.all_ready:
-            self.check_other_publishers()
-            self._started = True
+            if self._may_start:
+                self.check_other_publishers()
+                self._started = True
+            else:
+                self._publish_mission()  # it shows what the mission waits for
         if self._started:
             self.bridge.policy_lost = self._policy.is_lost()
             for command in self.bridge.tick(time.monotonic(), self._telemetry):
@@ -272,7 +316,8 @@ class AutopilotBridge(MissionNode):
 
     def _publish_mission(self) -> None:
         bridge = self.bridge
-        waits = "" if self._started else f"waits for {', '.join(self.peers)}"
+        waits = "the service start" if self._peers_found and not self._may_start else ", ".join(self.peers)
+        waits = "" if self._started else f"waits for {waits}"
         status = messages.Mission(
             run=self.run,
             mission=0,
@@ -293,6 +338,9 @@ class AutopilotBridge(MissionNode):
             self._status = status
             self._changes.append(f"{status.state}, step {status.step}: {status.reason}")
             self.publish_payload("mission", status)
+            text = self._texts.update(status, bridge.checkpoint.outcome)
+            if self._station is not None and text is not None:
+                self._station.report_text(text)
             if not self.is_supervised and bridge.phase not in (Phase.READY, Phase.MOVING):
                 self.get_logger().info(f"{status.state}: {status.reason}")
 

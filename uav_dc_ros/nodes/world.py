@@ -26,11 +26,11 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.mobility import WalkingUsers
 from uav_dc_ros.core.propagation.stochastic import Seeds
-from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.acknowledgements import AcknowledgementWindow
+from uav_dc_ros.nodes.framework.external_users import ExternalUsers
 from uav_dc_ros.nodes.framework.journal import Journal
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
@@ -42,8 +42,7 @@ CLOCK_PERIOD_S = 0.05
 POSE_AGE_MAX_S = 10.0  # of an external vehicle; an older pose was recorded
 USER_BYTES = 40  # of `users`, for each of them
 OVERRUN_S = 0.005  # a step that starts later than this after its time is an overrun
-# Phases in which an external vehicle has reached its step.
-REACHED = (Phase.READY, Phase.LANDING, Phase.LANDED, Phase.TIMEOUT, Phase.ABORTED)
+ABORTED = b"aborted"  # last line of the journal of a mission that a service ended
 
 
 class JournalHeader(msgspec.Struct, frozen=True):
@@ -53,56 +52,6 @@ class JournalHeader(msgspec.Struct, frozen=True):
     seed: int
     fingerprint: str
     run: str
-
-
-class ExternalUsers:
-    """The users around an external vehicle: they walk one step with each step of its mission.
-
-    The bridge publishes in `mission` which step it has reached. The users of that step have the time of the
-    next pose, so that the monitor measures them from the vehicle's position at that time.
-    """
-
-    def __init__(self, scenario: Scenario, seed: int) -> None:
-        self._scenario, self._seed = scenario, seed
-        self.status: messages.Mission | None = None  # the last payload of `mission`
-        self._users: WalkingUsers | None = None
-        self._mission = -1  # of these users
-        self._is_due = False
-
-    def update(self, payload: messages.Mission) -> None:
-        """Follow the mission; raises MessageError for a mission in another world, or with other users."""
-        payloads.check(payload, self._scenario)
-        seed = self._seed + payload.mission
-        if payload.seed != seed:
-            raise MessageError(
-                "seed",
-                f"mission {payload.mission} has seed {payload.seed}; expected {seed}: start this node with "
-                "the mission's seed",
-            )
-        self.status = payload
-        last = (self._mission, self._users.step) if self._users else (-1, -1)
-        is_new = payload.step > 0 and (payload.mission, payload.step) != last
-        if payload.phase is Phase.READY or (payload.phase in REACHED and is_new):
-            self._is_due = True  # after a repeated `ready` again
-
-    def users(self, stamp_ns: int, run: str = "") -> messages.Users | None:
-        """The users to publish with the time of a pose, nanoseconds; None: none are due."""
-        if not self._is_due or self.status is None:
-            return None
-        self._is_due = False
-        mission, step = self.status.mission, self.status.step
-        if self._users is None or self._mission != mission or self._users.step > step:
-            self._users, self._mission = WalkingUsers(self._scenario, self._seed + mission), mission
-        self._users.walk(step - self._users.step)
-        return payloads.users(
-            self._scenario,
-            self._users.positions_m,
-            mission=mission,
-            step=step,
-            time_ns=stamp_ns,
-            run=run,
-            seeds=self._users.seeds,
-        )
 
 
 class WorldNode(MissionNode):
@@ -130,6 +79,9 @@ class WorldNode(MissionNode):
         self._is_flying = False
         self._mission, self._step = -1, 0
         self._phase: Phase | None = None  # None before the first mission
+        self._reason = ""  # of an abort
+        self._may_start = not self.values["wait_for_start"]
+        self._stops_after_step = False
         self._energy_used_j: Array = np.asarray(0.0)
         self._action: Action | None = None  # received for this step
         self._step_at_tick: tuple[int, int] | None = None
@@ -148,9 +100,8 @@ class WorldNode(MissionNode):
         if self._hovered:
             self.get_logger().warning(f"{self._hovered} steps were hovered: no move came in time")
         if self._is_flying and self._phase is Phase.READY:
-            self._phase = Phase.ABORTED
-            status = self._status("the vehicle was stopped before the end of the mission")
-            self.publish_payload("mission", status)
+            self._phase, self._reason = Phase.ABORTED, "the vehicle was stopped before the end of the mission"
+            self.publish_payload("mission", self._status())
 
     # Before the first mission.
 
@@ -169,7 +120,7 @@ class WorldNode(MissionNode):
             self._start_if_all_ready()
 
     def _start_if_all_ready(self) -> None:
-        if self._is_flying or not self.all_ready:
+        if self._is_flying or not (self.all_ready and self._may_start):
             return
         if self._phase is None:
             self.check_other_publishers()
@@ -188,13 +139,54 @@ class WorldNode(MissionNode):
                 CLOCK_PERIOD_S, lambda: self.publish("clock", Clock(clock=convert.stamp(self._now_ns())))
             )
 
+    # Services.
+
+    def call_start(self) -> str:
+        """Begin the first mission."""
+        if self._may_start:
+            expected = "expected a first call, and the parameter wait_for_start"
+            raise NodeError(f"the missions start without this call, or have started; {expected}")
+        if not self.all_ready:
+            raise NodeError(f"not all of {', '.join(self.peers)} are ready yet; expected a later call")
+        self._may_start = True
+        self._start_if_all_ready()
+        return f"mission {self._mission} begins"
+
+    def call_stop(self) -> str:
+        """End the missions after the step in progress."""
+        return self._end_missions(at_once=False)
+
+    def call_abort(self) -> str:
+        """End the missions at once, as Ctrl-C of run_all does."""
+        return self._end_missions(at_once=True)
+
+    def _end_missions(self, *, at_once: bool) -> str:
+        if self._phase is not None and self._phase is not Phase.READY:
+            raise NodeError(f"the missions are over ({self._phase.value}); expected one in progress")
+        if self._phase is Phase.READY and not at_once:
+            self._stops_after_step = True
+            return f"mission {self._mission} ends after step {self._step}"
+        if self._phase is None:
+            self._open(0)
+            self._is_flying = True  # no mission begins any more
+        self._abort("aborted by a service call")
+        self.publish_payload("mission", self._status())
+        return f"mission {self._mission} is aborted at step {self._step}"
+
+    def _abort(self, reason: str) -> None:
+        self.journal.append(ABORTED)
+        self._phase, self._reason = Phase.ABORTED, reason
+
     # Missions.
 
     def _begin(self, mission: int) -> None:
+        self._open(mission)
+        self._publish_step()
+
+    def _open(self, mission: int) -> None:
         header = JournalHeader(mission, self.values["seed"], self.scenario.fingerprint, self.run)
         self.journal.begin(msgspec.json.encode(header))
         self._reset(mission)
-        self._publish_step()
 
     def _reset(self, mission: int) -> None:
         """Put the vehicle and the users at the start of a mission."""
@@ -212,7 +204,8 @@ class WorldNode(MissionNode):
             return
         try:
             header = msgspec.json.decode(first, type=JournalHeader)
-            actions = [Action(int(move)) for move in moves]
+            is_aborted = moves[-1:] == [ABORTED]
+            actions = [Action(int(move)) for move in moves[: len(moves) - is_aborted]]
         except (msgspec.DecodeError, ValueError) as error:
             raise NodeError(f"journal {self.values['journal']}: not a world's: {error}") from None
         if (header.seed, header.fingerprint) != (self.values["seed"], self.scenario.fingerprint):
@@ -225,6 +218,9 @@ class WorldNode(MissionNode):
         self._reset(header.mission)
         for action in actions:
             self._move(action)
+        self._may_start = True
+        if is_aborted:
+            self._phase, self._reason = Phase.ABORTED, "aborted by a service call"
         self.get_logger().warning(f"resumes mission {self._mission} at step {self._step}")
 
     def on_move(self, payload: messages.Move) -> None:
@@ -259,12 +255,16 @@ class WorldNode(MissionNode):
         action = Action.HOVER if self._action is None else self._action
         self.journal.append(b"%d" % int(action))
         self._move(action)
+        if self._stops_after_step and self._phase is Phase.READY:
+            self._abort("stopped by a service call")
         self._step_began_s = time.monotonic()
         if self.pace is None:
             self._unacknowledged.step()
         self._publish_step()
-        if self._phase is not Phase.READY and self._mission + 1 < self.values["missions"]:
+        if self._phase in (Phase.LANDED, Phase.TIMEOUT) and self._mission + 1 < self.values["missions"]:
             self._begin(self._mission + 1)
+            if self._stops_after_step:
+                self._end_missions(at_once=True)
 
     def _move(self, action: Action) -> None:
         """One step of the world."""
@@ -333,7 +333,7 @@ class WorldNode(MissionNode):
         )
         return messages.encode(users)
 
-    def _status(self, reason: str = "") -> messages.Mission:
+    def _status(self) -> messages.Mission:
         assert self._phase is not None, "a mission has begun"
         east, north, up = self._cell.tolist()
         return messages.Mission(
@@ -341,7 +341,7 @@ class WorldNode(MissionNode):
             mission=self._mission,
             step=self._step,
             phase=self._phase,
-            reason=reason,
+            reason=self._reason,
             cell=(east, north, up),
             remaining_steps=self.scenario.mission.max_steps - self._step,
             **payloads.battery(self.scenario, self._energy_used_j),
@@ -365,12 +365,13 @@ class WorldNode(MissionNode):
         if self.external is not None:
             status = self.external.status
             return [], {"vehicle": f"{status.phase}, step {status.step}" if status else "no message yet"}
+        waits = "peers" if self._may_start or not self.all_ready else "the service start"
         warnings = ["steps start late"] if self._overruns > self._overruns_reported else []
         self._overruns_reported = self._overruns
         values = {
             "mission": str(self._mission),
             "step": str(self._step),
-            "phase": self._phase.value if self._phase else "waiting for peers",
+            "phase": self._phase.value if self._phase else f"waiting for {waits}",
             **payloads.battery_diagnostics(self.scenario, self._energy_used_j),
             "hovered steps": str(self._hovered),
             "step overruns": str(self._overruns),

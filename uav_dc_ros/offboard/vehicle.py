@@ -58,6 +58,7 @@ class Telemetry:
     battery_fails: bool = False  # the autopilot reports the battery as low or broken
     vehicle_s: float = 0.0  # the vehicle's own time; in simulation it may be faster than the steady clock
     missing: str | None = None  # what the bridge needs before it can fly; None: nothing
+    fence_refusal: str | None = None  # why a fence that was to be uploaded is not the autopilot's
     refusal: str | None = None  # last refused command and the reason; None: none, or it was executed since
     status_text: str = ""  # warnings of the autopilot in the last seconds
     home: Enu | None = None  # where a return leads to

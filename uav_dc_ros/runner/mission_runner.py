@@ -134,7 +134,7 @@ class MissionRunner:
                 if isinstance(error, AnotherMissionError):  # received messages may belong to it
                     self.summaries.clear()
                     network.node.mission = self._status = None
-            is_complete = len(self.summaries) >= self.config.missions
+            is_complete = self._is_complete
             if is_complete and self._elsewhere():
                 time.sleep(RESEND_S)  # what the monitor has received, the recorder may not yet have
             if self._page is not None and web_page.is_attended() and self._show and not self.interrupted:
@@ -177,7 +177,7 @@ class MissionRunner:
         """Spin until all missions are over, or the run is interrupted."""
         self._step_s = time.monotonic()
         check_s, is_page_open = 0.0, False
-        while not (self.interrupted or (node.is_alone and len(self.summaries) >= self.config.missions)):
+        while not (self.interrupted or (node.is_alone and self._is_complete)):
             tick_s = TICK_S if supervisor.brought_up else BRING_UP_TICK_S
             executor.spin_once(tick_s)
             now_s = time.monotonic()
@@ -195,10 +195,17 @@ class MissionRunner:
                 self._check_timeout(node, now_s)
             time.sleep(min(node.pause_s, tick_s))
 
+    @property
+    def _is_complete(self) -> bool:
+        """Whether no mission follows: all are over, or one was aborted, by a service call for example."""
+        return self._aborted or len(self.summaries) >= self.config.missions
+
     def _check_timeout(self, node: MissionMonitor, now_s: float) -> None:
         """Check the time since the last step; nodes of another run_all have no timeout."""
         if not self.is_simulated and self._status is not None:
             return  # the bridge has its own timeouts, and a pilot none
+        if node.mission is None and self._settings.get("world", {}).get("wait_for_start"):
+            return  # for the service
         timeout_s = STEP_TIMEOUT_S + pace.period_s(self.scenario, self.config.factor)
         if now_s - self._step_s <= timeout_s:
             return
@@ -280,6 +287,7 @@ class MissionRunner:
             "system": config.system or 0,
             "arm": config.arm,
             "datum": config.datum or "",
+            "upload_fence": config.upload_fence,
         }
         if config.live is not None:
             values["port"] = config.live

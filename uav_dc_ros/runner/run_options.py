@@ -15,7 +15,7 @@ from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
-VEHICLE_OPTIONS = ("connect", "system", "arm", "datum")
+VEHICLE_OPTIONS = ("connect", "system", "arm", "datum", "upload_fence")
 # Parameters that are options of run_all.
 OPTIONS = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", *VEHICLE_OPTIONS)
 
@@ -67,7 +67,9 @@ def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]
             raise ParameterError(f"{option}: expected a node that is started here: {', '.join(nodes)}")
         row = next((row for row in NODES[node].parameters if row.name == name), None)
         if name in OPTIONS:
-            raise ParameterError(f"{option}: expected --{name}, which sets it for all nodes")
+            raise ParameterError(
+                f"{option}: expected --{name.replace('_', '-')}, which sets it for all nodes"
+            )
         if row is None:
             known = ", ".join(row.name for row in NODES[node].parameters if row.name not in OPTIONS)
             expected = f"some of {known}" if known else "none: it has options of run_all only"
@@ -88,10 +90,11 @@ def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> No
     simulated = config.vehicle == SIMULATED
     for name in VEHICLE_OPTIONS:
         value = getattr(config, name)
+        option = f"--{name.replace('_', '-')}"
         if value and simulated:
-            raise ParameterError(f"--{name}: expected --vehicle {', '.join(VEHICLES)} with it")
+            raise ParameterError(f"{option}: expected --vehicle {', '.join(VEHICLES)} with it")
         if value and "bridge" not in nodes:
-            raise ParameterError(f"--{name}: expected the node 'bridge' among --nodes")
+            raise ParameterError(f"{option}: expected the node 'bridge' among --nodes")
     if simulated:
         return
     if config.pace != pace.WATCHABLE:
@@ -103,7 +106,8 @@ def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> No
         from uav_dc_ros.offboard import datums  # a simulated run needs no autopilot
 
         datums.parse(config.datum or "", scenario, config.vehicle, arm=config.arm)
-        vehicles.check(config.vehicle, config.connect or "", config.system or 0, config.arm)
+        address, system = config.connect or "", config.system or 0
+        vehicles.check(config.vehicle, address, system, config.arm, config.upload_fence)
 
 
 def check_summary(summary: Path, bag: Path | None) -> None:

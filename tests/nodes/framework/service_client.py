@@ -5,6 +5,7 @@ Commands come as JSON lines on standard input, responses go as JSON lines to sta
     {"node": "/policy", "do": "configure"}            -> {"success": true, "state": "inactive"}
     {"node": "/policy", "set": {"policy": "nobody"}}  -> {"policy": {"success": false, "reason": "..."}}
     {"node": "/policy", "describe": ["policy"]}       -> {"policy": {"description": "...", ...}}
+    {"call": "/abort"}                                -> {"success": true, "message": "..."}
 """
 
 import json
@@ -16,6 +17,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
 
 TRANSITIONS = {"configure": 1, "cleanup": 2, "activate": 3, "deactivate": 4}
 
@@ -70,7 +72,10 @@ def main() -> None:
     client = ServiceClient("client")
     for line in sys.stdin:
         command = json.loads(line)
-        if "do" in command:
+        if "call" in command:
+            called = client.call(Trigger, command["call"])
+            response = {"success": called.success, "message": called.message}
+        elif "do" in command:
             response = client.change(command["node"], command["do"])
         elif "set" in command:
             response = client.set(command["node"], command["set"])

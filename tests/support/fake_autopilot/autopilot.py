@@ -19,6 +19,9 @@ in GUIDED only, and silently ignored outside its fence; failsafes for its fence,
 its own time), and low voltage (a text and the battery's health; neither acts on it). Its metres are those of
 a sphere; all events have true ones. A foreign gimbal sends, too.
 
+What a client sends to no system in particular, and all that the autopilot sends, also goes to a ground
+station on UDP (`--station PORT`), whose messages it receives. Fence points are stored, and enforce nothing.
+
 Not imitated: noise, GPS, missions, other failsafes, links that lose single messages, yaw. Unlike a real
 autopilot's, its time waits (a quarter of a second at most) for a client that is late: the machine that tests
 run on is busy.
@@ -39,6 +42,7 @@ import pymap3d
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from tests.support.fake_autopilot.copter import FOLLOWS, RETURNS, TICK_S, Copter, emit
+from tests.support.fake_autopilot.fences import FenceStore
 
 ADVICE_S = 30.0
 OFFBOARD_GAP_S, OFFBOARD_PROOF_S = 0.5, 1.0
@@ -92,6 +96,9 @@ class Autopilot:
         self.parser = mav.MAVLink(None)
         self.parser.robust_parsing = True
         self.out = bytearray()
+        self.fence_s = 0.0  # when fence items were last requested
+        self.forwarded = bytearray()  # of clients, to other links
+        self.fence = FenceStore(lambda event, **more: copter.emit(event, **more))
         self.due = {mav.MAVLINK_MSG_ID_HEARTBEAT: (1.0, 0.0)}  # period, next
         self.frozen, self.offset, self.late_s = False, [0.0, 0.0, 0.0], 0.0
         self.later: list[tuple[float, Any]] = []
@@ -128,6 +135,9 @@ class Autopilot:
         t_s = self.copter.t_s
         while self.copter.texts:
             self.send_text(self.copter.texts.pop(0))
+        if t_s - self.fence_s >= 1.0:
+            self.fence_s = t_s
+            self.fence.repeat(self.mav)
         while self.held_back and self.held_back[0][0] <= t_s:
             self.out += self.held_back.pop(0)[1]
         if not self.copter.ready and not self.copter.px4 and t_s - self.advised_s >= ADVICE_S:
@@ -240,17 +250,19 @@ class Autopilot:
 
     # In.
 
-    def receive(self, data: bytes) -> bool:
-        """Process bytes; returns whether a message was among them."""
+    def receive(self, data: bytes, station: mav.MAVLink | None = None) -> bool:
+        """Process bytes, of a client or of a `station`; returns whether a message was among them."""
         if self.other is not None:
             self.other.receive(data)
         if self.echoes:
             self.out += data
-        messages = self.parser.parse_buffer(data) or []
+        messages = (station or self.parser).parse_buffer(data) or []
         for message in messages:
             if message.get_msgbuf()[0] == mav.PROTOCOL_MARKER_V2:
                 self.mav.old = self.gimbal.old = False
             name = message.get_type()
+            if station is None and getattr(message, "target_system", 0) == 0:
+                self.forwarded += message.get_msgbuf()
             if getattr(message, "target_system", self.mav.srcSystem) != self.mav.srcSystem:
                 continue
             if name == "COMMAND_LONG" and self.ignores.get(message.command, 0) > 0:
@@ -261,6 +273,8 @@ class Autopilot:
             elif name == "SET_POSITION_TARGET_LOCAL_NED":
                 message.x, message.y = message.x / self.scale[0], message.y / self.scale[1]
                 self._setpoint(message)
+            elif name.startswith("MISSION_"):
+                self.fence.receive(message, self.mav)
             elif name == "PARAM_REQUEST_READ":
                 self._send_parameter(message.param_id)
             elif name == "HEARTBEAT":
@@ -385,6 +399,10 @@ class Control:
         balk 0|1                         to arm, without a warning
         late SECONDS                     until commands are looked at
         ignore COMMAND N                 the next N commands of that number (MAV_CMD) are lost on the way
+    Of fences:
+        fence refuse RESULT              uploads end with that MAV_MISSION_RESULT
+        fence silent 0|1                 no answer
+        fence other                      it has the points of another fence
     Of the link:
         drop SECONDS                     silent, wall time; on TCP the client is hung up on
         freeze 0|1                       no positions
@@ -444,6 +462,16 @@ class Control:
                 c.lost = words[0] == "1"
             case "late":
                 a.late_s = float(words[0])
+            case "fence":
+                match words:
+                    case ("refuse", result):
+                        a.fence.result = int(result)
+                    case ("silent", value):
+                        a.fence.is_silent = value == "1"
+                    case ("other",):
+                        a.fence.points = [(5003, 473977420, 85455940, 100.0)]
+                    case _:
+                        raise ValueError(words)
             case "reboot":
                 c.switch_on()
                 a.forget_rates()
@@ -511,8 +539,15 @@ class Control:
 class Wire:
     """One client at a time, on TCP; a port to speak to, on UDP."""
 
-    def __init__(self, tcp: int | None, udp: int | None) -> None:
+    def __init__(self, tcp: int | None, udp: int | None, station: int | None = None) -> None:
         self.server = self.client = None
+        self.station: socket.socket | None = None
+        if station is not None:
+            self.station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self.station.setblocking(False)
+            self.station.connect(("127.0.0.1", station))
+            self.station_parser = mav.MAVLink(None)
+            self.station_parser.robust_parsing = True
         self.udp: socket.socket | None = None
         if tcp is not None:
             self.server = socket.create_server(("127.0.0.1", tcp))
@@ -535,6 +570,8 @@ class Wire:
         """Pass bytes both ways; did a message come."""
         data, out, met = b"", bytes(autopilot.out), False
         autopilot.out.clear()
+        if self.station is not None:
+            self._exchange_with_station(autopilot, out)
         if self.udp is not None:
             self.met = True
             with contextlib.suppress(OSError):
@@ -573,6 +610,17 @@ class Wire:
             self._hang_up()
         return autopilot.receive(data) if data else False
 
+    def _exchange_with_station(self, autopilot: Autopilot, out: bytes) -> None:
+        assert self.station is not None
+        received = b""
+        with contextlib.suppress(OSError):  # it may not listen yet
+            received = self.station.recv(65536)
+        for data in (out, bytes(autopilot.forwarded)):
+            with contextlib.suppress(OSError):
+                self.station.send(data) if data else None
+        autopilot.forwarded.clear()
+        autopilot.receive(received, self.station_parser)
+
     def _hang_up(self) -> None:
         if self.client is not None:
             self.client.close()
@@ -584,12 +632,13 @@ def main() -> None:
     parser.add_argument("--kind", choices=["ardupilot", "px4"], required=True)
     parser.add_argument("--tcp", type=int)
     parser.add_argument("--udp", type=int)
+    parser.add_argument("--station", type=int)
     parser.add_argument("--speed", type=float, default=1.0)
     parser.add_argument("--ready-s", type=float, default=42.0)
     options = parser.parse_args()
     copter = Copter(options.kind, options.ready_s)
     autopilot = Autopilot(copter, system=1)
-    control, wire = Control(autopilot), Wire(options.tcp, options.udp)
+    control, wire = Control(autopilot), Wire(options.tcp, options.udp, options.station)
     wall_s = heard_wall_s = time.monotonic()
     heard_s, owed_s, setpoints, streamed_wall_s = 0.0, 0.0, 0, 0.0
     while not control.ended:

@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,15 @@ def free_udp_port() -> int:
 class Fake(FakeProcess):
     """The process; `address` is where the bridge finds it."""
 
-    def __init__(self, kind: str, wire: str = "tcp", *, speed: float = 1.0, ready_s: float = 5.0) -> None:
+    def __init__(
+        self,
+        kind: str,
+        wire: str = "tcp",
+        *,
+        speed: float = 1.0,
+        ready_s: float = 5.0,
+        station: int | None = None,
+    ) -> None:
         number = free_udp_port() if wire == "udp" else 0
         command = [
             sys.executable,
@@ -47,8 +55,9 @@ class Fake(FakeProcess):
             f"--{wire}",
             str(number),
         ]
+        at = () if station is None else ("--station", str(station))
         process = subprocess.Popen(
-            [*command, "--speed", str(speed), "--ready-s", str(ready_s)],
+            [*command, "--speed", str(speed), "--ready-s", str(ready_s), *at],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -92,7 +101,12 @@ class Flight(FlightRecord):
     """
 
     def __init__(
-        self, autopilot: Fake, how: SafetySettings, scenario: Scenario = SCENARIO, **bridge: Any
+        self,
+        autopilot: Fake,
+        how: SafetySettings,
+        scenario: Scenario = SCENARIO,
+        fence: Sequence[Enu] = (),
+        **bridge: Any,
     ) -> None:
         super().__init__()
         self.fake = autopilot
@@ -102,7 +116,7 @@ class Flight(FlightRecord):
         self.bridge = MissionController(scenario, how, self._note, **bridge)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
-        self.vehicle = MavlinkVehicle(autopilot.address, start=self.place)
+        self.vehicle = MavlinkVehicle(autopilot.address, start=self.place, fence=fence)
         self.policy: Callable[[MissionController], Action] | None = way_home
 
     def _note(self) -> None:

@@ -19,11 +19,13 @@ from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.messages import Phase
 from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.mavlink.fence_upload import FenceUpload
 from uav_dc_ros.offboard.mavlink.session import Session
 from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.mavlink.vehicle import load_codec
 from uav_dc_ros.offboard.mission.controller import MissionController
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
+from uav_dc_ros.offboard.mission.geofence import UPLOAD_MARGIN_M, Geofence
 
 LOOKS = 2  # after so many ticks of the vehicle the bridge looks: half as often as its node does
 
@@ -56,6 +58,7 @@ class VirtualFlight(FlightRecord):
         channel: from the autopilot to the bridge; None: all arrives at once.
         datum, datum_deg: of the grid.
         system: the vehicle that is meant.
+        upload_fence: whether the fence is uploaded before take-off.
         speed: how many times faster than the clock its time runs.
         looks: after so many of its ticks the bridge looks; 1: as often as its node.
 
@@ -76,6 +79,7 @@ class VirtualFlight(FlightRecord):
         system: int | None = None,
         speed: float = 1.0,
         looks: int = LOOKS,
+        upload_fence: bool = False,
         **bridge: Any,
     ) -> None:
         super().__init__()
@@ -87,7 +91,9 @@ class VirtualFlight(FlightRecord):
         self.channel = channel or (lambda sent, now_s: sent)
         start = scenario.mission.start_m
         self.place = Enu(start[0], start[1], 0.0)
-        self.telemetry = MavlinkTelemetry(datum, self.place, system, datum_deg=datum_deg)
+        corners = Geofence.around(scenario).outline(UPLOAD_MARGIN_M)
+        upload = FenceUpload(corners) if upload_fence else None
+        self.telemetry = MavlinkTelemetry(datum, self.place, system, datum_deg=datum_deg, fence=upload)
         self.session = Session(load_codec(), self.telemetry, self._write)
         self.link_is_up, self.now_s, self.speed, self.looks = True, 1000.0, speed, looks
         self._control = Control(self.autopilot)

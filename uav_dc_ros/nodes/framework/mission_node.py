@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -13,9 +14,10 @@ from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from std_srvs.srv import Trigger
 
 from uav_dc_ros import cdr, messages, topics
-from uav_dc_ros.errors import MessageError
+from uav_dc_ros.errors import MessageError, UavDcError
 from uav_dc_ros.nodes.framework import diagnostics, other_publishers
 from uav_dc_ros.nodes.framework.diagnostics import MessageStatistics
 from uav_dc_ros.nodes.framework.lifecycle_node import ManagedNode
@@ -36,6 +38,9 @@ class MissionNode(ManagedNode):
     While the node is active, each topic calls a method `on_TOPIC` with the checked payload (a JSON topic) or
     the pose (a pose topic). Invalid messages are counted by reason, logged once, and dropped. Subscriptions
     take messages serialised, so that those that cannot be decoded are counted, too.
+
+    Each service of its row calls a method `call_SERVICE`, which returns the message of the response. After a
+    UavDcError the response is without success.
 
     Messages of another run are counted and dropped. Without the parameter `run` the vehicle draws a run, and
     another node adopts that of the only publisher that it receives from.
@@ -103,6 +108,9 @@ class MissionNode(ManagedNode):
             subscription = self.subscribe(TOPICS[name])
             self.subscriptions_of[name] = subscription
             self._until_inactive.callback(self.destroy_subscription, subscription)
+        for name in self.row.services:
+            service = self.create_service(Trigger, name, partial(self._serve, name.removeprefix("~/")))
+            self._until_inactive.callback(self.destroy_service, service)
         endpoints = [*self.subscriptions_of.values(), *self.publishers_of.values()]
         self._reject_unknown("qos", [f"qos_overrides.{end.topic_name}" for end in endpoints])
         self._peers_timer = self.timer(PEERS_PERIOD_S, self._find_peers)
@@ -111,6 +119,15 @@ class MissionNode(ManagedNode):
         deadline_s = time.monotonic() + ACKNOWLEDGE_S
         for publisher in self.publishers_of.values():
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline_s - time.monotonic())))
+
+    def _serve(self, name: str, request: Any, response: Any) -> Any:
+        try:
+            response.message, response.success = getattr(self, f"call_{name}")(), True
+            self.get_logger().info(f"service {name}: {response.message}")
+        except UavDcError as error:
+            response.message, response.success = str(error), False
+            self.get_logger().warning(f"service {name}: refused: {response.message}")
+        return response
 
     # Topics.
 

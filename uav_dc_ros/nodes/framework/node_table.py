@@ -18,6 +18,8 @@ class NodeRow:
     publishes: tuple[str, ...]  # names of topics
     subscribes: tuple[str, ...]
     parameters: tuple[p.Parameter, ...] = ()  # its own, beside `parameters.COMMON`
+    # Services of std_srvs/Trigger while it is active, beside those of the life cycle; `~/`: below its name.
+    services: tuple[str, ...] = ()
     keeps_all: bool = False  # subscriptions keep every message until it is handled, not only the newest 100
     process: bool = True  # it is a process of its own, `python -m uav_dc_ros.nodes.NAME`
     composable: bool = False  # it may share a process with the others that wait for it in every step
@@ -34,6 +36,9 @@ class NodeRow:
     restart_parameters: Mapping[str, object] = field(default_factory=dict)  # that a restart adds
 
 
+VEHICLE_SERVICES = ("start", "stop", "abort")
+RECORDER_SERVICES = ("~/pause", "~/resume", "~/split", "~/snapshot")
+
 NODES: dict[str, NodeRow] = {
     row.name: row
     for row in (
@@ -41,15 +46,25 @@ NODES: dict[str, NodeRow] = {
             name="world",
             publishes=("pose", "users", "mission", "target", "diagnostics", "clock"),
             subscribes=("move", "ready"),
-            parameters=(p.SCENARIO, p.VEHICLE_OF_WORLD, p.SEED, p.MISSIONS, p.PACE, p.JOURNAL),
+            parameters=(
+                p.SCENARIO,
+                p.VEHICLE_OF_WORLD,
+                p.SEED,
+                p.MISSIONS,
+                p.PACE,
+                p.JOURNAL,
+                p.WAIT_FOR_START,
+            ),
+            services=VEHICLE_SERVICES,
             composable=True,
             rank=2,
         ),
         NodeRow(
             name="bridge",
             publishes=("pose", "mission", "target", "battery", "fix", "diagnostics"),
-            subscribes=("move", "ready"),
+            subscribes=("move", "ready", "rates"),  # rates: for ground stations
             parameters=p.BRIDGE,
+            services=VEHICLE_SERVICES,
             rank=2,
             on_request=True,
         ),
@@ -75,6 +90,7 @@ NODES: dict[str, NodeRow] = {
                 *(p.SCENARIO, p.RECORDED_POLICY, p.SEED, p.MISSIONS, p.PACE, p.RECORDED_VEHICLE),
                 *p.BAG_WRITER,
             ),
+            services=RECORDER_SERVICES,
             keeps_all=True,
             rank=0,
             hang_timeout_s=10.0,  # a slow disk blocks its callbacks between waits within the kernel, ...
@@ -86,6 +102,7 @@ NODES: dict[str, NodeRow] = {
             publishes=("diagnostics",),
             subscribes=(),
             parameters=p.BAG_WRITER,
+            services=RECORDER_SERVICES,
             keeps_all=True,
             process=False,
             max_restarts=0,
@@ -131,7 +148,7 @@ COMPOSABLE = tuple(row.name for row in NODES.values() if row.composable)
 
 # Beside a bridge the world only moves the users.
 WORLD_BESIDE_BRIDGE = replace(
-    NODES["world"], publishes=("users", "ready", "diagnostics"), subscribes=("mission", "pose")
+    NODES["world"], publishes=("users", "ready", "diagnostics"), subscribes=("mission", "pose"), services=()
 )
 
 

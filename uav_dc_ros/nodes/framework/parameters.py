@@ -160,6 +160,10 @@ TOKEN = Parameter(
     "secret that the page's address must hold; empty: none on 127.0.0.1, and a random one on other addresses",
 )
 
+WAIT_FOR_START = Parameter(
+    "wait_for_start", False, "true: the first mission begins with a call of the service start"
+)
+
 # Of the nodes that write a bag.
 RECORDED_TOPICS = Parameter(
     "topics",
@@ -175,6 +179,15 @@ COMPRESSION = Parameter("compression", "zstd", "compression of a bag's chunks", 
 MIN_FREE_BYTES = Parameter(
     "min_free_bytes", 2**28, "free disk space below which recording stops", "bytes", 0, INTEGER_MAX
 )
+KEEP_LAST_S = Parameter(
+    "keep_last_s",
+    0.0,
+    "keep the messages of this time in memory; write them, and what follows within the same time, on a "
+    "fault, on an abort and on a call of the service snapshot; 0: write everything",
+    "s",
+    0.0,
+    3600.0,
+)
 BAG_WRITER = (
     Parameter("bag", "", "folder of the new bag"),
     Parameter(
@@ -182,7 +195,7 @@ BAG_WRITER = (
         False,
         "true: continue the bag of a recorder that was killed; false: refuse an existing folder",
     ),
-    *(RECORDED_TOPICS, SPLIT_BYTES, SPLIT_S, COMPRESSION, MIN_FREE_BYTES),
+    *(RECORDED_TOPICS, SPLIT_BYTES, SPLIT_S, COMPRESSION, MIN_FREE_BYTES, KEEP_LAST_S),
 )
 
 
@@ -209,7 +222,7 @@ BRIDGE = (
         "(metres) with a comma between; empty: datum_deg of the scenario, where it has one; here otherwise, "
         "and not with arm",
     ),
-    *(SCENARIO, SEED, JOURNAL),
+    *(SCENARIO, SEED, JOURNAL, WAIT_FOR_START),
     Parameter(
         "fence_margin_m",
         MARGIN_M,
@@ -222,6 +235,11 @@ BRIDGE = (
         "arm",
         SafetySettings.arm,
         "true: the bridge sets the mode and arms; false: it waits until a pilot has done so",
+    ),
+    Parameter(
+        "upload_fence",
+        False,
+        "true: upload the fence to an autopilot on MAVLink that has none, before take-off",
     ),
     _safety("tolerance_m", "distance to a cell's centre that counts as reached", "m", 0.1, 50.0),
     _safety("dwell_s", "time at the cell's centre that completes a step, vehicle time", "s", 0.0, 60.0),

@@ -55,6 +55,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--split-bytes", type=size, default=0, metavar="N", help=p.SPLIT_BYTES.description)
     add("--split-s", type=float, default=0.0, metavar="S", help=p.SPLIT_S.description)
     add("--compression", choices=COMPRESSIONS, default="zstd", help=p.COMPRESSION.description)
+    last = p.KEEP_LAST_S
+    seconds = cli.number(0.0, last.max or 0.0, f"seconds, 0 to {last.max:g}")
+    add("--keep-last", dest="keep_last_s", type=seconds, default=0.0, metavar="S", help=last.description)
     free = p.MIN_FREE_BYTES
     what = f"{free.description} (default: {free.default})"
     add("--min-free-bytes", type=size, default=free.default, metavar="N", help=what)
@@ -62,7 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Record until Ctrl-C or SIGTERM; exits the process, or raises ParameterError."""
-    names = ("resume", "topics", "split_bytes", "compression", "min_free_bytes")
+    names = ("resume", "topics", "split_bytes", "compression", "min_free_bytes", "keep_last_s")
     values = {name: getattr(options, name) for name in names}
     values |= {"bag": str(options.out), "split_s": p.SPLIT_S.value(options.split_s)}
     environment.prepare(local_only=False)  # publishers may be on any host

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from uav_dc_ros.errors import BagError, NodeError, ParameterError
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.record.adaptive_subscription import AdaptiveSubscription
+from uav_dc_ros.nodes.record.gate import RecordingGate
 from uav_dc_ros.nodes.ros import message_types, qos, rclpy_private
 from uav_dc_ros.topics import TOPICS, Topic
 
@@ -70,7 +71,10 @@ class RecorderBase(MissionNode):
         about, folder = self.about(), Path(given["bag"])
         self._check_space(folder)
         options = {name: given[name] for name in ("compression", "split_bytes", "split_s")}
+        if given["keep_last_s"]:
+            about = {**about, "keep_last_s": f"{given['keep_last_s']:g}"}
         self.writer = BagWriter(folder, about, resume=given["resume"] and folder.exists(), **options)
+        self.gate = RecordingGate(self.writer, given["keep_last_s"])
         for kept in (self._announced, self._not_recorded, self._undrained):
             kept.clear()
         self._scanned = set()
@@ -97,6 +101,11 @@ class RecorderBase(MissionNode):
             now_ns, deadline_s = time.time_ns(), time.monotonic() + DRAIN_S
             for name, topic in self._recorded.items():
                 self._undrained[name] = topic.drain(now_ns, deadline_s)
+            if self.gate.is_paused:
+                self.gate.resume(now_ns)
+            if self.gate.kept:
+                why = "no fault, no abort and no call of snapshot"
+                self.get_logger().info(f"{self.gate.kept} messages in memory are not written: {why}")
             dropped = self.dropped()
             self.writer.set_dropped(dropped)
             for name in self.selected - self._recorded.keys() - self._not_recorded.keys():
@@ -146,7 +155,7 @@ class RecorderBase(MissionNode):
             return lambda data, info: None  # the peers of a mission wait for the subscription
         already_ns = writer.already_written.get(name, -1)
         label = name if topic is None else topic.name
-        count, write, announced = self.statistics.count_received, writer.write, self._announced
+        count, write, announced = self.statistics.count_received, self.gate.write, self._announced
 
         def handle(data: bytes, info: Any) -> None:
             if topic is not None:
@@ -257,6 +266,29 @@ class RecorderBase(MissionNode):
         self._not_recorded[name] = reason
         self.get_logger().warning(f"{name} is not recorded: {reason}")
 
+    # Services.
+
+    def call_pause(self) -> str:
+        """Record nothing but marks from now on."""
+        self.gate.pause(time.time_ns())
+        return "recording is paused"
+
+    def call_resume(self) -> str:
+        """Go on recording."""
+        self.gate.resume(time.time_ns())
+        return "recording goes on"
+
+    def call_split(self) -> str:
+        """Begin the next part of the bag."""
+        assert self.writer is not None, "services end with the bag"
+        if not self.writer.split():
+            raise NodeError("this part of the bag has no message yet")
+        return f"part {self.writer.part_count} of the bag begins"
+
+    def call_snapshot(self) -> str:
+        """Write the messages in memory."""
+        return f"{self.gate.save('snapshot')} messages were written"
+
     # The bag.
 
     def _sync(self) -> None:
@@ -287,6 +319,9 @@ class RecorderBase(MissionNode):
         if dropped:
             self.writer.set_dropped(dropped)
         warnings = ["messages were dropped"] if dropped else []
+        warnings += ["recording is paused"] if self.gate.is_paused else []
         values = {"messages": str(self.writer.message_count), "parts": str(self.writer.part_count)}
+        if self.gate.omitted or self.gate.kept:
+            values |= {"messages in memory": str(self.gate.kept), "omitted": str(self.gate.omitted)}
         values |= {f"{name} dropped": str(n) for name, n in dropped.items()}
         return warnings, values | {f"{name} not recorded": why for name, why in self._not_recorded.items()}

@@ -1,6 +1,6 @@
 """The transports to a real vehicle, by the value of the parameter `vehicle`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rclpy.node import Node
@@ -22,6 +22,7 @@ def make(
     grid_origin: str,  # of an earlier bridge in the same flight, which replaces all of them; empty: none
     system: int | None,  # MAVLink system of the vehicle then, unless the parameter names one
     restarted: bool,  # whether an earlier bridge was killed, which the ROS graph may still list
+    fence: Sequence[Enu] = (),  # corners of a polygon to upload (ENU of the grid); empty: none
 ) -> Vehicle:
     """The vehicle that a bridge's parameters name; not opened yet. Call `check` before."""
     start = Enu(*scenario.mission.start_m)._replace(up_m=0.0)
@@ -29,13 +30,13 @@ def make(
     grid: dict[str, Any] = {"start": start, "datum": datum, "datum_deg": datum_deg}
     grid["grid_origin"] = grid_origin
     if values["vehicle"] == "mavlink":
-        return MavlinkVehicle(values["connect"], **grid, system=values["system"] or system)
+        return MavlinkVehicle(values["connect"], **grid, system=values["system"] or system, fence=fence)
     if values["vehicle"] == "mavros":
         return mavros.MavrosVehicle(node, **grid, arms=values["arm"], restarted=restarted)
     return px4.Px4Vehicle(node, **grid, restarted=restarted)
 
 
-def check(kind: str, connect: str, system: int, arm: bool) -> None:
+def check(kind: str, connect: str, system: int, arm: bool, upload_fence: bool) -> None:
     """Check parameters against each other (ParameterError), and that the transport is available.
 
     Raises VehicleError if it is not, or cannot arm, or the address is invalid.
@@ -44,6 +45,8 @@ def check(kind: str, connect: str, system: int, arm: bool) -> None:
         raise ParameterError(f"connect: {connect!r}; expected none with a vehicle on {kind}")
     if kind != "mavlink" and system:
         raise ParameterError(f"system: {system}; expected none (0) with a vehicle on {kind}")
+    if kind != "mavlink" and upload_fence:
+        raise ParameterError(f"upload_fence: true; expected false with a vehicle on {kind}")
     if kind == "mavlink":
         if not connect:
             raise ParameterError("connect: none given; expected an address such as tcp:127.0.0.1:5760")

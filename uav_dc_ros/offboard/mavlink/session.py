@@ -6,10 +6,12 @@ they do when the process has died.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from uav_dc_ros.offboard.frames import Enu
+from uav_dc_ros.offboard.ground_station import StatusText
+from uav_dc_ros.offboard.mavlink.status_text import StatusTextQueue
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM
 from uav_dc_ros.offboard.mavlink.telemetry import OPTIONAL_RATES_HZ, MavlinkTelemetry
 from uav_dc_ros.offboard.setpoint_stream import (
@@ -31,6 +33,7 @@ NUMBERS = 256  # of MAVLink's messages, which then wrap around
 
 REQUEST_S = 0.5  # between checks for messages and parameters that are missing
 RETRY_S, RETRY_OPTIONAL_S = 3.0, 10.0  # for a required message, for an optional one
+VALUES_S = 1.0  # between the values for ground stations
 ONCE = frozenset({"GPS_GLOBAL_ORIGIN"})  # PX4 sends it only when it changes, or on request
 
 NAMES = {SET_MODE: "the change of mode", ARM: "arming", TAKE_OFF: "taking off"}  # as in "arming refused"
@@ -53,6 +56,11 @@ class Session:
         self._request_s = -math.inf
         self._requested_s: dict[str, float] = {}
         self._heartbeat = Heartbeat()
+        # Ground stations show texts and values of the vehicle's own system, as an onboard computer's.
+        self._onboard = codec.MAVLink(None, 0, COMPONENT)
+        self._texts = StatusTextQueue()
+        self._values: Mapping[str, float] = {}
+        self._values_s = -math.inf
 
     def on_connected(self, now_s: float) -> None:
         """Start over on a new link, where a vehicle sends nothing unrequested."""
@@ -60,6 +68,8 @@ class Session:
         self._commands.clear()  # they were for the vehicle on the previous link
         self._requested_s.clear()
         self._heartbeat.begin()
+        if (fence := self.telemetry.fence) is not None and not fence.is_over:
+            fence.begin()
 
     def set_setpoint(self, setpoint: Enu | None, now_s: float) -> bool:
         """Stream a setpoint from now on, or none; returns whether one is due at once."""
@@ -74,6 +84,14 @@ class Session:
     def queue_command(self, command: Command) -> None:
         """Send a command with the next call of `send`."""
         self._commands.append(command)
+
+    def report_text(self, text: StatusText) -> None:
+        """Send a text to ground stations, see `StatusTextQueue`."""
+        self._texts.add(text)
+
+    def report_values(self, values: Mapping[str, float]) -> None:
+        """Send values to ground stations, every `VALUES_S`, unless another controller flies the vehicle."""
+        self._values = values
 
     def receive(self, data: bytes, now_s: float) -> bool:
         """Process received bytes; returns whether a message of the vehicle was among them."""
@@ -103,11 +121,17 @@ class Session:
             self._streamed = self._setpoint, vehicle_s
             if alive and self._setpoint is not None:
                 self._send_setpoint(self._setpoint, vehicle_s)
+        if telemetry.flight_stack is not None:
+            self._report(now_s)
+            self._upload_fence(now_s)
 
     def _on_message(self, message: Any, now_s: float) -> bool:
         accepted = self.telemetry.update(message, now_s)
-        if accepted and message.get_type() == "COMMAND_ACK":
+        name = message.get_type()
+        if accepted and name == "COMMAND_ACK":
             self._on_ack(message, now_s)
+        if accepted and name.startswith("MISSION_") and self.telemetry.fence is not None:
+            self.telemetry.fence.on_message(message, self._codec)
         return accepted
 
     def _on_ack(self, message: Any, now_s: float) -> None:
@@ -127,12 +151,34 @@ class Session:
             result = result.removeprefix("MAV_RESULT_").lower().replace("_", " ")
             telemetry.rejections.reject(name, result, now_s)
 
-    def _write(self, message: Any) -> bool:
-        """Send a message; returns whether there is a peer."""
-        if not self._write_bytes(message.pack(self._mav)):
+    def _write(self, message: Any, mav: Any = None) -> bool:
+        """Send a message, of this bridge or of another identity; returns whether there is a peer."""
+        mav = self._mav if mav is None else mav
+        if not self._write_bytes(message.pack(mav)):
             return False
-        self._mav.seq = (self._mav.seq + 1) % NUMBERS
+        mav.seq = (mav.seq + 1) % NUMBERS
         return True
+
+    def _report(self, now_s: float) -> None:
+        """Send texts and values to ground stations."""
+        telemetry, onboard = self.telemetry, self._onboard
+        onboard.srcSystem = telemetry.system
+        for chunk in self._texts.due(now_s):
+            self._write(onboard.statustext_encode(*chunk), onboard)
+        if self._values and now_s - self._values_s >= VALUES_S and not telemetry.is_flown_by_others:
+            self._values_s = next_due_s(self._values_s, VALUES_S, now_s)
+            boot_ms = int(telemetry.vehicle_s * 1e3) & 0xFFFFFFFF
+            for name, value in self._values.items():
+                self._write(onboard.named_value_float_encode(boot_ms, name.encode(), value), onboard)
+
+    def _upload_fence(self, now_s: float) -> None:
+        """Upload the fence, while the vehicle is disarmed on the ground."""
+        telemetry, fence = self.telemetry, self.telemetry.fence
+        if fence is None or not telemetry.is_at_rest or telemetry.datum is None:
+            return
+        message = fence.due(self._mav, telemetry.system or 0, telemetry.datum, now_s)
+        if message is not None:
+            self._write(message)
 
     def _send_heartbeat(self, now_s: float, vehicle_s: float) -> None:
         number = self._mav.seq

@@ -7,8 +7,9 @@ from functools import lru_cache
 from typing import Any
 
 from uav_dc_ros.offboard import limits
-from uav_dc_ros.offboard.flight_stacks import BATTERY, LANDING, ON_GROUND, FlightStack
+from uav_dc_ros.offboard.flight_stacks import BATTERY, IN_AIR, LANDING, ON_GROUND, FlightStack
 from uav_dc_ros.offboard.frames import Enu, Geodetic, LocalFrame, Ned, sphere_scale
+from uav_dc_ros.offboard.mavlink.fence_upload import FenceUpload
 from uav_dc_ros.offboard.mavlink.systems import AUTOPILOT, COMPONENT, SYSTEM, OtherControllers, Systems
 from uav_dc_ros.offboard.message_order import Discard, Sequence, VehicleClock
 from uav_dc_ros.offboard.rejections import Rejections
@@ -65,9 +66,11 @@ class MavlinkTelemetry:
         system: int | None = None,
         again: bool = False,
         datum_deg: tuple[float, float] | None = None,
+        fence: FenceUpload | None = None,
     ) -> None:
         self.datum, self.start = datum, start  # of the grid, None: not known yet; see `MavlinkVehicle`
         self.datum_deg = datum_deg
+        self.fence = fence  # to be uploaded before take-off; None: none
         self.systems, self.other_controllers = Systems(system, again), OtherControllers(SYSTEM, COMPONENT)
         self.rejections = Rejections()
         self.discarded: Counter[str] = Counter()
@@ -112,6 +115,17 @@ class MavlinkTelemetry:
         """MAV_LANDED_STATE; None: not reported."""
         message = self._messages.get("EXTENDED_SYS_STATE")
         return message.landed_state if message is not None else None
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the vehicle is disarmed, and reports that it stands on the ground."""
+        return not self._armed and self.landed_state == ON_GROUND
+
+    @property
+    def is_flown_by_others(self) -> bool:
+        """Whether a pilot or a failsafe flies: it is armed in another mode than the commanded one."""
+        stack = self.flight_stack
+        return self._armed and (stack is None or stack.mode(self._custom_mode) is not Mode.COMMANDED)
 
     def is_mode_uncertain(self, now_s: float) -> bool:
         """Whether the last heartbeat reports a state left a moment ago: a late message, or a pilot."""
@@ -172,6 +186,7 @@ class MavlinkTelemetry:
             battery_fails=fails,
             vehicle_s=self.vehicle_s,
             missing=self._missing(now_s),
+            fence_refusal=self._fence_refusal(),
             refusal=self.rejections.latest(),
             status_text=self.rejections.recent_texts(now_s),
             home=_enu_from(_geodetic(home), self.datum) if home is not None and self.datum else None,
@@ -225,7 +240,17 @@ class MavlinkTelemetry:
             return ALTITUDE_UNKNOWN
         if self.position is None:
             return "the grid has no datum, and the vehicle does not stand on the ground; expected a datum"
+        if self.fence is not None and not self.fence.is_over:
+            wait = "the fence is uploaded once the vehicle is disarmed on the ground"
+            return str(self.fence.state) if self.is_at_rest else wait
         return None
+
+    def _fence_refusal(self) -> str | None:
+        if self.fence is None or (self.fence.is_over and self.fence.refusal is None):
+            return None
+        if not self.fence.is_over and self._armed and self.landed_state == IN_AIR:
+            return "the fence was not uploaded before take-off"
+        return self.fence.refusal and f"the fence is not uploaded: {self.fence.refusal}"
 
     # Handlers, by message name.
 

@@ -10,12 +10,15 @@ import os
 import select
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.extras import load
 from uav_dc_ros.offboard.frames import Enu, Geodetic
+from uav_dc_ros.offboard.ground_station import StatusText
 from uav_dc_ros.offboard.mavlink.connection import Address, Connection, ConnectionLost, load_serial
+from uav_dc_ros.offboard.mavlink.fence_upload import FenceUpload
 from uav_dc_ros.offboard.mavlink.session import Session
 from uav_dc_ros.offboard.mavlink.telemetry import MavlinkTelemetry
 from uav_dc_ros.offboard.setpoint_stream import use_realtime_priority
@@ -47,6 +50,7 @@ class MavlinkVehicle:
         datum_deg: tuple[float, float] | None = None,  # without `datum`: its latitude and longitude
         grid_origin: str = "",  # of an earlier process in the same flight; replaces all three
         system: int | None = None,  # MAVLink system of the vehicle; None: the only autopilot on the link
+        fence: Sequence[Enu] = (),  # corners of a polygon to upload, in the grid's ENU frame; empty: none
     ) -> None:
         if grid_origin:
             datum = Geodetic.parse(grid_origin)
@@ -54,7 +58,10 @@ class MavlinkVehicle:
         codec = load_codec()
         if self.address.kind == "serial":
             load_serial(self.address)
-        self._telemetry = MavlinkTelemetry(datum, start, system, again=bool(grid_origin), datum_deg=datum_deg)
+        upload = FenceUpload(fence) if fence else None
+        self._telemetry = MavlinkTelemetry(
+            datum, start, system, again=bool(grid_origin), datum_deg=datum_deg, fence=upload
+        )
         self._session = Session(codec, self._telemetry, self._write)
         self._lock = threading.Lock()  # of both
         self._down: str | None = f"{self.address} is not open yet"  # why there is no connection
@@ -113,6 +120,17 @@ class MavlinkVehicle:
         with self._lock:
             self._session.queue_command(command)
         self._wake()
+
+    def report_text(self, text: StatusText) -> None:
+        """Send a text to ground stations."""
+        with self._lock:
+            self._session.report_text(text)
+        self._wake()
+
+    def report_values(self, values: Mapping[str, float]) -> None:
+        """Send values to ground stations from now on."""
+        with self._lock:
+            self._session.report_values(values)
 
     # The thread.
 

@@ -56,6 +56,7 @@ class MissionController:
         self._entered_step = self.step
         before = self.progress.checkpoint
         self._released = before.released  # another controller has the vehicle
+        self._stop_reason = before.stop_reason  # of a stop after the step in progress; empty: none
         self._other_controller: str | None = None  # as reported
         home = Enu(*before.home) if before.home else None
         self.detector = FaultDetector(settings, before.at_rest_v, home)
@@ -123,6 +124,7 @@ class MissionController:
             cell=self.cell,
             goal=self.progress.goal if self._steps.resumes_move or self.phase is Phase.MOVING else None,
             steps_not_reached=self.progress.steps_not_reached,
+            stop_reason=self._stop_reason,
             energy_used_j=float(self.progress.energy_used_j),
             airborne=True,
             released=self._released or (self.is_over and not self._telemetry.armed),
@@ -142,6 +144,8 @@ class MissionController:
         """Begin the move of a step; returns why it is refused, or None."""
         if self.phase is not Phase.READY or self.fault is not None:
             return f"the vehicle is {self.phase.value} ({self.fault or self.reason}); expected it to be ready"
+        if self._stop_reason:
+            return f"the mission ends: {self._stop_reason}"
         if step != self.step:
             return f"a move for step {step}; expected {self.step}"
         cell = self.progress.neighbour(action)
@@ -173,6 +177,14 @@ class MissionController:
             self._released = True  # nothing was requested
             self._end(Phase.ABORTED, reason)
 
+    def stop_after_step(self, reason: str, telemetry: Telemetry | None = None) -> None:
+        """End the mission as `stop` does, but first complete the move in progress."""
+        if self.phase is not Phase.MOVING:
+            self.stop(reason, telemetry)
+        elif not self._stop_reason:
+            self._stop_reason = reason
+            self._on_change()
+
     def can_be_released(self, telemetry: Telemetry) -> bool:
         """Whether the mission ends without further commands."""
         return self.is_over or (self.phase is Phase.LANDING and self._landing.confirm(telemetry))
@@ -198,6 +210,8 @@ class MissionController:
                 self._released = True
                 self._end(Phase.ABORTED, takeover)
                 return []
+        if self._stop_reason and self.phase is Phase.READY:
+            self._abort(self._stop_reason)
         if self._fault_timer.fault is not None and self.phase in OFFBOARD:
             return []  # holds at the setpoint
         if self.phase in POLICY_CONTROLLED and not self._check_policy(telemetry):

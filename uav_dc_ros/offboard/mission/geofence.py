@@ -14,6 +14,7 @@ from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.vehicle import Limits, Telemetry
 
 MARGIN_M = 20.0
+UPLOAD_MARGIN_M = 10.0  # of the autopilot's polygon around the bridge's fence, which acts first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +38,13 @@ class Geofence:
             obstacles=scenario.obstacles,
             margin_m=margin_m,
         )
+
+    def outline(self, margin_m: float) -> tuple[Enu, ...]:
+        """The corners of the box on the ground, counter-clockwise, with a margin around it."""
+        west_m, south_m = self.lower.east_m - margin_m, self.lower.north_m - margin_m
+        east_m, north_m = self.upper.east_m + margin_m, self.upper.north_m + margin_m
+        corners = (west_m, south_m), (east_m, south_m), (east_m, north_m), (west_m, north_m)
+        return tuple(Enu(*corner, 0.0) for corner in corners)
 
     def breach(self, position: Enu) -> str | None:
         """The coordinate that lies outside, or the obstacle that is near; None: the position is inside."""

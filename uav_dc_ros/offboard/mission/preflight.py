@@ -214,7 +214,8 @@ class Preflight:
 
     def _refusal(self, telemetry: Telemetry) -> str | None:
         """Why the mission cannot be flown with this vehicle; None: it can."""
-        return other_controller(telemetry) or self._elsewhere(telemetry) or self._conflict(telemetry)
+        refusal = other_controller(telemetry) or telemetry.fence_refusal or self._elsewhere(telemetry)
+        return refusal or self._conflict(telemetry)
 
     def _elsewhere(self, telemetry: Telemetry) -> str | None:
         """How far the grid lies from where the scenario has it; None: nowhere else."""

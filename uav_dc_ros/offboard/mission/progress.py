@@ -30,6 +30,7 @@ class Checkpoint(msgspec.Struct, frozen=True, kw_only=True):
     allowed_mode: str | None = None  # see `Preflight`
     pilot_has_control: bool = False  # see `Preflight`
     home: tuple[float, float, float] | None = None  # where it was armed, in the grid's ENU frame
+    stop_reason: str = ""  # the mission ends after the move in progress; empty: it does not
     outcome: Phase | None = None  # final phase of a mission that is landing or over
     reason: str = ""  # of the outcome
     landing_mode: Mode | None = None  # with an outcome
