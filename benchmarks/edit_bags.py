@@ -1,6 +1,6 @@
 """Time and memory of `bag cut`, `merge`, `filter` and `convert`, beside the bare `mcap` reader and writer.
 
-    python benchmarks/edit_bags.py [--megabytes N]
+    python benchmarks/edit_bags.py [--megabytes N] [--verbs VERB ...]
 
 The bag has missions with 50 users, as a recorder writes them. Each command is a process of its own; the bare
 one reads the same bag in the order of time and writes every message into a file of the same chunks and
@@ -129,9 +129,11 @@ def main() -> None:
     """Print a line for each command."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--megabytes", type=float, default=50.0)
+    parser.add_argument("--verbs", nargs="+", help="only these")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory("_cache", ".edit_", Path.cwd()) as name:
         folder = Path(name)
-        n = make(folder / "bag", parser.parse_args().megabytes * 1e6)
+        n = make(folder / "bag", options.megabytes * 1e6)
         with BagReader(folder / "bag") as reader:
             seconds, count = (reader.last_ns - reader.first_ns) / 1e9, reader.message_count
         size = (folder / "bag" / "bag_0.mcap").stat().st_size
@@ -154,6 +156,8 @@ def main() -> None:
             "merge (both halves)": ["merge", "0", "1"],
         }
         for title, (verb, *arguments) in commands.items():
+            if options.verbs and verb not in options.verbs:
+                continue
             out = folder / {"--end": "0", "--start": "1"}.get(
                 str(title.split()[1:2] and title.split()[1]), "out"
             )
