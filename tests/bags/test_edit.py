@@ -69,7 +69,8 @@ def cuts(capsys: Capture, source: Path, folder: Path, ends_s: Sequence[tuple[flo
 def check_merge_of_cuts(capsys: Capture, source: Path, folder: Path, n: int, seed: int) -> None:
     """Cuts at random times, some of which overlap, have the source's messages when they are merged."""
     draw = random.Random(seed)
-    at_s = [0.0, *sorted(draw.uniform(0.2, 9.9) for _ in range(n)), 11.0]
+    times_ns = sorted({message.log_time_ns for message in messages(source)})  # none of the cuts is empty
+    at_s = [0.0, *sorted((at_ns - times_ns[0]) / 1e9 for at_ns in draw.sample(times_ns[1:], n)), 11.0]
     ends_s = [(one, other + draw.choice((0.0, 0.0, 0.3))) for one, other in pairwise(at_s)]
     made = cuts(capsys, source, folder, ends_s)
     draw.shuffle(made)

@@ -96,7 +96,9 @@ def _merged(copy: BagCopy, group: Sequence[BagReader], *, is_first: bool) -> Ite
     written: Counter[BagMessage] = Counter()
     read: defaultdict[int, Counter[BagMessage]] = defaultdict(Counter)  # by bag
     streams = [stream(number, reader) for number, reader in enumerate(group)]
-    for number, is_repeated, message in heapq.merge(*streams, key=lambda item: item[2].log_time_ns):
+    # A head is compared with what was written before the bag's first message, also of others at that time.
+    in_order = heapq.merge(*streams, key=lambda item: (item[2].log_time_ns, not item[1]))
+    for number, is_repeated, message in in_order:
         if is_repeated:
             if not copy.holds(message):
                 yield message
