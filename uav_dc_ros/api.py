@@ -3,11 +3,12 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act
-from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.recorded_step import RecordedStep

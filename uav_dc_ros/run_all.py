@@ -28,15 +28,21 @@ VIEW_PORT = 8766
 def parser(prog: str = PROG) -> cli.Parser:
     """The command line."""
     description = (
-        "Fly recorded missions with a trained policy: world, channel monitor, policy and recorder as "
-        "separate ROS 2 nodes."
+        "Fly recorded missions with a trained policy or a planner: world, channel monitor, policy and "
+        "recorder as separate ROS 2 nodes."
     )
     options = cli.Parser(prog=prog, description=description)
     add = options.add_argument
     scenario = "shipped scenario, a TOML file, or the random field of a seed (default: %(default)s)"
     add("--scenario", default="five_clusters", metavar="NAME|FILE|random:SEED", help=scenario)
-    policy = "shipped policy, or its folder (default: the scenario's name with '_dueling')"
+    policy = (
+        "shipped policy, its folder, or a planner: random, nearest, fixed_tour, tour or search (default: the "
+        "scenario's name with '_dueling')"
+    )
     add("--policy", metavar="NAME|DIR", help=policy)
+    weight = cli.number(0.0, 1.0, "a weight between 0 (time only) and 1 (users only)")
+    objective = "weight w of the users in the objective of tour or search, 0 to 1 (default: 10/11)"
+    add("--objective", type=weight, metavar="W", help=objective)
     seed = "seed of the users (default: %(default)s)"
     add("--seed", type=cli.whole_number(0), default=0, metavar="N", help=seed)
     missions = "missions, with seeds N, N+1, ... (default: %(default)s)"

@@ -20,7 +20,7 @@ RANGES = {  # of whole numbers
     "live": (0, PORT_MAX),
     "view": (0, PORT_MAX),
 }
-OPTIONAL = ("policy", "bag", "summary", "system", "live", "view", "compose")
+OPTIONAL = ("policy", "objective", "bag", "summary", "system", "live", "view", "compose")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,9 @@ class RunConfig:
     """
 
     scenario: str | Path = "five_clusters"  # a shipped one, the path of a TOML file, or `random:SEED`
-    policy: str | Path | None = None  # shipped policy, or its folder; None: scenario's name with `_dueling`
+    # Shipped policy, its folder, or a planner; None: the scenario's name with `_dueling`
+    policy: str | Path | None = None
+    objective: float | None = None  # weight w of the users in a planner's objective, 0 to 1; None: 10/11
     seed: int = 0  # seed of the first mission's users; each further mission takes the next one
     missions: int = 1  # number of missions
     pace: float | Literal["lockstep"] = paces.WATCHABLE  # times faster than real time, or as fast as possible
@@ -69,6 +71,9 @@ class RunConfig:
             if isinstance(self.pace, bool) or not isinstance(self.pace, int | float):
                 raise ParameterError(f"pace: {self.pace!r}; expected {paces.LOCKSTEP!r} or a number above 0")
             paces.parse(repr(self.pace))
+        self._check_type("objective", int | float, "a number from 0 to 1")
+        if self.objective is not None and not 0.0 <= self.objective <= 1.0:
+            raise ParameterError(f"objective: {self.objective!r}; expected a number from 0 to 1")
         if self.vehicle not in (SIMULATED, *VEHICLES):
             expected = ", ".join((SIMULATED, *VEHICLES))
             raise ParameterError(f"vehicle: {self.vehicle!r}; expected one of {expected}")

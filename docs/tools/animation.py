@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import load
 from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.env.render import picture
 from uav_dc_ros.env.trajectory import Trajectory
-from uav_dc_ros.experiments.evaluate.evaluation import greedy_act
 
 OUT = Path(__file__).parents[1] / "mission.gif"
 POLICY, SEED = "five_clusters_dueling", 0

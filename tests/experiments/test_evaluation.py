@@ -13,6 +13,7 @@ import pytest
 from tests.support.worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.core.stats import interval
 from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.env.gym_env import DataCollectionEnv
@@ -25,7 +26,6 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     compare,
     evaluate,
     evaluate_act,
-    greedy_act,
     rows,
 )
 from uav_dc_ros.experiments.evaluate.rollout import roll_out

@@ -10,13 +10,14 @@ import torch
 from tests.support.worlds import changed, saved, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.core import world
 from uav_dc_ros.core.scenario import from_values, leaves
 from uav_dc_ros.core.stats import interval
 from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.errors import ScenarioError
 from uav_dc_ros.experiments.evaluate.cli import main
-from uav_dc_ros.experiments.evaluate.evaluation import EvaluationReport, evaluate_act, greedy_act
+from uav_dc_ros.experiments.evaluate.evaluation import EvaluationReport, evaluate_act
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.experiments.evaluate.shifts import apply, parse, transmitting
 from uav_dc_ros.planners import PLANNERS

@@ -103,13 +103,26 @@ def measure(
     `transmitting`: the users that send, bool `[..., U]`; None: all. `drawn`: by a channel that is random;
     without it, see `channel.path_gain`.
     """
+    served, gain = reception(scenario, uav_m, users_m, collected, drawn)
+    if transmitting is not None:
+        served, gain = served & transmitting, gain * transmitting
+    return link_over(scenario, served, gain)
+
+
+def reception(
+    scenario: Scenario, uav_m: Array, users_m: Array, collected: Array, drawn: Realization | None = None
+) -> tuple[Array, Array]:
+    """Who is served, bool, and the channel power gain, linear, `[..., U]`; arguments as in `measure`."""
     values = scenario.radio
     distance_m = radio.distance(uav_m, users_m)
     served = mission.served(distance_m, collected, scenario.mission.d_cons_m)
     cut = None if scenario.buildings is None else scenario.buildings.cut(uav_m, users_m)
-    gain = channel.path_gain(values, uav_m, users_m, distance_m, drawn, cut)
-    if transmitting is not None:
-        served, gain = served & transmitting, gain * transmitting
+    return served, channel.path_gain(values, uav_m, users_m, distance_m, drawn, cut)
+
+
+def link_over(scenario: Scenario, served: Array, gain: Array) -> Link:
+    """The channel of users of which some are served, bool, with their power gains, linear, `[..., U]`."""
+    values = scenario.radio
     sinr = radio.sinr(gain, values.tx_power_w, values.noise_power_w, values.interference, served)
     rate_bps = radio.rate_bps(sinr, values.bandwidth_hz)
     return Link(sinr=sinr, rate_bps=rate_bps, served=served, sum_rate_bps=mission.sum_rate(served, rate_bps))

@@ -1,40 +1,52 @@
-"""The policy: decides a move for each step that the vehicle is ready for. Needs no torch.
+"""The policy node: decides a move for each step that the vehicle is ready for. Needs no torch.
 
-It is the same node in simulation and on an aircraft: it receives the vehicle's state in `mission` only.
+It flies a trained policy, or a planner. It is the same node in simulation and on an aircraft: it receives the
+vehicle's state in `mission`. It subscribes to `users` only for a planner that knows the users' positions.
 """
 
 import numpy as np
 
 from uav_dc_ros import messages, payloads, scenarios
-from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.core import world
+from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
+from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.acknowledgements import AcknowledgementWindow
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
+from uav_dc_ros.nodes.framework.node_table import NODES, POLICY_WITH_POSITIONS
 from uav_dc_ros.nodes.framework.step_synchronizer import StepSynchronizer
 
 
 class PolicyNode(MissionNode):
-    """Flies a trained policy."""
+    """Flies a policy or a planner."""
 
     def __init__(self) -> None:
         super().__init__("policy")
 
     def configure(self) -> None:
-        """Load the policy, and check that it fits the mission's scenario."""
-        self.policy = policies.load(self.values["policy"])
-        scenario = self.values["scenario"]
-        self.scenario = scenarios.load(scenario) if scenario else self.policy.scenario
-        self.policy.check(self.scenario)
-        cell, zeros = np.asarray(self.scenario.start_cell), np.zeros(self.scenario.n_users)
-        energy_used_j = np.asarray(0.0)
-        self._decide(cell, np.asarray(0), zeros, zeros > 0, energy_used_j)  # the first call is the slowest
+        """Load the policy or planner, and check that it fits the mission's scenario."""
+        agent = agents.load(self.values["policy"])
+        scenario = scenarios.load(self.values["scenario"]) if self.values["scenario"] else agent.home
+        if scenario is None:
+            raise ParameterError(f"scenario: none; expected one for the planner {agent.name!r}")
+        self.scenario = scenario
+        self.row = POLICY_WITH_POSITIONS if agent.knows_positions else NODES["policy"]
+        self._kinds = (messages.Users,) if agent.knows_positions else ()
+        self._act = agent.act_in(self.scenario, self.values["objective_weight"])
+        zeros = np.zeros(self.scenario.n_users)
+        self._decide(  # the first call is the slowest
+            cell=np.asarray(self.scenario.start_cell),
+            step=np.asarray(0),
+            data_bits=zeros,
+            collected=zeros > 0,
+            energy_used_j=np.asarray(0.0),
+            users_m=np.asarray(self.scenario.user_centres_m),
+        )
 
     def activate(self) -> None:
         """Begin without a pending step."""
-        self._steps = StepSynchronizer()
+        self._steps = StepSynchronizer(messages.Mission, messages.Rates, *self._kinds)
         self._unacknowledged = AcknowledgementWindow([self.publishers_of["move"]])
 
     def on_mission(self, payload: messages.Mission) -> None:
@@ -48,32 +60,31 @@ class PolicyNode(MissionNode):
         payloads.check(payload, self.scenario)
         self._add(payload)
 
-    def _add(self, payload: messages.Mission | messages.Rates) -> None:
-        if (pair := self._steps.add(payload)) is None:
+    def on_users(self, payload: messages.Users) -> None:
+        """Receive the users' positions in a step."""
+        payloads.check(payload, self.scenario)
+        self._add(payload)
+
+    def _add(self, payload: messages.Mission | messages.Rates | messages.Users) -> None:
+        if (complete := self._steps.add(payload)) is None:
             return
-        mission, rates = pair
+        mission, rates, *users = complete
         data_bits, collected = payloads.collection(rates, self.scenario)
-        steps_flown = self.scenario.mission.max_steps - mission.remaining_steps
-        energy_used_j = payloads.energy_used_j(mission)
         action = self._decide(
-            np.asarray(mission.cell), np.asarray(steps_flown), data_bits, collected, energy_used_j
+            cell=np.asarray(mission.cell),
+            step=np.asarray(self.scenario.mission.max_steps - mission.remaining_steps),
+            data_bits=data_bits,
+            collected=collected,
+            energy_used_j=payloads.energy_used_j(mission),
+            users_m=payloads.users_m(users[0], self.scenario) if users else None,
         )
         move = messages.Move(run=mission.run, mission=mission.mission, step=mission.step, action=action.label)
         self._unacknowledged.step()
         self.publish_payload("move", move)
 
-    def _decide(
-        self, cell: Array, step: Array, data_bits: Array, collected: Array, energy_used_j: Array
-    ) -> Action:
-        observation = self.policy.observe(
-            self.scenario,
-            cell=cell,
-            step=step,
-            data_bits=data_bits,
-            collected=collected,
-            energy_used_j=energy_used_j,
-        )
-        return Action(int(self.policy.act(observation, world.action_mask(self.scenario, cell))))
+    def _decide(self, **state: Array) -> Action:
+        """The action in a state, see `agent.state_of`."""
+        return Action(int(self._act(agents.state_of(self.scenario, **state))))
 
 
 if __name__ == "__main__":

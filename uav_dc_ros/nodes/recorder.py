@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import msgspec
 
 from uav_dc_ros import __version__, scenarios
-from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.core import pace
 from uav_dc_ros.messages import PAYLOADS
 from uav_dc_ros.nodes.framework import node_main
@@ -19,7 +19,7 @@ from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 
 
 class RecorderNode(RecorderBase):
-    """Writes a mission's bag, with metadata: scenario, policy and its hash, seed."""
+    """Writes a mission's bag, with metadata: scenario, policy and its hash or planner, seed."""
 
     delays_new_topics = True  # a later scan shows whether another mission owns their namespace
 
@@ -42,8 +42,12 @@ class RecorderNode(RecorderBase):
         if values["vehicle"] == SIMULATED:  # a real one has no pace
             about["pace"] = pace.text(values["pace"])
         if values["policy"]:
-            loaded = policies.load(values["policy"])
-            about |= {"policy": loaded.name, "policy_sha256": loaded.sha256}
+            agent = agents.load(values["policy"])
+            about["policy"] = agent.name
+            if agent.sha256 is not None:
+                about["policy_sha256"] = agent.sha256
+            if agent.weighs:
+                about["objective_weight"] = repr(values["objective_weight"])
         return about
 
     def on_peers(self) -> None:

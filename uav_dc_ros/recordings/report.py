@@ -22,6 +22,7 @@ SUMMARIES_MAX = 2_000  # rows in the list of missions
 SYSTEM_ROOM = 150_000  # bytes kept for latencies, nodes and faults
 GENERATOR = b'<meta name="generator" content="uav_dc_ros report">'
 HEAD_SIZE = 1_000  # bytes of a page that contain the generator
+ABOUT = ("pace", "objective_weight", "policy_sha256")  # of a bag, that the page shows
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +91,9 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
             "bag": bag,
             "recorded": start.strftime("%Y-%m-%d %H:%M UTC"),
             "policy": reader.about.get("policy", "unknown"),
-            "about": {k: reader.about[k] for k in ("pace", "policy_sha256") if k in reader.about},
+            "about": {
+                k: reader.about[k] for k in ("pace", "objective_weight", "policy_sha256") if k in reader.about
+            },
             **({"vehicle": vehicle} if real else {}),
             "version": __version__,
             "world": world_data(scenario),

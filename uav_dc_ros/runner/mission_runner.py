@@ -12,7 +12,7 @@ import msgspec
 from rclpy.context import Context
 
 from uav_dc_ros import cli, files, scenarios
-from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.core import pace
 from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
@@ -68,8 +68,9 @@ class MissionRunner:
     def __init__(self, config: RunConfig, *, show: bool = True) -> None:
         self.config = config
         self.scenario = scenarios.load(config.scenario)
-        self.policy = policies.load(config.policy or f"{self.scenario.name}_dueling")
-        self.policy.check(self.scenario)
+        self.agent = agents.load(config.policy or f"{self.scenario.name}_dueling")
+        self.weight = run_options.weight(config, self.agent)
+        self.agent.act_in(self.scenario, self.weight)  # raises UavDcError where it does not fit
         self.is_simulated = config.vehicle == SIMULATED
         if self.is_simulated:
             pace.check(self.scenario, config.factor, config.missions)
@@ -166,10 +167,10 @@ class MissionRunner:
         return node_locks.held(node.context.get_domain_id(), names, self.run_id)
 
     def _note_other_world(self) -> None:
-        trained, flown = self.policy.scenario, self.scenario
-        if trained.fingerprint != flown.fingerprint:
+        trained, flown = self.agent.home, self.scenario
+        if trained is not None and trained.fingerprint != flown.fingerprint:
             self._note(
-                f"policy {self.policy.name} was trained in another world ({trained.name} "
+                f"policy {self.agent.name} was trained in another world ({trained.name} "
                 f"{trained.fingerprint}) than it flies in ({flown.name} {flown.fingerprint})"
             )
 
@@ -277,7 +278,8 @@ class MissionRunner:
         config = self.config
         values: dict[str, object] = {
             "scenario": scenarios.from_anywhere(config.scenario),
-            "policy": str(self.policy.folder.absolute()),
+            "policy": self.agent.argument,
+            "objective_weight": self.weight,
             "seed": config.seed,
             "missions": config.missions,
             "pace": pace.text(config.factor),
@@ -335,7 +337,7 @@ class MissionRunner:
             if not (self._abort_reason or self.interrupted):
                 reason = mission.reason or "the vehicle gave no reason"
                 self._error(f"mission {mission.index} was aborted at step {mission.steps}: {reason}")
-        self.summaries.append(mission.summary(self.scenario, self.policy.name, bag))
+        self.summaries.append(mission.summary(self.scenario, self.agent.name, bag))
 
     def _write_summary(self) -> None:
         """Write the summary to its file, if there is one, and print it."""

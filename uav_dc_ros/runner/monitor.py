@@ -100,7 +100,7 @@ class MissionMonitor(MissionNode):
         self._started_s = math.inf  # when all nodes of this run_all had started
         self._found_s: float | None = None  # when another mission was found
         self._noted: set[str] = set()  # nodes outside this mission
-        self._steps = StepSynchronizer()
+        self._steps = StepSynchronizer(messages.Mission, messages.Rates)
         self._position_m: list[float] = []
         self._unreported: dict[int, messages.Mission] = {}  # final states of missions
         self._ended_s = 0.0  # time of the last one

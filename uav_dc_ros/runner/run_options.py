@@ -8,16 +8,20 @@ from pathlib import Path
 import msgspec
 
 from uav_dc_ros import files
+from uav_dc_ros.agents.agent import Agent
 from uav_dc_ros.core import pace
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, UavDcError
 from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
+from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
 VEHICLE_OPTIONS = ("connect", "system", "arm", "datum", "upload_fence")
-# Parameters that are options of run_all.
-OPTIONS = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", *VEHICLE_OPTIONS)
+_SHARED = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", *VEHICLE_OPTIONS)
+# Parameters that are options of run_all, and their options.
+OPTIONS = {name: name.replace("_", "-") for name in _SHARED} | {"objective_weight": "objective"}
 
 
 def nodes(config: RunConfig) -> list[str]:
@@ -67,9 +71,7 @@ def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]
             raise ParameterError(f"{option}: expected a node that is started here: {', '.join(nodes)}")
         row = next((row for row in NODES[node].parameters if row.name == name), None)
         if name in OPTIONS:
-            raise ParameterError(
-                f"{option}: expected --{name.replace('_', '-')}, which sets it for all nodes"
-            )
+            raise ParameterError(f"{option}: expected --{OPTIONS[name]}, which sets it for all nodes")
         if row is None:
             known = ", ".join(row.name for row in NODES[node].parameters if row.name not in OPTIONS)
             expected = f"some of {known}" if known else "none: it has options of run_all only"
@@ -83,6 +85,19 @@ def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]
             raise ParameterError(f"--set {node}.{error}") from None
         checked.setdefault(node, {})[name] = row.typed(value)
     return checked
+
+
+def weight(config: RunConfig, agent: Agent) -> float:
+    """The weight of the objective; raises ParameterError for one that a policy or planner does not use."""
+    if config.objective is None:
+        return DEFAULT_WEIGHT
+    if not agent.weighs:
+        expected = ", ".join(planner.name for planner in PLANNERS.values() if planner.weighs)
+        raise ParameterError(
+            f"--objective {config.objective:g}: the moves of {agent.name!r} do not depend on it; expected it "
+            f"with the planners {expected}"
+        )
+    return float(config.objective)
 
 
 def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> None:

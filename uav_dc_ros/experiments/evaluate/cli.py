@@ -1,10 +1,10 @@
 """The command line of `python -m uav_dc_ros.evaluate`."""
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import msgspec
 from msgspec import UNSET, UnsetType
@@ -14,7 +14,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from uav_dc_ros import cli, files, scenarios
+from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.agents.agent import Agent
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT, EXPECTED_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act
@@ -30,7 +32,6 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     ShiftEffect,
     compare,
     evaluate_act,
-    greedy_act,
     mean_and_interval,
     rows,
     save_mission_picture,
@@ -53,28 +54,20 @@ _MAIN_FIGURES = ("objective", "landing_rate", "users_collected", "arrival_step")
 _SHIFT_FIGURES = ("objective", "users_collected", "data_bits", "landing_rate", "arrival_step")
 
 
-class Candidate(NamedTuple):
-    """A policy or a planner to evaluate."""
-
-    name: str  # in the results
-    sha256: str | None  # of a policy's config and model
-    home: str | None  # name of the scenario that a policy was trained in
-    act_in: Callable[[Scenario], Act]  # raises PolicyError where the policy does not fit
-
-
 def main(argv: list[str] | None = None) -> None:
     """Run the command, and exit."""
     description = "Fly policies over many missions, and show and compare their performance."
     parser = cli.Parser(prog=PROG, description=description)
     add = parser.add_argument
-    text = f"shipped: {', '.join(policies.names())}; baselines: {', '.join(PLANNERS)}; "
+    text = f"shipped: {', '.join(policies.names())}; planners: {', '.join(PLANNERS)}; "
     text += "all are compared with the first"
     add("--policy", nargs="+", required=True, metavar="NAME|DIR", help=text)
     text = f"every policy flies in each; shipped: {', '.join(scenarios.names())}; "
     text += "default: by the name of the policy's own"
     add("--scenario", nargs="+", default=[], metavar="NAME|FILE|random:SEED", help=text)
     add("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
-    text = "w of the objective J: 1 counts the users only, 0 the time only; default 10/11"
+    text = "w of the objective J, which tour and search maximise: 1 counts the users only, 0 the time only; "
+    text += "default 10/11"
     weight = cli.number(0.0, 1.0, EXPECTED_WEIGHT)
     add("--objective", type=weight, default=DEFAULT_WEIGHT, metavar="W", help=text)
     add("--json", type=Path, metavar="FILE", help="write evaluations and comparisons")
@@ -87,7 +80,7 @@ def main(argv: list[str] | None = None) -> None:
         options = parser.parse_args(argv)
         _check_once("--shift", [request.text for request in options.shift])
         pairs = _pairs(options.policy, options.scenario)
-        flights = [flight for pair in pairs for flight in _flights(*pair, options.shift)]
+        flights = [flight for pair in pairs for flight in _flights(*pair, options.shift, options.objective)]
         if options.picture and len(flights) > 1:
             raise UavDcError(
                 f"--picture of {len(flights)} evaluations; expected one policy, one scenario, no --shift"
@@ -96,7 +89,7 @@ def main(argv: list[str] | None = None) -> None:
             files.check_writable(path)
         if options.picture:
             candidate, scenario = pairs[0]
-            save_mission_picture(candidate.act_in(scenario), scenario, 0, options.picture)
+            save_mission_picture(candidate.act_in(scenario, options.objective), scenario, 0, options.picture)
 
         seeds = range(options.seeds)
         evaluated = [
@@ -118,14 +111,14 @@ def _check_once(option: str, values: Sequence[str]) -> None:
             raise UavDcError(f"{option} {value} is given {values.count(value)} times; expected once")
 
 
-def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[tuple[Candidate, Scenario]]:
-    """Candidates and scenarios in the order of the results: every policy in each scenario, or in its own."""
+def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[tuple[Agent, Scenario]]:
+    """Agents and scenarios in the order of the results: every policy in each scenario, or in its own."""
     for option, values in (("--policy", policy_names), ("--scenario", scenario_names)):
         _check_once(option, values)
-    candidates = [_candidate(value) for value in policy_names]
+    candidates = [agents.load(value) for value in policy_names]
     names = [candidate.name for candidate in candidates]
     candidates = [  # equal names are replaced by the arguments, which differ
-        candidate._replace(name=value) if names.count(candidate.name) > 1 else candidate
+        replace(candidate, name=value) if names.count(candidate.name) > 1 else candidate
         for candidate, value in zip(candidates, policy_names, strict=True)
     ]
     if scenario_names:
@@ -143,19 +136,19 @@ def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[t
             raise UavDcError(
                 f"--policy {candidate.name}: a planner has no scenario of its own; expected --scenario"
             )
-        pairs.append((candidate, scenarios.load(candidate.home)))
+        pairs.append((candidate, scenarios.load(candidate.home.name)))
     return pairs
 
 
 def _flights(
-    candidate: Candidate, scenario: Scenario, shifts: Sequence[ShiftRequest]
-) -> Iterator[tuple[Candidate, ShiftedWorld, Act]]:
+    candidate: Agent, scenario: Scenario, shifts: Sequence[ShiftRequest], weight: float
+) -> Iterator[tuple[Agent, ShiftedWorld, Act]]:
     """A candidate in the scenario as it is and in each shifted world, with its actions there."""
-    yield candidate, ShiftedWorld(scenario, scenario), candidate.act_in(scenario)
+    yield candidate, ShiftedWorld(scenario, scenario), candidate.act_in(scenario, weight)
     for request in shifts:
         world = apply(request, scenario)
         try:
-            act = candidate.act_in(world.known)
+            act = candidate.act_in(world.known, weight)
         except PolicyError as error:
             raise PolicyError(f"--shift {request.text}: {error}") from None
         yield candidate, world, act
@@ -178,13 +171,6 @@ def _report(evaluated: Sequence[EvaluatedMissions]) -> EvaluationReport:
             comparisons.append(compare(one, baseline))
     evaluations = [one.evaluation for one in evaluated]
     return EvaluationReport(evaluations=evaluations, comparisons=comparisons, shifts=effects or UNSET)
-
-
-def _candidate(value: str) -> Candidate:
-    if value in PLANNERS:
-        return Candidate(value, None, None, PLANNERS[value])
-    policy = policies.load(value)
-    return Candidate(policy.name, policy.sha256, policy.scenario.name, partial(greedy_act, policy))
 
 
 def show(report: EvaluationReport) -> None:

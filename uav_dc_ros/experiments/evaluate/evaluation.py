@@ -10,13 +10,14 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from uav_dc_ros import __version__
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.reward import MISSION_REWARD, RewardData
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.stats import interval
-from uav_dc_ros.core.world import Act, action_mask, observe
+from uav_dc_ros.core.world import Act
 from uav_dc_ros.errors import FROM_TRAIN, UavDcError
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out, roll_out_trajectory
 from uav_dc_ros.experiments.evaluate.shifts import Shift, transmitting
@@ -122,13 +123,6 @@ class EvaluatedMissions:
 
     evaluation: Evaluation
     values: dict[str, Array]
-
-
-def greedy_act(policy: Policy, scenario: Scenario) -> Act:
-    """The policy's greedy actions in a scenario; raises PolicyError when it does not fit."""
-    policy.check(scenario)
-    kind = policy.config.observation
-    return lambda state: policy.act(observe(kind, scenario, state), action_mask(scenario, state.cell))
 
 
 def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Evaluation:

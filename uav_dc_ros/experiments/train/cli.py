@@ -15,12 +15,13 @@ import msgspec
 
 from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import network, policy
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Algorithm, Hyperparameters, PolicyConfig
 from uav_dc_ros.core.observations import Observation
 from uav_dc_ros.core.reward import RewardData, RewardForm, RPlus
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act, save_mission_picture
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture
 from uav_dc_ros.experiments.train.generalist import cli as generalist
 from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run

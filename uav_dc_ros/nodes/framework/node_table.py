@@ -79,7 +79,7 @@ NODES: dict[str, NodeRow] = {
             name="policy",
             publishes=("move", "ready", "diagnostics"),
             subscribes=("mission", "rates"),
-            parameters=(p.POLICY, p.SCENARIO_OF_POLICY),
+            parameters=(p.POLICY, p.SCENARIO_OF_POLICY, p.OBJECTIVE_WEIGHT),
             composable=True,
         ),
         NodeRow(
@@ -87,7 +87,15 @@ NODES: dict[str, NodeRow] = {
             publishes=("ready", "diagnostics"),
             subscribes=tuple(one.name for one in TOPICS.values() if one.recorded and not one.optional),
             parameters=(
-                *(p.SCENARIO, p.RECORDED_POLICY, p.SEED, p.MISSIONS, p.PACE, p.RECORDED_VEHICLE),
+                *(
+                    p.SCENARIO,
+                    p.RECORDED_POLICY,
+                    p.OBJECTIVE_WEIGHT,
+                    p.SEED,
+                    p.MISSIONS,
+                    p.PACE,
+                    p.RECORDED_VEHICLE,
+                ),
                 *p.BAG_WRITER,
             ),
             services=RECORDER_SERVICES,
@@ -145,6 +153,9 @@ NODES: dict[str, NodeRow] = {
 }
 
 COMPOSABLE = tuple(row.name for row in NODES.values() if row.composable)
+
+# A planner that knows where the users are.
+POLICY_WITH_POSITIONS = replace(NODES["policy"], subscribes=(*NODES["policy"].subscribes, "users"))
 
 # Beside a bridge the world only moves the users.
 WORLD_BESIDE_BRIDGE = replace(

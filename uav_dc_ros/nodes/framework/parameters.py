@@ -9,6 +9,7 @@ import msgspec
 
 from uav_dc_ros.bags import COMPRESSIONS
 from uav_dc_ros.core import pace
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.messages import Run
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
@@ -118,8 +119,18 @@ SCENARIO = Parameter(
     "scenario", "five_clusters", "name of a shipped scenario, path of a TOML file, or random:SEED"
 )
 SCENARIO_OF_POLICY = Parameter("scenario", "", "scenario of the mission; empty: the policy's own")
-POLICY = Parameter("policy", "five_clusters_dueling", "name of a shipped policy, or its folder")
-RECORDED_POLICY = Parameter("policy", "", "policy that flies, by name or folder; empty: not known")
+POLICY = Parameter(
+    "policy", "five_clusters_dueling", "name of a shipped policy or of a planner, or a policy's folder"
+)
+RECORDED_POLICY = Parameter("policy", "", "policy or planner that flies, by name or folder; empty: not known")
+OBJECTIVE_WEIGHT = Parameter(
+    "objective_weight",
+    DEFAULT_WEIGHT,
+    "weight w of the users in the objective, for a planner; 0: the time counts only",
+    "",
+    0.0,
+    1.0,
+)
 SEED = Parameter("seed", 0, "seed of the first mission's users", "", 0, INTEGER_MAX)
 MISSIONS = Parameter("missions", 1, "number of missions, with consecutive seeds", "", 1, INTEGER_MAX)
 PACE = Parameter(

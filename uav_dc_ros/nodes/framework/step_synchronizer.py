@@ -1,27 +1,25 @@
-"""Pairs the messages of one step."""
+"""Collects the messages of one step."""
 
-from uav_dc_ros.messages import Mission, Rates
+from typing import Any
 
-WAITING_MAX = 1000  # unpaired steps; older ones are dropped
+from uav_dc_ros.messages import Stepped
+
+WAITING_MAX = 1000  # incomplete steps; older ones are dropped
 
 
 class StepSynchronizer:
-    """Pairs the `mission` and the `rates` of a step, which arrive in any order."""
+    """Collects one payload of each kind for a step, which arrive in any order."""
 
-    def __init__(self) -> None:
-        self._missions: dict[tuple[str, int, int], Mission] = {}
-        self._rates: dict[tuple[str, int, int], Rates] = {}
+    def __init__(self, *kinds: type[Stepped]) -> None:
+        self._waiting: dict[type[Stepped], dict[tuple[str, int, int], Any]] = {kind: {} for kind in kinds}
 
-    def add(self, payload: Mission | Rates) -> tuple[Mission, Rates] | None:
-        """Add a payload; returns the pair of its step once both are there."""
+    def add(self, payload: Stepped) -> tuple[Any, ...] | None:
+        """Add a payload; returns those of its step, in the order of the kinds, once all are there."""
         step = (payload.run, payload.mission, payload.step)
-        if isinstance(payload, Mission):
-            self._missions[step] = payload
-        else:
-            self._rates[step] = payload
-        for waiting in (self._missions, self._rates):
-            if len(waiting) > WAITING_MAX:
-                del waiting[next(iter(waiting))]
-        if step not in self._missions or step not in self._rates:
+        own = self._waiting[type(payload)]
+        own[step] = payload
+        if len(own) > WAITING_MAX:
+            del own[next(iter(own))]
+        if not all(step in waiting for waiting in self._waiting.values()):
             return None
-        return self._missions.pop(step), self._rates.pop(step)
+        return tuple(waiting.pop(step) for waiting in self._waiting.values())

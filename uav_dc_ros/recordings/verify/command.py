@@ -7,18 +7,20 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import msgspec
-import numpy as np
 
 from uav_dc_ros import __version__, cli, files
+from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.agents import policy as policies
-from uav_dc_ros.agents.policy import CONFIG, Policy
+from uav_dc_ros.agents.agent import Agent
+from uav_dc_ros.agents.policy import CONFIG
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.core import pace
-from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT, check_weight
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.errors import BagError, ParameterError, PolicyError
+from uav_dc_ros.errors import BagError, ParameterError, PolicyError, UavDcError
 from uav_dc_ros.messages import printable
+from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import Steps
@@ -51,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("bag", type=Path, metavar="BAG", help="folder of a bag, or one of its files")
-    add("--policy", metavar="NAME|DIR", help="also show where this policy decides differently")
+    add("--policy", metavar="NAME|DIR", help="also show where this policy or planner decides differently")
     add("--policy-dir", type=Path, metavar="DIR", help="folder of the policy that flew, or of policies")
     add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the mission, for a bag with several")
@@ -104,8 +106,9 @@ class VerifyReport(msgspec.Struct, frozen=True, kw_only=True):
     namespace: str  # without a slash at its end
     scenario: str
     fingerprint: str
-    policy: str | None  # the one whose decisions are recomputed
-    policy_sha256: str | None
+    policy: str | None  # the policy or planner whose decisions are recomputed
+    policy_sha256: str | None  # null for a planner
+    objective_weight: float | None  # w of a planner that depends on it
     decisions_missing: str  # why no decisions are recomputed; empty
     recorded_by: str | None  # version of this package
     verified_by: str  # likewise
@@ -126,24 +129,29 @@ class Verified(NamedTuple):
 
 
 class OtherPolicy(DecisionCheck):
-    """Decisions of another policy than the one that flew."""
+    """Decisions of another policy or planner than the one that flew."""
 
-    def __init__(self, scenario: Scenario, policy: Policy) -> None:
-        super().__init__(scenario, policy)
+    def __init__(self, scenario: Scenario, agent: Agent, weight: float) -> None:
+        super().__init__(scenario, agent, weight)
         self._details: list[str] = []
         self._missions = 0  # with different decisions
         self._before = 0, 0  # steps compared and differing before the mission
 
-    def add(self, step: RecordedStep) -> Array | None:
+    def add(self, step: RecordedStep) -> str | None:
         """Compare the decision of a step."""
-        q_values = super().add(step)
-        if q_values is not None and self.differing <= SHOWN and step.move is not None:
-            best, recorded = int(np.argmax(q_values)), ACTION_LABELS.index(step.move.action)
-            self._details.append(
-                f"  {step.name}: {ACTION_LABELS[best]} (Q {q_values[best]:.6g}), "
-                f"recorded {step.move.action} (Q {q_values[recorded]:.6g})"
-            )
-        return q_values
+        action = super().add(step)
+        if action is not None and self.differing <= SHOWN and step.move is not None:
+            own, recorded = self._with_q(step, action), self._with_q(step, step.move.action)
+            self._details.append(f"  {step.name}: {own}, recorded {recorded}")
+        return action
+
+    def _with_q(self, step: RecordedStep, action: str) -> str:
+        """An action with its Q-value; of a planner, which has none, the action alone."""
+        observed, policy = step.observed(self._scenario), self.agent.policy
+        if policy is None or observed is None:
+            return action
+        q_values = policy.q_values(policy.observe(self._scenario, **observed))
+        return f"{action} (Q {q_values[ACTION_LABELS.index(action)]:.6g})"
 
     def end_mission(self, name: str) -> None:
         """Count the decisions of a mission after its last step."""
@@ -156,21 +164,22 @@ class OtherPolicy(DecisionCheck):
     def lines(self) -> list[str]:
         """The result as text."""
         more = [f"  and in {self._missions - LISTED} more missions"] if self._missions > LISTED else []
-        summary = f"{self.policy.name!r} decides differently in {self.differing} of {self.compared} steps"
+        summary = f"{self.agent.name!r} decides differently in {self.differing} of {self.compared} steps"
         return [summary, *self._details, *more]
 
 
 def _verify(reader: BagReader, namespace: str, scenario: Scenario, options: argparse.Namespace) -> Verified:
     """Recompute the missions in a namespace; raises BagError if nothing can be recomputed."""
-    other = OtherPolicy(scenario, policies.load(options.policy)) if options.policy else None
     about, tolerance = reader.about, options.tolerance
+    weight = _weight(reader)
+    other = OtherPolicy(scenario, agents.load(options.policy), weight) if options.policy else None
     vehicle = step_reader.vehicle(reader, namespace)
     seed, lockstep, real = about.get("seed"), about.get("pace") == pace.LOCKSTEP, vehicle != SIMULATED
-    policy, missing_policy = _policy(about, scenario, options.policy_dir)
+    agent, missing_policy = _agent(about, scenario, options.policy_dir)
     channel = ChannelCheck(scenario, tolerance)
     world = WorldCheck(scenario, seed=seed, lockstep=lockstep, real=real, tolerance=tolerance)
     flights = VehicleCheck(scenario, vehicle) if real else None
-    decisions = DecisionCheck(scenario, policy) if policy else None
+    decisions = DecisionCheck(scenario, agent, weight) if agent else None
     service = ServiceSummary(scenario)
     recorded = Steps(reader, namespace, scenario.step_ns)
     n_missions = n_steps = 0
@@ -198,7 +207,7 @@ def _verify(reader: BagReader, namespace: str, scenario: Scenario, options: argp
     lines += service.lines()
     losses = list(recorded.losses())
     missions = f"{n_missions} mission{'s' * (n_missions != 1)}"
-    by = "" if policy is None else f", policy {policy.name!r} (sha256 {policy.sha256[:12]})"
+    by = "" if agent is None else f", {_title(agent, weight)}"
     flown = f"{missions}, {n_steps} steps in scenario {scenario.name!r}{by}"
     has_gaps = any(check.skipped for check in checks) or not decisions or bool(losses) or seed is None
     differs = any(check.differing for check in checks)
@@ -208,8 +217,9 @@ def _verify(reader: BagReader, namespace: str, scenario: Scenario, options: argp
         namespace=namespace,
         scenario=scenario.name,
         fingerprint=scenario.fingerprint,
-        policy=policy.name if policy else None,
-        policy_sha256=policy.sha256 if policy else None,
+        policy=agent.name if agent else None,
+        policy_sha256=agent.sha256 if agent else None,
+        objective_weight=weight if agent and agent.weighs else None,
         decisions_missing=missing_policy,
         recorded_by=about.get("version"),
         verified_by=__version__,
@@ -246,11 +256,30 @@ def _check_topics(reader: BagReader, namespace: str) -> None:
         )
 
 
-def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> tuple[Policy | None, str]:
-    """The policy that flew, by the hash in the bag, or why there is none."""
+def _title(agent: Agent, weight: float) -> str:
+    if agent.sha256 is not None:
+        return f"policy {agent.name!r} (sha256 {agent.sha256[:12]})"
+    return f"planner {agent.name!r}" + (f" (w = {weight:.6g})" if agent.weighs else "")
+
+
+def _weight(reader: BagReader) -> float:
+    """The weight of the objective in the bag; raises BagError if it is none."""
+    text = reader.about.get("objective_weight")
+    try:
+        return DEFAULT_WEIGHT if text is None else check_weight(float(text), "objective_weight")
+    except (ValueError, UavDcError):
+        raise BagError(
+            f"bag {reader.path}: objective_weight {text!r}; expected a number from 0 to 1"
+        ) from None
+
+
+def _agent(about: dict[str, str], scenario: Scenario, folder: Path | None) -> tuple[Agent | None, str]:
+    """The policy that flew, by the hash in the bag, or the planner; or why there is none."""
     if folder is not None and not folder.is_dir():
         raise ParameterError(f"--policy-dir {folder}: no such folder")
     name, sha256 = about.get("policy"), about.get("policy_sha256")
+    if name in PLANNERS and sha256 is None:
+        return Agent(name, PLANNERS[name]), ""
     if name is None or sha256 is None:
         return None, "the bag does not name the policy that flew; --policy NAME|DIR compares with one"
     candidates: list[str | Path] = [name, *policies.names()]
@@ -264,7 +293,7 @@ def _policy(about: dict[str, str], scenario: Scenario, folder: Path | None) -> t
             continue
         if policy.sha256 == sha256:
             policy.check(scenario)
-            return policy, ""
+            return Agent(policy.name, policy), ""
         if policy.name == name and not other:
             other = f"; {str(candidate)!r} is another one (sha256 {policy.sha256[:12]})"
     missing = f"policy {name!r} (sha256 {sha256[:12]}) is missing{other}"

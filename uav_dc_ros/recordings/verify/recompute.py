@@ -11,11 +11,12 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 
 from uav_dc_ros import payloads
-from uav_dc_ros.agents.policy import Policy
+from uav_dc_ros.agents.agent import Agent, state_of
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.mobility import WalkingUsers
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import Mission, Phase, Rates, Stepped
@@ -331,17 +332,17 @@ class WorldCheck(Check):
 
 
 class DecisionCheck(Check):
-    """Recomputes the decisions of a policy."""
+    """Recomputes the decisions of a policy or a planner."""
 
     title = "decisions"
 
-    def __init__(self, scenario: Scenario, policy: Policy) -> None:
+    def __init__(self, scenario: Scenario, agent: Agent, weight: float = DEFAULT_WEIGHT) -> None:
         super().__init__()
-        policy.check(scenario)
-        self.policy, self._scenario = policy, scenario
+        self.agent, self._scenario = agent, scenario
+        self._act = agent.act_in(scenario, weight)
 
-    def add(self, step: RecordedStep) -> Array | None:
-        """Recompute the decision of a step; the Q-values `[A]` if it differs."""
+    def add(self, step: RecordedStep) -> str | None:
+        """Recompute the decision of a step; the label of the action if it differs."""
         status, move = step.status, step.move
         if status is None or status.phase not in (Phase.READY, Phase.LANDING, Phase.ABORTED):
             return None
@@ -351,19 +352,20 @@ class DecisionCheck(Check):
             return None
         try:
             observed = step.observed(self._scenario)
+            if observed is not None and self.agent.knows_positions:
+                users = step.users
+                observed["users_m"] = None if users is None else payloads.users_m(users, self._scenario)
         except MessageError:
-            self.skipped["rates or mission of another world"] += 1
+            self.skipped["rates, users or mission of another world"] += 1
             return None
-        if observed is None:
-            self.skipped["no rates recorded"] += 1
+        if observed is None or observed.get("users_m", observed) is None:
+            self.skipped[f"no {'rates' if observed is None else 'users'} recorded"] += 1
             return None
-        observation = self.policy.observe(self._scenario, **observed)
-        q_values = self.policy.q_values(observation)
-        mask = world.action_mask(self._scenario, observed["cell"])
-        action = Action(int(self.policy.act(observation, mask))).label
+        state = state_of(self._scenario, **observed)
+        action = Action(int(self._act(state))).label
         found = [difference(step, "move", "action", move.action, action)] if action != move.action else []
         self.count(found)
-        return q_values if found else None
+        return action if found else None
 
 
 def _cell(step: RecordedStep, cell: list[int], reached: list[list[int]]) -> list[Difference]:

@@ -1,6 +1,6 @@
 """Whether a mission of a scenario can be flown: what is in reach, and what a tour of the clusters collects.
 
-The tour is the planner `tour`, flown with the scenario's own channel, users and end of a mission.
+The tour is the planner `fixed_tour`, flown with the scenario's own channel, users and end of a mission.
 """
 
 import math
@@ -12,12 +12,12 @@ from typing import TypeAlias
 import msgspec
 import numpy as np
 
-from uav_dc_ros import planners
 from uav_dc_ros.core import mission, observations, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.obstacles import UNREACHABLE, moves_to_dock
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act, rollout_steps
+from uav_dc_ros.planners.baselines import ENOUGH, fixed_tour
 
 SEEDS = range(10)
 DISC_POINTS = 500  # of a disc, of equal area each
@@ -41,7 +41,7 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Tour(msgspec.Struct, frozen=True, kw_only=True):
-    """Missions of the planner `tour`."""
+    """Missions of the planner `fixed_tour`."""
 
     missions: int
     landed: int  # missions
@@ -75,7 +75,7 @@ class Flown:
 
 def examine(scenario: Scenario, seeds: Sequence[int] = SEEDS) -> Flyable:
     """Fly tours, and collect what is wrong with a scenario."""
-    flown = fly(scenario, planners.tour(scenario), seeds)
+    flown = fly(scenario, fixed_tour(scenario), seeds)
     collected = flown.collected.mean(axis=0)
     users = scenario.users
     starts = [[((user.x_m, user.y_m), user.radius_m) for user in listed] for listed in users.listed]
@@ -148,7 +148,7 @@ def by_cluster(scenario: Scenario, collected: Array) -> Array:
 
 
 def steps_of_tour(scenario: Scenario, seeds: Sequence[int] = SEEDS) -> float | None:
-    """Steps of a tour that has no limit: it stays until `planners.ENOUGH` of each cluster is collected.
+    """Steps of a tour that has no limit: it stays until `ENOUGH` of each cluster is collected.
 
     The mean step at which it is home, over the missions that collect so much; None: fewer than half do.
     """
@@ -156,13 +156,13 @@ def steps_of_tour(scenario: Scenario, seeds: Sequence[int] = SEEDS) -> float | N
     longest = (grid.n_x + grid.n_y + HOVERS_MAX) * (scenario.n_clusters + 1) + grid.n_z
     limits = msgspec.structs.replace(scenario.mission, max_steps=longest, episode_end="at_time_limit")
     free = msgspec.structs.replace(scenario, mission=limits, energy=None)
-    enough = planners.ENOUGH * np.asarray(scenario.users.sizes)
+    enough = ENOUGH * np.asarray(scenario.users.sizes)
 
     def is_home(state: world.State) -> bool:
         served = (by_cluster(free, state.collected) >= enough).all(axis=-1)
         return bool((served & mission.at_dock(state.cell, scenario.dock_cell)).all())
 
-    flown = fly(free, planners.tour(free), seeds, until=is_home)
+    flown = fly(free, fixed_tour(free), seeds, until=is_home)
     complete = (flown.collected >= enough).all(axis=-1)
     return float(flown.docked_step[complete].mean()) if 2 * complete.sum() >= len(seeds) else None
 
@@ -279,5 +279,5 @@ def _uncollected(scenario: Scenario, missed: list[int], names: str, tour: Tour, 
 
 def _visit(scenario: Scenario, cluster: int) -> Act:
     """The tour of a UAV that counts every other cluster as collected."""
-    act, others = planners.tour(scenario), scenario.user_cluster != cluster
+    act, others = fixed_tour(scenario), scenario.user_cluster != cluster
     return lambda state: act(replace(state, collected=state.collected | others))

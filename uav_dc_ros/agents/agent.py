@@ -1,0 +1,129 @@
+"""What decides the moves of missions: a trained policy, or a planner. Both have one interface here."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.agents.policy import Policy
+from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT
+from uav_dc_ros.core.scenario import Scenario
+from uav_dc_ros.core.world import Act, State, action_mask
+from uav_dc_ros.errors import PolicyError
+from uav_dc_ros.planners import PLANNERS, Planner
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A policy or a planner, before it has a scenario."""
+
+    name: str
+    source: Policy | Planner
+
+    @property
+    def policy(self) -> Policy | None:
+        """The policy; None: it is a planner."""
+        return self.source if isinstance(self.source, Policy) else None
+
+    @property
+    def sha256(self) -> str | None:
+        """Hash of a policy's config and model, in hex."""
+        return None if self.policy is None else self.policy.sha256
+
+    @property
+    def home(self) -> Scenario | None:
+        """The scenario in which a policy was trained."""
+        return None if self.policy is None else self.policy.scenario
+
+    @property
+    def knows_positions(self) -> bool:
+        """Whether it needs the users' positions, `State.users_m`."""
+        return isinstance(self.source, Planner) and self.source.knows == "positions"
+
+    @property
+    def weighs(self) -> bool:
+        """Whether its moves depend on the weight of the objective."""
+        return isinstance(self.source, Planner) and self.source.weighs
+
+    @property
+    def argument(self) -> str:
+        """What names it for `load` in another process."""
+        return str(self.source.folder.absolute()) if isinstance(self.source, Policy) else self.name
+
+    def act_in(self, scenario: Scenario, weight: float = DEFAULT_WEIGHT) -> Act:
+        """Its actions in a scenario, with the weight w of the objective.
+
+        Raises:
+            PolicyError: a policy that does not fit the scenario.
+            ParameterError: a scenario that is too large for a planner.
+        """
+        if isinstance(self.source, Policy):
+            return greedy_act(self.source, scenario)
+        return self.source(scenario, weight)
+
+
+def load(name_or_path: str | Path) -> Agent:
+    """The planner with a name, or the policy with a shipped name or in a folder.
+
+    Raises:
+        PolicyError: neither, or both; see also `policy.load`.
+    """
+    name = str(name_or_path)
+    if name not in PLANNERS:
+        policy = policies.load(name_or_path)
+        return Agent(policy.name, policy)
+    if name in policies.names() or Path(name, policies.CONFIG).exists():
+        raise PolicyError(
+            f"policy {name!r} is a planner, and a policy's folder has the same name; expected another name "
+            f"of the folder, or a path such as ./{name}"
+        )
+    return Agent(name, PLANNERS[name])
+
+
+def greedy_act(policy: Policy, scenario: Scenario) -> Act:
+    """The policy's greedy actions in a scenario; raises PolicyError when it does not fit."""
+    policy.check(scenario)
+
+    def act(state: State) -> Array:
+        observation = policy.observe(
+            scenario,
+            cell=state.cell,
+            step=state.step,
+            data_bits=state.data_bits,
+            collected=state.collected,
+            energy_used_j=state.energy_used_j,
+        )
+        return policy.act(observation, action_mask(scenario, state.cell))
+
+    return act
+
+
+def state_of(
+    scenario: Scenario,
+    *,
+    cell: Array,
+    step: Array,
+    data_bits: Array,
+    collected: Array,
+    energy_used_j: Array,
+    users_m: Array | None = None,
+) -> State:
+    """The state of one mission as an agent knows it; positions and rewards that it does not know are NaN.
+
+    `cell` is `[3]`, `step` and `energy_used_j` `[]`, `data_bits` and `collected` `[U]`, `users_m` `[U, 2]`.
+    """
+    unknown = np.asarray(np.nan)
+    return State(
+        step=step,
+        cell=cell,
+        users_m=np.full((scenario.n_users, 2), np.nan) if users_m is None else users_m,
+        data_bits=data_bits,
+        collected=collected,
+        total_reward=unknown,
+        mission_reward=unknown,
+        energy_used_j=energy_used_j,
+        motion=np.zeros((scenario.n_users, 0)),
+        waves=np.zeros((1, 0)),
+    )
