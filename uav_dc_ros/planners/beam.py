@@ -7,7 +7,9 @@ All missions of the beam are at the same step. Each is extended by every move. O
 with the same users collected only the most promising one is kept, and of all the `width` most promising.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,10 +17,14 @@ from uav_dc_ros.core import mission, world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT, objective
 from uav_dc_ros.core.world import State
-from uav_dc_ros.planners.model import MissionModel
+from uav_dc_ros.planners.model import MissionModel, Model
 from uav_dc_ros.planners.promise import Promise
 
 WIDTH = 512
+
+# From the index of the step, the steps flown, the cells `[B]`, the data and who is collected, `[B, U]`: the J
+# that missions may end with, and the further users that they may collect, `[B]` each; see `Promise`.
+Ranking: TypeAlias = Callable[[int, int, Array, Array, Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +52,14 @@ class _Beam:
         return _Beam(**{name: getattr(self, name)[where] for name in self.__dataclass_fields__})
 
 
-def search(model: MissionModel, state: State, *, width: int = WIDTH, weight: float = DEFAULT_WEIGHT) -> Plan:
+def search(
+    model: Model,
+    state: State,
+    *,
+    width: int = WIDTH,
+    weight: float = DEFAULT_WEIGHT,
+    ranking: Ranking | None = None,
+) -> Plan:
     """The best mission from a state, by the objective J with the weight w.
 
     Args:
@@ -54,22 +67,26 @@ def search(model: MissionModel, state: State, *, width: int = WIDTH, weight: flo
         state: that of one mission, without batch dimensions.
         width: missions that are kept in each step.
         weight: w of J.
+        ranking: what missions are compared by; default: `Promise`, for a `MissionModel`.
 
     Returns:
         The actions up to the arrival; the UAV hovers from then on. They are none where no mission lands.
     """
-    return _Search(model, state, width, weight).run()
+    if ranking is None:
+        assert isinstance(model, MissionModel), "needed by `Promise`"
+        ranking = Promise(model, model.scenario.user_r_min_bits(state.data_bits), weight)
+    return _Search(model, state, width, weight, ranking).run()
 
 
 class _Search:
     """A search, step by step."""
 
-    def __init__(self, model: MissionModel, state: State, width: int, weight: float) -> None:
+    def __init__(self, model: Model, state: State, width: int, weight: float, ranking: Ranking) -> None:
         scenario = model.scenario
         self._model, self._scenario, self._width, self._weight = model, scenario, width, weight
         self._first_step = int(state.step)
         self._r_min_bits = scenario.user_r_min_bits(state.data_bits)
-        self._promise = Promise(model, self._r_min_bits, weight)
+        self._promise = ranking
         # Sums of random numbers: equal ones are those of equal sets of users, but for one in 2^64.
         self._numbers = np.random.default_rng(0).integers(0, 2**64, scenario.n_users, np.uint64)
         cell = model.index(np.asarray(state.cell))[None]

@@ -1,4 +1,4 @@
-"""The cells of a scenario as a graph, and what each of them would deliver in a step."""
+"""The cells of a scenario and the moves between them, numbered, and what each cell delivers in a step."""
 
 from functools import lru_cache
 
@@ -11,96 +11,74 @@ from uav_dc_ros.core.obstacles import UNREACHABLE
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 
-SIZE_MAX = 20_000_000  # cells times users: tables of 160 MB
+SIZE_MAX = 20_000_000  # cells times users of a `Delivery`: tables of 160 MB
+FAR = np.iinfo(np.int32).max  # moves to what cannot be reached
 
 
 class Cells:
-    """The C cells that the UAV can reach, numbered, with their moves.
-
-    Raises:
-        ParameterError: more cells and users than `SIZE_MAX`.
-    """
+    """The C cells of a grid, also those that the UAV cannot reach."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.scenario, grid = scenario, scenario.grid
-        if (size := int(np.prod(grid.shape)) * scenario.n_users) > SIZE_MAX:
-            raise ParameterError(
-                f"scenario {scenario.name!r}: cells times users are {size}; this planner expects "
-                f"at most {SIZE_MAX}"
-            )
-        everywhere = np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3)
-        if scenario.moves is None:
-            reachable = np.ones(len(everywhere), dtype=bool)
-        else:
-            reachable = (
-                scenario.moves.steps_from(np.asarray([scenario.start_cell])).reshape(-1) != UNREACHABLE
-            )
-        self.cells: Array = everywhere[reachable]  # `[C, 3]`
-        self._numbers = np.where(reachable, np.cumsum(reachable) - 1, -1).reshape(grid.shape)
-        actions = np.arange(len(MOVES))
-        moved = world.move(
+        self.scenario = scenario
+        self.cells = np.moveaxis(np.indices(scenario.grid.shape), 0, -1).reshape(-1, 3)  # `[C, 3]`
+        after = world.move(
             scenario,
-            np.repeat(self.cells[:, None], len(MOVES), axis=1),
-            actions[None] + 0 * self.cells[:, :1],
+            np.repeat(self.cells, len(MOVES), axis=0),
+            np.tile(np.arange(len(MOVES)), len(self.cells)),
         )
-        self.after: Array = self.number(moved)  # number of the cell after each action, `[C, 7]`
-        # The actions that have an effect, and hover, bool `[C, 7]`
-        self.valid: Array = (self.after != np.arange(len(self.cells))[:, None]) | (actions == Action.HOVER)
-        self.at_dock: Array = mission.at_dock(self.cells, scenario.dock_cell)  # bool `[C]`
-        self.to_dock: Array = self._steps(scenario.dock_cell)  # moves to the dock, `[C]`
-        self.uav_m: Array = grid.centre_m(self.cells, like=np.zeros(1))  # `[C, 3]`
-        self.steps_to = lru_cache(maxsize=256)(self._steps_to)  # moves to the cell of a number, `[C]`
+        # The cell after each action, integers `[C, 7]`, and whether the action has an effect, or is hover.
+        self.after = self.index(after).reshape(-1, len(MOVES))
+        self.has_effect = self.after != np.arange(len(self.cells))[:, None]
+        self.has_effect[:, Action.HOVER] = True
+        self.docked = mission.at_dock(self.cells, scenario.dock_cell)  # bool `[C]`
+        self.steps_home = self._steps(np.asarray(scenario.dock_cell))  # moves to the dock, integers `[C]`
+        self.steps_to = lru_cache(maxsize=256)(lambda cell: self._steps(self.cells[cell]))  # to a cell, `[C]`
 
-    def number(self, cell: Array) -> Array:
-        """Numbers of cells `[..., 3]`, integers `[...]`; -1 for one that cannot be reached."""
-        return self._numbers[tuple(np.moveaxis(cell, -1, 0))]
+    def index(self, cells: Array) -> Array:
+        """Index of cells `[..., 3]` in `cells`, integers `[...]`."""
+        _, n_y, n_z = self.scenario.grid.shape
+        return (cells[..., 0] * n_y + cells[..., 1]) * n_z + cells[..., 2]
 
-    def _steps_to(self, number: int) -> Array:
-        return self._steps(self.cells[number])
-
-    def _steps(self, goal: Array | tuple[int, int]) -> Array:
-        """Moves from each cell to a goal `[3]`, or a column of cells `[2]`, integers `[C]`."""
-        moves, goal = self.scenario.moves, np.asarray(goal)
+    def _steps(self, goal: Array) -> Array:
+        """Moves from each cell to a cell `[3]`, or to a column of cells `[2]`; `FAR`: no way."""
+        moves = self.scenario.moves
         if moves is None:
             return np.abs(self.cells[:, : len(goal)] - goal).sum(axis=-1)
         steps = (
             moves.steps_from(goal[None]) if len(goal) == 3 else moves.steps_to((int(goal[0]), int(goal[1])))
         )
-        return steps[tuple(self.cells.T)].astype(np.int64)
-
-    @property
-    def energies_j(self) -> Array:
-        """Energy of each action, joules, `[7]`; zeros in a scenario without `energy`."""
-        if self.scenario.energy is None:
-            return np.zeros(len(MOVES))
-        one = self.scenario.step_energies_j
-        return np.asarray([*(one.level,) * 4, one.climb, one.descent, one.hover])
-
-    @property
-    def has_battery(self) -> bool:
-        """Whether the battery may end a mission."""
-        return self.scenario.energy is not None and self.scenario.energy.ends != "steps"
+        return np.where(steps == UNREACHABLE, FAR, steps).reshape(-1).astype(np.int64)
 
 
 class Delivery:
     """The data of a step over each cell, with the users at given positions, and no draw of the channel.
 
     `users_m` is `[U, 2]`, metres. Where interference is `associated`, a user's data depend on who is served.
+    From a cell that the UAV cannot reach no data are delivered.
+
+    Raises:
+        ParameterError: more cells times users than `SIZE_MAX`.
     """
 
     def __init__(self, cells: Cells, users_m: Array) -> None:
         self._scenario = scenario = cells.scenario
+        if (size := len(cells.cells) * scenario.n_users) > SIZE_MAX:
+            raise ParameterError(
+                f"scenario {scenario.name!r}: {size} cells times users; the planner expects up to {SIZE_MAX}"
+            )
+        uav_m = scenario.grid.centre_m(cells.cells, like=users_m)
         waiting = np.zeros((1, scenario.n_users), dtype=bool)
-        everywhere_m = np.broadcast_to(users_m, (len(cells.cells), *users_m.shape))
-        self._served, self._gain = world.reception(scenario, cells.uav_m, everywhere_m, waiting)
+        everywhere_m = np.broadcast_to(users_m, (len(uav_m), *users_m.shape))
+        served, self._gain = world.reception(scenario, uav_m, everywhere_m, waiting)
+        self._served = served & (cells.steps_home < FAR)[:, None]
         self._depends = scenario.radio.interference == "associated"
         self._bits = self._delivered(self._served, self._gain)
 
-    def of(self, number: Array, collected: Array) -> Array:
+    def of(self, cell: Array, collected: Array) -> Array:
         """Data in a step over cells `[N]`, bit, `[N, U]`, of users not collected; `collected` is `[N, U]`."""
         if not self._depends:
-            return self._bits[number] * ~collected
-        return self._delivered(self._served[number] & ~collected, self._gain[number])
+            return self._bits[cell] * ~collected
+        return self._delivered(self._served[cell] & ~collected, self._gain[cell])
 
     def everywhere(self, collected: Array) -> Array:
         """Data in a step over each cell, bit, `[C, U]`, where `collected` is `[U]`."""

@@ -23,7 +23,7 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act, State
-from uav_dc_ros.planners.cells import Cells, Delivery
+from uav_dc_ros.planners.cells import FAR, Cells, Delivery
 
 HOVERS_MAX = 16  # steps over a stop within which a user is collected, or not counted
 EXACT_MAX = 8  # stops of which every order is tried
@@ -45,8 +45,8 @@ class _Tour:
         self._step_cost = (1.0 - weight) / scenario.mission.max_steps
         stops, needs = _stops(self.cells)
         legs = np.stack([self.cells.steps_to(int(stop)) for stop in stops])  # [M, C], moves to each stop
-        start = self.cells.number(np.asarray(scenario.start_cell))
-        to_dock = self.cells.to_dock
+        start = self.cells.index(np.asarray(scenario.start_cell))
+        to_dock = self.cells.steps_home
         order = _order(legs[:, stops], legs[:, start], to_dock[stops])
         self._stops, self._legs = stops[order], legs[order]  # in the order of the tour
         self._between = self._legs[:, self._stops]  # [M, M], symmetric
@@ -61,7 +61,7 @@ class _Tour:
     def act(self, state: State) -> Array:
         """The actions of missions."""
         shape = state.step.shape
-        number = self.cells.number(state.cell).reshape(-1)
+        number = self.cells.index(state.cell).reshape(-1)
         left = self._left(state).reshape(-1)
         data_bits = state.data_bits.reshape(len(left), -1)
         collected = state.collected.reshape(len(left), -1)
@@ -72,10 +72,9 @@ class _Tour:
     def _left(self, state: State) -> Array:
         """Steps that are left, of the mission and of the battery, integers `[...]`."""
         left = self.scenario.mission.max_steps - state.step
-        if not self.cells.has_battery:
-            return left
         energy = self.scenario.energy
-        assert energy is not None, "it has a battery"
+        if energy is None or energy.ends == "steps":
+            return left
         # As many as the dearest kind of step allows: a way with obstacles may climb.
         steps = (energy.battery_j - state.energy_used_j) / max(self.scenario.step_energies_j)
         return np.minimum(left, np.floor(steps).astype(np.int64))
@@ -119,7 +118,7 @@ class _Tour:
         worth = np.take_along_axis(worth, kept, axis=-1)[..., 0]  # [S, M]
         stays = np.ceil(np.take_along_axis(needs, kept, axis=-1)[..., 0])
         n_stops = len(self._stops)
-        to_dock = self.cells.to_dock
+        to_dock = self.cells.steps_home
         # Of a tour that begins with stop i: its value and its steps, of the dock alone in the last column
         value, steps = np.zeros((len(price), n_stops + 1)), np.zeros((len(price), n_stops + 1))
         for i in reversed(range(n_stops)):
@@ -152,16 +151,14 @@ class _Tour:
     def _towards(self, number: Array, left: Array, goal: Array) -> Array:
         """The action on a shortest way to the goals, or to the dock where time would run out, `[S]`."""
         cells, is_dock = self.cells, goal == len(self._stops)
-        after, valid = cells.after[number], cells.valid[number]
+        after, valid = cells.after[number], cells.has_effect[number]
         to_goal = np.where(
             is_dock[:, None],
-            cells.to_dock[after],
+            cells.steps_home[after],
             self._legs[np.minimum(goal, len(self._stops) - 1)[:, None], after],
         )
-        in_time = valid & (cells.to_dock[after] <= left[:, None] - 1)
-        steps = np.where(
-            in_time, to_goal, np.where(valid, 10**9 + cells.to_dock[after], np.iinfo(np.int64).max)
-        )
+        in_time = valid & (cells.steps_home[after] <= left[:, None] - 1)
+        steps = np.where(in_time, to_goal, np.where(valid, FAR + cells.steps_home[after], 10**10))
         return _PREFERRED[steps[:, _PREFERRED].argmin(axis=1)]
 
 

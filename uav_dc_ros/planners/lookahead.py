@@ -12,90 +12,92 @@ stop and the steps that its slowest user needs there. Of all subsets of the grou
 the time counts, in the order of the shortest way (Held and Karp, 1962).
 """
 
-from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
-from uav_dc_ros.core.mobility import Static
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act, State
-from uav_dc_ros.planners import table_beam as beam
-from uav_dc_ros.planners.cells import Cells, Delivery
-from uav_dc_ros.planners.table_beam import Guess, Guide, Plan, Start
+from uav_dc_ros.planners import beam
+from uav_dc_ros.planners.beam import Ranking
+from uav_dc_ros.planners.cells import FAR, Cells, Delivery
+from uav_dc_ros.planners.model import Model
 
-WIDTH = 48  # states of a depth
+WIDTH = 48  # missions of the beam
 GROUPS_MAX = 6
 _ROUNDING = 1024.0  # parts of a step: sums of such numbers are exact in any order
 
 
+class StandingUsers(Model):
+    """Users that stay where they are, over the channel without shadowing and fading."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Until `look` the model has no users; raises ParameterError for a scenario that is too large."""
+        super().__init__(scenario)
+        self.n_steps = 0
+        self._look = self._deliver(np.asarray(scenario.user_centres_m))
+
+    def _deliver(self, users_m: Array) -> tuple[bytes, Delivery]:
+        return users_m.tobytes(), Delivery(self, users_m)
+
+    def look(self, state: State) -> Delivery:
+        """Take the users' positions and the steps that are left from the state of one mission."""
+        self.n_steps = self.scenario.mission.max_steps - int(state.step)
+        if self._look[0] != state.users_m.tobytes():
+            self._look = self._deliver(state.users_m)
+        return self._look[1]
+
+    def delivered(self, step: int, cell: Array, collected: Array) -> Array:
+        """See `Model.delivered`."""
+        return self._look[1].of(cell, collected)
+
+
 def search(scenario: Scenario, weight: float, width: int = WIDTH) -> Act:
     """Flies the first move of the best plan from each state; see the module."""
-    cells = Cells(scenario)
-    plan = planner(cells, weight, width)
+    model = StandingUsers(scenario)
+
+    def decide(state: State) -> int:
+        ranking = estimate(model, model.look(state), state, weight)
+        plan = beam.search(model, state, width=width, weight=weight, ranking=ranking)
+        return int(plan.actions[0]) if len(plan.actions) else _homewards(model, int(model.index(state.cell)))
 
     def act(state: State) -> Array:
-        shape = state.step.shape
-        numbers = cells.number(state.cell).reshape(-1).tolist()
-        rows = zip(
-            numbers,
-            state.step.reshape(-1).tolist(),
-            state.users_m.reshape(-1, scenario.n_users, 2),
-            state.data_bits.reshape(-1, scenario.n_users),
-            state.collected.reshape(-1, scenario.n_users),
-            np.broadcast_to(state.energy_used_j, shape).reshape(-1).tolist(),
-            strict=True,
-        )
-        actions = [
-            _first(cells, number, plan(users_m, Start(step, number, data_bits, collected, used_j)))
-            for number, step, users_m, data_bits, collected, used_j in rows
-        ]
-        return np.asarray(actions).reshape(shape)
+        shape, n = state.step.shape, state.step.size
+        each = {one.name: getattr(state, one.name) for one in fields(State)}
+        rows = {name: values.reshape((n, *values.shape[len(shape) :])) for name, values in each.items()}
+        states = (State(**{name: rows[name][i] for name in rows}) for i in range(n))
+        return np.asarray([decide(one) for one in states]).reshape(shape)
 
     return act
 
 
-def planner(cells: Cells, weight: float, width: int = WIDTH) -> Callable[[Array, Start], Plan | None]:
-    """The plan from a start with the users at `[U, 2]`, metres, or None; see `beam.search`."""
-    known: dict[bytes, Delivery] = {}  # of users that do not move
-    moves = not isinstance(cells.scenario.users.moves, Static)
-
-    def plan(users_m: Array, start: Start) -> Plan | None:
-        where = users_m.tobytes()
-        if moves:
-            known.clear()
-        if (delivery := known.get(where)) is None:
-            delivery = known[where] = Delivery(cells, users_m)
-        guide = estimate(cells, delivery, users_m, start, weight)
-        return beam.search(cells, lambda _, *at: delivery.of(*at), guide, start, weight, width)
-
-    return plan
+def _homewards(cells: Cells, cell: int) -> int:
+    """The first action of the shortest way to the dock; over it, hover."""
+    steps = np.where(cells.has_effect[cell], cells.steps_home[cells.after[cell]], FAR)
+    return int(Action.HOVER if steps[Action.HOVER] == steps.min() else steps.argmin())
 
 
-def _first(cells: Cells, number: int, plan: Plan | None) -> int:
-    """The first action of a plan; over the dock, hover; without a plan, the shortest way home."""
-    if plan is not None:
-        return plan.actions[0] if plan.actions else int(Action.HOVER)
-    steps = np.where(cells.valid[number], cells.to_dock[cells.after[number]], np.iinfo(np.int64).max)
-    return int(len(steps) - 1 - steps[::-1].argmin())  # hover first
-
-
-def estimate(cells: Cells, delivery: Delivery, users_m: Array, start: Start, weight: float) -> Guide:
-    """The guide of a search from `start`, see the module."""
+def estimate(cells: Cells, delivery: Delivery, state: State, weight: float) -> Ranking:
+    """What the missions of a search from the state of one mission lead to, see the module."""
     scenario = cells.scenario
     n_users, max_steps = scenario.n_users, scenario.mission.max_steps
-    r_min_bits = np.broadcast_to(scenario.user_r_min_bits(start.data_bits), (n_users,))
-    left_bits = np.where(start.collected, 0.0, r_min_bits - start.data_bits)
-    bits = delivery.everywhere(start.collected)
+    user_value, price = weight / n_users, (1.0 - weight) / max_steps
+    r_min_bits = np.broadcast_to(scenario.user_r_min_bits(state.data_bits), (n_users,))
+    left_bits = np.where(state.collected, 0.0, r_min_bits - state.data_bits)
+    bits = delivery.everywhere(state.collected)
     with np.errstate(divide="ignore", invalid="ignore"):
-        alone = left_bits / bits.max(axis=0)  # steps at the best cell of each user
-        # More steps than a user is worth are spent on it by accident only.
-        worth = max(weight / n_users * max_steps / (1.0 - weight), 1.0) if weight < 1.0 else np.inf
-    waiting = np.flatnonzero(~start.collected & (alone <= min(worth, max_steps - start.step)))
+        alone = left_bits / bits.max(axis=0)  # steps over the best cell of each user
+    # A user that needs more steps than it is worth is only collected on the way.
+    worth = max(user_value / price, 1.0) if price > 0.0 else np.inf
+    waiting = np.flatnonzero(~state.collected & (alone <= min(worth, max_steps - int(state.step))))
     if not waiting.size:
-        return _home(cells)
-    groups = _groups(scenario, users_m, waiting)
+        return lambda _, n_flown, cell, data_bits, collected: (
+            user_value * collected.sum(axis=1) - price * (n_flown + cells.steps_home[cell]),
+            (~collected).sum(axis=1),
+        )
+    groups = _groups(scenario, state.users_m, waiting)
     order = np.argsort(groups, kind="stable")
     users, groups = waiting[order], groups[order]
     firsts = np.flatnonzero(np.diff(groups, prepend=-1))
@@ -106,34 +108,18 @@ def estimate(cells: Cells, delivery: Delivery, users_m: Array, start: Start, wei
     per_bit = 1.0 / np.where(at_stop >= 0.25 * best, at_stop, best)
     wanted = r_min_bits[users]
     ways, member = _ways(cells, stops)
-    price = (1.0 - weight) / max_steps
-    user_value = weight / n_users
 
-    def guide(step: int, number: Array, data_bits: Array, collected: Array, arrival: Array) -> Guess:
+    def ranking(_: int, n_flown: int, cell: Array, data_bits: Array, collected: Array) -> tuple[Array, Array]:
         open_ = ~collected[:, users]
         needs = np.where(open_, (wanted - data_bits[:, users]) * per_bit, 0.0)
         needs = np.rint(np.maximum.reduceat(needs, firsts, axis=1) * _ROUNDING) / _ROUNDING
         waits = np.add.reduceat(open_.astype(np.float64), firsts, axis=1)
-        more = waits @ member.T  # [N, 2^G]
-        finish = step + ways[number] + needs @ member.T
-        finish[:, 0] = np.where(cells.at_dock[number], arrival, finish[:, 0])
-        values = np.where(finish <= max_steps, user_value * more - price * finish, -np.inf)
-        values[:, 0] = np.maximum(values[:, 0], -price * max_steps)  # the way home fits, see `beam.search`
-        chosen = values.argmax(axis=1)
-        row = np.arange(len(number))
-        return Guess(more[row, chosen], finish[row, chosen])
+        finish = n_flown + ways[cell] + needs @ member.T  # by subset, `[B, 2^G]`
+        values = np.where(finish <= max_steps, user_value * (waits @ member.T) - price * finish, -np.inf)
+        uncollected = (~collected).sum(axis=1)
+        return user_value * (n_users - uncollected) + values.max(axis=1), uncollected
 
-    return guide
-
-
-def _home(cells: Cells) -> Guide:
-    """The guide where no user is left: home."""
-
-    def guide(step: int, number: Array, _: Array, collected: Array, arrival: Array) -> Guess:
-        home = np.where(cells.at_dock[number], arrival, step + cells.to_dock[number])
-        return Guess(np.zeros(len(number)), home)
-
-    return guide
+    return ranking
 
 
 def _groups(scenario: Scenario, users_m: Array, users: Array) -> Array:
@@ -166,7 +152,7 @@ def _ways(cells: Cells, stops: Array) -> tuple[Array, Array]:
     legs = np.stack([cells.steps_to(int(stop)) for stop in stops])  # [G, C]
     member = (np.arange(2**n)[:, None] >> np.arange(n)) & 1
     ways = np.empty((2**n, len(cells.cells)))
-    ways[0] = cells.to_dock
+    ways[0] = cells.steps_home
     for subset in range(1, 2**n):
         ways[subset] = np.min(
             [legs[i] + ways[subset ^ (1 << i), stops[i]] for i in range(n) if subset >> i & 1], axis=0

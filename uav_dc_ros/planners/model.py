@@ -10,15 +10,13 @@ import numpy as np
 
 from uav_dc_ros.core import mission, mobility, world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.grid import MOVES, Action
-from uav_dc_ros.core.obstacles.moves import UNREACHABLE
 from uav_dc_ros.core.propagation.counter_random import seed_of
 from uav_dc_ros.core.propagation.stochastic import Realization
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import State
+from uav_dc_ros.planners.cells import Cells
 
 _BLOCK = 1 << 18  # links at a time
-_FAR = np.iinfo(np.int32).max
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,40 +43,30 @@ def known_walks(scenario: Scenario, seed: int) -> tuple[State, Walks]:
     return start, Walks(users_m=np.stack(walks), drawn=drawn if scenario.radio.is_random else None)
 
 
-class MissionModel:
-    """The moves of a scenario, and the data that users deliver over the next steps, by cell."""
+class Model(Cells):
+    """The moves of a scenario, and what a search needs besides."""
 
-    def __init__(self, scenario: Scenario, walks: Walks) -> None:
-        self.scenario, self.walks = scenario, walks
-        self.n_steps = len(walks.users_m)  # H
-        self.cells = np.moveaxis(np.indices(scenario.grid.shape), 0, -1).reshape(-1, 3)  # `[C, 3]`
-        # The cell after each action, integers `[C, 7]`, and whether the action has an effect, or is hover.
-        after = world.move(
-            scenario,
-            np.repeat(self.cells, len(MOVES), axis=0),
-            np.tile(np.arange(len(MOVES)), len(self.cells)),
-        )
-        self.after = self.index(after).reshape(-1, len(MOVES))
-        self.has_effect = self.after != np.arange(len(self.cells))[:, None]
-        self.has_effect[:, Action.HOVER] = True
-        self.docked = mission.at_dock(self.cells, scenario.dock_cell)  # bool `[C]`
-        if scenario.moves is None:
-            home = np.abs(self.cells[:, :2] - np.asarray(scenario.dock_cell)).sum(axis=-1)
-        else:
-            home = scenario.moves.steps_to(scenario.dock_cell).reshape(-1)
-        self.steps_home = np.where(home == UNREACHABLE, _FAR, home)  # integers `[C]`
-        self._uav_m = scenario.grid.centre_m(self.cells, like=walks.users_m)
-
-    def index(self, cells: Array) -> Array:
-        """Index of cells `[..., 3]` in `cells`, integers `[...]`."""
-        _, n_y, n_z = self.scenario.grid.shape
-        return (cells[..., 0] * n_y + cells[..., 1]) * n_z + cells[..., 2]
+    n_steps: int  # H, the steps to look ahead
 
     def delivered(self, step: int, cell: Array, collected: Array) -> Array:
         """Bits that users deliver in the step with index `step` (0 to H - 1), `[B, U]`.
 
         Of missions with the UAV at `cell` (indices `[B]`) and users collected before, bool `[B, U]`.
         """
+        raise NotImplementedError
+
+
+class MissionModel(Model):
+    """The moves of a scenario, and the data that users deliver over the next steps, by cell."""
+
+    def __init__(self, scenario: Scenario, walks: Walks) -> None:
+        super().__init__(scenario)
+        self.walks = walks
+        self.n_steps = len(walks.users_m)  # H
+        self._uav_m = scenario.grid.centre_m(self.cells, like=walks.users_m)
+
+    def delivered(self, step: int, cell: Array, collected: Array) -> Array:
+        """See `Model.delivered`."""
         drawn = None if self.walks.drawn is None else self.walks.drawn[step]
         users_m = self.walks.users_m[step]
         if self.scenario.radio.interference == "associated":
