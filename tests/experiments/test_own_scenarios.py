@@ -42,7 +42,7 @@ def check_random_field(seed: int) -> None:
     scenario = field.at_random(seed)
     assert parse(document.text(scenario), "") == scenario
     assert flyable.examine(scenario).problems == ()
-    missions = roll_out(scenario, PLANNERS["tour"](scenario), range(100, 105))
+    missions = roll_out(scenario, PLANNERS["fixed_tour"](scenario), range(100, 105))
     assert missions.landed.all(), seed
     assert missions.users_collected.mean() > 0.8 * scenario.n_users, seed
     centres_m, radius_m = scenario.cluster_centres_m, scenario.users.clusters[0].radius_m
@@ -342,7 +342,7 @@ def test_a_field_around_the_users_of_a_file(
     assert centres_m.min() < 2.0 or not degrees, "the grid begins where the users do"
     assert flyable.examine(scenario).problems == ()
     assert run(capsys, "check", path)[0] == 0
-    missions = roll_out(scenario, PLANNERS["tour"](scenario), range(2))
+    missions = roll_out(scenario, PLANNERS["fixed_tour"](scenario), range(2))
     assert missions.landed.all()
     assert missions.users_collected.mean() >= 27.0
 
@@ -363,7 +363,7 @@ def test_a_field_among_obstacles_is_checked_and_drawn(
     assert scenario.mission.start_m[:2] != (0.0, 0.0), "the tower stands there"
     found = flyable.examine(scenario)
     assert found.problems == ()
-    missions = roll_out(scenario, PLANNERS["tour"](scenario), range(2))
+    missions = roll_out(scenario, PLANNERS["fixed_tour"](scenario), range(2))
     assert missions.landed.all()
     ground_m = np.asarray([[0.0, 0.0], [400.0, 300.0]])
     near_m = flyable.nearest_cells_m(scenario, ground_m)
@@ -473,7 +473,7 @@ def test_what_a_tour_collects_is_what_evaluate_reports() -> None:
         changed("five_clusters_hover", energy={"battery_j": 1e5, "ends": "both"}),
     ):
         found = flyable.examine(scenario, range(5)).tour
-        missions = roll_out(scenario, PLANNERS["tour"](scenario), range(5))
+        missions = roll_out(scenario, PLANNERS["fixed_tour"](scenario), range(5))
         assert (found.missions, found.landed) == (5, missions.landed.sum())
         assert found.collected == pytest.approx(missions.users_collected.mean())
         assert found.docked_step == pytest.approx(np.nanmean(missions.arrival_step))

@@ -69,6 +69,19 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--summary", "."), "--summary . cannot be written: Is a directory; expected a file in an existing"),
         (("--summary", "/dev/fd/99"), "--summary /dev/fd/99 cannot be written: Bad file descriptor"),
         (("--sead", "1"), "unrecognized arguments: --sead"),
+        (
+            ("--objective", "1.1"),
+            "argument --objective: '1.1'; expected a weight between 0 (time only)",
+        ),
+        (
+            ("--objective", "0.5"),
+            "the moves of 'five_clusters_dueling' do not depend on it; expected it",
+        ),
+        (("--scenario", "random:"), "scenario 'random:': no such name or file; expected one of "),
+        (
+            ("--policy", "search", "--set", "policy.objective_weight=0.5"),
+            "--set policy.objective_weight=0.5: expected --objective, which sets it for all nodes",
+        ),
     ],
 )
 def test_an_option_that_cannot_be_flown(ros: Ros, arguments: tuple[str, ...], message: str) -> None:

@@ -1,0 +1,62 @@
+"""Missions that planners fly: nodes and bag agree with the rollout to the last bit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import Ros, read_bag
+from tests.recordings.report_bags import unpacked
+from uav_dc_ros import bag as command
+from uav_dc_ros import scenarios
+from uav_dc_ros.core.grid import ACTION_LABELS
+from uav_dc_ros.core.world import rollout_steps
+from uav_dc_ros.planners import PLANNERS
+
+SEED, WEIGHT = 5, 0.8
+
+
+def test_search_flies_in_nodes_as_in_a_rollout(
+    ros: Ros, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, output = ros.run_all(
+        *("--scenario", "random:2", "--policy", "search", "--objective", WEIGHT, "--pace", "lockstep"),
+        *("--seed", SEED, "--nodes", "world,channel_monitor,policy,recorder", "--bag", "bag"),
+        *("--summary", "summary.json"),
+    )
+    assert status == 0, output
+    scenario, actions = scenarios.load("random:2"), []
+    planner = PLANNERS["search"](scenario, WEIGHT)
+
+    def act(state):
+        actions.append(int(planner(state)[0]))
+        return np.asarray(actions[-1:])
+
+    *_, (last, _) = rollout_steps(scenario, act, [SEED])
+    bag = read_bag(ros.folder / "bag", "/move", "/rates")
+    moves = {payload["step"]: payload["action"] for name, payload in bag if name == "/move"}
+    assert moves == {step: ACTION_LABELS[action] for step, action in enumerate(actions)}
+    rates = [payload for name, payload in bag if name == "/rates"][-1]
+    np.testing.assert_array_equal(rates["data_bits"], last.data_bits[0])
+    summary = json.loads((ros.folder / "summary.json").read_text())
+    assert (summary["policy"], summary["outcome"]) == ("search", "landed")
+
+    def run(*arguments: object) -> str:
+        with pytest.raises(SystemExit) as end:
+            command.main([str(one) for one in arguments])
+        out = capsys.readouterr().out
+        assert end.value.code == 0, out
+        return out
+
+    out = run("verify", ros.folder / "bag", "--complete")
+    assert "in scenario 'random_2', planner 'search' (w = 0.8)" in out
+    n_steps = scenario.mission.max_steps
+    assert f"decisions: {n_steps} of {n_steps} steps recomputed, equal to the last bit" in out
+    out = run("verify", ros.folder / "bag", "--policy", "tour")
+    assert "'tour' decides differently in " in out
+    out = run("info", ros.folder / "bag")
+    assert "search" in out
+    run("report", ros.folder / "bag", "--out", tmp_path / "report.html")
+    shown = unpacked(tmp_path / "report.html")["data"]
+    assert (shown["policy"], shown["about"]["objective_weight"]) == ("search", "0.8")
