@@ -1,5 +1,6 @@
 """The cells of a scenario and the moves between them, numbered, and what each cell delivers in a step."""
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -11,14 +12,22 @@ from uav_dc_ros.core.obstacles import UNREACHABLE
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import ParameterError
 
-SIZE_MAX = 20_000_000  # cells times users of a `Delivery`: tables of 160 MB
+SIZE_MAX = 20_000_000  # cells times users: a table of 160 MB
 FAR = np.iinfo(np.int32).max  # moves to what cannot be reached
 
 
 class Cells:
-    """The C cells of a grid, also those that the UAV cannot reach."""
+    """The C cells of a grid, also those that the UAV cannot reach.
+
+    Raises:
+        ParameterError: more cells times users than `SIZE_MAX`.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
+        if (size := math.prod(scenario.grid.shape) * scenario.n_users) > SIZE_MAX:
+            raise ParameterError(
+                f"scenario {scenario.name!r}: {size} cells times users; the planner expects up to {SIZE_MAX}"
+            )
         self.scenario = scenario
         self.cells = np.moveaxis(np.indices(scenario.grid.shape), 0, -1).reshape(-1, 3)  # `[C, 3]`
         after = world.move(
@@ -55,17 +64,10 @@ class Delivery:
 
     `users_m` is `[U, 2]`, metres. Where interference is `associated`, a user's data depend on who is served.
     From a cell that the UAV cannot reach no data are delivered.
-
-    Raises:
-        ParameterError: more cells times users than `SIZE_MAX`.
     """
 
     def __init__(self, cells: Cells, users_m: Array) -> None:
         self._scenario = scenario = cells.scenario
-        if (size := len(cells.cells) * scenario.n_users) > SIZE_MAX:
-            raise ParameterError(
-                f"scenario {scenario.name!r}: {size} cells times users; the planner expects up to {SIZE_MAX}"
-            )
         uav_m = scenario.grid.centre_m(cells.cells, like=users_m)
         waiting = np.zeros((1, scenario.n_users), dtype=bool)
         everywhere_m = np.broadcast_to(users_m, (len(uav_m), *users_m.shape))
