@@ -10,13 +10,13 @@ import torch
 from tests.agents.test_policy_folder import edit_config, refused
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy, set_network
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.set_network import SetArchitecture
 from uav_dc_ros.agents.set_policy import PqnSettings, SetPolicyConfig
 from uav_dc_ros.core import world
 from uav_dc_ros.core.entities.encoding import CLUSTER, GLOBAL, allowed
 from uav_dc_ros.core.world import initial
 from uav_dc_ros.errors import PolicyError
-from uav_dc_ros.experiments.evaluate.evaluation import greedy_act
 from uav_dc_ros.experiments.train.generalist.pqn import _active
 
 SIZES = SetArchitecture(width=16, hidden=(24, 24), n_actions=7)

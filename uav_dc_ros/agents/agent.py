@@ -45,7 +45,9 @@ class Agent:
     @property
     def weighs(self) -> bool:
         """Whether its moves depend on the weight of the objective."""
-        return isinstance(self.source, Planner) and self.source.weighs
+        if isinstance(self.source, Policy):
+            return self.source.config.observation == "entities"
+        return self.source.weighs
 
     @property
     def argument(self) -> str:
@@ -60,7 +62,7 @@ class Agent:
             ParameterError: a scenario that is too large for a planner.
         """
         if isinstance(self.source, Policy):
-            return greedy_act(self.source, scenario)
+            return greedy_act(self.source, scenario, weight)
         return self.source(scenario, weight)
 
 
@@ -82,8 +84,11 @@ def load(name_or_path: str | Path) -> Agent:
     return Agent(name, PLANNERS[name])
 
 
-def greedy_act(policy: Policy, scenario: Scenario) -> Act:
-    """The policy's greedy actions in a scenario; raises PolicyError when it does not fit."""
+def greedy_act(policy: Policy, scenario: Scenario, weight: float = DEFAULT_WEIGHT) -> Act:
+    """The policy's greedy actions in a scenario; raises PolicyError when it does not fit.
+
+    A policy that observes `entities` also gets the weight w of the objective.
+    """
     policy.check(scenario)
 
     def act(state: State) -> Array:
@@ -94,6 +99,7 @@ def greedy_act(policy: Policy, scenario: Scenario) -> Act:
             data_bits=state.data_bits,
             collected=state.collected,
             energy_used_j=state.energy_used_j,
+            weight=weight,
         )
         return policy.act(observation, action_mask(scenario, state.cell))
 

@@ -92,10 +92,10 @@ def weight(config: RunConfig, agent: Agent) -> float:
     if config.objective is None:
         return DEFAULT_WEIGHT
     if not agent.weighs:
-        expected = ", ".join(planner.name for planner in PLANNERS.values() if planner.weighs)
+        weighed = ", ".join(planner.name for planner in PLANNERS.values() if planner.weighs)
         raise ParameterError(
             f"--objective {config.objective:g}: the moves of {agent.name!r} do not depend on it; expected it "
-            f"with the planners {expected}"
+            f"with {weighed}, or a policy that observes 'entities'"
         )
     return float(config.objective)
 

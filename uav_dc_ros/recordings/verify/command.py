@@ -257,9 +257,9 @@ def _check_topics(reader: BagReader, namespace: str) -> None:
 
 
 def _title(agent: Agent, weight: float) -> str:
-    if agent.sha256 is not None:
-        return f"policy {agent.name!r} (sha256 {agent.sha256[:12]})"
-    return f"planner {agent.name!r}" + (f" (w = {weight:.6g})" if agent.weighs else "")
+    sha256, weighed = agent.sha256, f"w = {weight:.6g}" if agent.weighs else ""
+    details = ", ".join(filter(None, (sha256 and f"sha256 {sha256[:12]}", weighed)))
+    return f"{'policy' if sha256 else 'planner'} {agent.name!r}" + (f" ({details})" if details else "")
 
 
 def _weight(reader: BagReader) -> float:

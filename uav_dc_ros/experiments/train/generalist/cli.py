@@ -12,11 +12,12 @@ import msgspec
 
 from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import policy
+from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Policy
 from uav_dc_ros.agents.set_policy import PqnSettings, SetPolicyConfig
 from uav_dc_ros.core.keys import leaves
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, greedy_act, save_mission_picture
+from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture
 from uav_dc_ros.experiments.train.generalist.card import card, checkpoint_card
 from uav_dc_ros.experiments.train.start import make_folder, torch_device
 
