@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from tests.conftest import Ros, read_bag
+from tests.nodes.test_bridge import NODES, beside
 from tests.recordings.report_bags import unpacked
+from tests.support.fake_autopilot.flight import fake
 from uav_dc_ros import bag as command
 from uav_dc_ros import scenarios
 from uav_dc_ros.core.grid import ACTION_LABELS
@@ -60,3 +62,23 @@ def test_search_flies_in_nodes_as_in_a_rollout(
     run("report", ros.folder / "bag", "--out", tmp_path / "report.html")
     shown = unpacked(tmp_path / "report.html")["data"]
     assert (shown["policy"], shown["about"]["objective_weight"]) == ("search", "0.8")
+
+
+@pytest.mark.long
+def test_search_lands_beside_an_autopilot(ros: Ros, capsys: pytest.CaptureFixture[str]) -> None:
+    """It gets the users' positions from the world beside the bridge."""
+    scenario = scenarios.load("three_clusters_hover")
+    with fake("ardupilot", "tcp", speed=200.0) as autopilot:
+        given = ("--scenario", scenario.name, "--policy", "search", "--seed", 3, "--compose", "--arm")
+        status, output = ros.run_all(
+            *beside(autopilot, *given, "--bag", "bag", "--summary", "summary.json", *NODES)
+        )
+    assert status == 0, output
+    summary = json.loads((ros.folder / "summary.json").read_text())
+    assert (summary["outcome"], summary["steps"]) == ("landed", scenario.mission.max_steps)
+    assert summary["users_collected"] >= 29
+    with pytest.raises(SystemExit) as end:
+        command.main(["verify", str(ros.folder / "bag")])
+    out = capsys.readouterr().out
+    assert end.value.code == 0, out
+    assert "planner 'search' (w = 0.909091)" in out
