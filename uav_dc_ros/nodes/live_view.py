@@ -1,8 +1,8 @@
 """The live view: serves the mission's messages to Foxglove over WebSocket, serialised.
 
-A client reads CDR with the definitions that the server sends, so it needs no ROS. Topics have their full
-names. Times are those of receipt, on the wall clock: mission time may run a hundred times faster and restarts
-with every run, which a client's time line does not support; it is in the stamps, and on `clock`.
+A client reads CDR and JSON with the definitions that the server sends, so it needs no ROS. Topics have their
+full names. Times are those of receipt, on the wall clock: mission time may run a hundred times faster and
+restarts with every run, which a client's time line does not support; it is in the stamps, and on `clock`.
 """
 
 from typing import Any

@@ -52,6 +52,8 @@ class FoxgloveClient:
                 self.channels |= {channel["topic"]: channel for channel in data["channels"]}
         self._store = get_typestore(Stores.EMPTY)  # with the types that the server sends only
         for channel in self.channels.values():
+            if channel["encoding"] == "json":
+                continue
             types = get_types_from_msg(channel["schema"], channel["schemaName"])
             self._store.register(
                 {name: kind for name, kind in types.items() if name not in self._store.types}
@@ -74,7 +76,11 @@ class FoxgloveClient:
             if isinstance(data, bytes) and data[0] == MESSAGE_DATA:
                 _, number, time_ns = MESSAGE.unpack_from(data)
                 (channel,) = (row for row in self.channels.values() if row["id"] == number)
-                content = self._store.deserialize_cdr(data[MESSAGE.size :], channel["schemaName"])
+                body = data[MESSAGE.size :]
+                if channel["encoding"] == "json":
+                    content = json.loads(body)
+                else:
+                    content = self._store.deserialize_cdr(body, channel["schemaName"])
                 return Received(channel["topic"], time_ns, content)
         return None
 

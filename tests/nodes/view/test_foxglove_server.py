@@ -10,7 +10,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from tests.nodes.view.foxglove_client import FoxgloveClient, is_free
-from uav_dc_ros import cdr
+from uav_dc_ros import cdr, messages
 from uav_dc_ros.errors import NodeError, ParameterError
 from uav_dc_ros.nodes.view.foxglove_server import FoxgloveServer, check
 from uav_dc_ros.topics import TOPICS
@@ -39,35 +39,35 @@ def test_a_client_gets_every_topic_with_its_type(server: FoxgloveServer) -> None
         assert viewer.server["capabilities"] == []  # viewers cannot publish
         assert set(viewer.channels) == set(ROWS)
         for name, channel in viewer.channels.items():
-            assert channel["encoding"] == "cdr"
-            assert channel["schemaEncoding"] == "ros2msg"
-            assert channel["schemaName"] == ROWS[name].type
+            found = channel["encoding"], channel["schemaEncoding"], channel["schemaName"]
+            if (kind := messages.PAYLOADS.get(name[1:])) is not None:
+                assert found == ("json", "jsonschema", f"uav_dc_ros.{kind.__name__}")
+            else:
+                assert found == ("cdr", "ros2msg", ROWS[name].type)
 
 
 def test_bytes_and_time_arrive_as_they_were(server: FoxgloveServer) -> None:
     with client(server) as viewer:
         viewer.open("/mission")
-        server.send("/mission", cdr.encode_string(b"now"), 1_700_000_000_123_456_789)
+        server.send("/mission", cdr.encode_string(b'"now"'), 1_700_000_000_123_456_789)
         (message,) = viewer.read_until(lambda received: len(received) == 1, 60.0)
-    assert message.content.data == "now"
+    assert message.content == "now"
     assert message.time_ns == 1_700_000_000_123_456_789
 
 
 def test_who_comes_late_gets_the_last_message_of_latched_topics_only(server: FoxgloveServer) -> None:
-    for text in (b"old", b"newest"):
+    for text in (b'"old"', b'"newest"'):
         for topic in ("/users", "/mission", "/move"):
             server.send(topic, cdr.encode_string(text), 7)
     with client(server) as first:
         first.open("/users", "/mission", "/move", "/rates")
-        received = [
-            (m.topic, m.content.data, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 60.0)
-        ]
+        received = [(m.topic, m.content, m.time_ns) for m in first.read_until(lambda h: len(h) == 2, 60.0)]
         assert sorted(received) == [("/mission", "newest", 7), ("/users", "newest", 7)]
         assert first.read(0.3) is None
         with client(server) as second:
             second.open("/users")
             (message,) = second.read_until(lambda h: len(h) == 1, 60.0)
-            assert message.content.data == "newest"
+            assert message.content == "newest"
 
 
 def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> None:
@@ -80,7 +80,7 @@ def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> 
             n += 1
             server.send("/mission", cdr.encode_string(b"%d" % n), n)
             time.sleep(0.0005)
-        server.send("/mission", cdr.encode_string(b"last"), n + 1)
+        server.send("/mission", cdr.encode_string(b'"last"'), n + 1)
 
     sender = threading.Thread(target=send, daemon=True)
     sender.start()
@@ -93,7 +93,7 @@ def test_clients_that_come_and_go_while_much_is_sent(server: FoxgloveServer) -> 
         stop.set()
         sender.join(60.0)
         assert not sender.is_alive()
-        received = watcher.read_until(lambda h: bool(h) and h[-1].content.data == "last", 60.0)
+        received = watcher.read_until(lambda h: bool(h) and h[-1].content == "last", 60.0)
     times = [message.time_ns for message in received]
     assert times == sorted(times)
 

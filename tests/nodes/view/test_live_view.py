@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 from websockets.exceptions import ConnectionClosed
 
@@ -42,7 +43,10 @@ def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy:
         with FoxgloveClient(port, len(SERVED)) as viewer:
             assert viewer.server["name"] == "uav_dc_ros"
             assert {name: row["schemaName"] for name, row in viewer.channels.items()} == {
-                f"/{name}": TOPICS[name].type for name in SERVED
+                f"/{name}": f"uav_dc_ros.{name.capitalize()}"
+                if name in messages.PAYLOADS
+                else TOPICS[name].type
+                for name in SERVED
             }
             viewer.open(*viewer.channels)
             expected = {f"/{name}" for name in PUBLISHED}
@@ -57,16 +61,22 @@ def test_a_client_sees_the_mission(ros: Ros, small_scenario: Path, small_policy:
     assert "Traceback" not in output
     assert is_free(port)
 
+    schemas = {
+        name: json.loads(row["schema"]) for name, row in viewer.channels.items() if row["encoding"] == "json"
+    }
+    assert set(schemas) == {f"/{name}" for name in messages.PAYLOADS if name in SERVED}
     first: dict[str, Any] = {}
     for message in received:
         assert abs(message.time_ns - time.time_ns()) < 120e9  # the wall clock's
+        if message.topic in schemas and message.topic[1:] not in first:
+            jsonschema.validate(message.content, schemas[message.topic])
         first.setdefault(message.topic[1:], message.content)
     for name, kind in messages.PAYLOADS.items():
         if name in SERVED:
-            messages.decode(first[name].data, kind)
-    mission = json.loads(first["mission"].data)
+            messages.decode(json.dumps(first[name]), kind)
+    mission = first["mission"]
     assert mission["scenario"] == "small"
-    assert len(json.loads(first["users"].data)["x_m"]) == 4
+    assert len(first["users"]["x_m"]) == 4
     assert first["pose"].header.frame_id == first["path"].header.frame_id == "map"
     assert first["path"].poses
     assert {marker.ns for marker in first["markers"].markers} >= {"users", "clusters", "uav"}
@@ -97,7 +107,7 @@ def test_topics_are_called_as_in_the_graph_and_the_server_ends_with_the_mission(
         received = list(until_closed(viewer))
     status, output = finish(flight)
     assert status == 0, output
-    last = json.loads(received[-1].content.data)
+    last = received[-1].content
     assert (last["mission"], last["remaining_steps"]) == (2, 0)
     assert is_free(port)
 

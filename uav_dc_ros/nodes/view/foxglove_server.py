@@ -1,5 +1,6 @@
 """A Foxglove WebSocket server for serialized messages, without ROS.
 
+Payloads travel as JSON with their schemas, so that Foxglove plots their fields, such as `rates.sum_rate_bps`.
 Unlike the SDK's server, it keeps the last message of latched topics for later clients.
 """
 
@@ -9,6 +10,8 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
+from uav_dc_ros import cdr
+from uav_dc_ros.bags import json_channels
 from uav_dc_ros.bags.message_definitions import ENCODING, definition
 from uav_dc_ros.errors import NodeError, ParameterError
 from uav_dc_ros.topics import Topic
@@ -58,12 +61,17 @@ class FoxgloveServer:
             raise _port_error(address, port, str(error).removeprefix("FoxgloveError: ")) from None
         self._topics = topics
         self._channels: dict[str, foxglove.Channel] = {}
+        self._json: set[str] = set()  # full names of the topics that travel as JSON
         for full_name, row in topics.items():
-            schema = foxglove.Schema(name=row.type, encoding=ENCODING, data=definition(row.type))
-            channel = foxglove.Channel(
-                full_name, schema=schema, message_encoding="cdr", context=self._context
+            encoding, name, kind, data = "cdr", row.type, ENCODING, definition(row.type)
+            if (payload := json_channels.payload(full_name, row.type)) is not None:
+                self._json.add(full_name)
+                encoding, name = json_channels.SERIALIZATION, json_channels.name(payload)
+                kind, data = json_channels.ENCODING, json_channels.schema(payload)
+            schema = foxglove.Schema(name=name, encoding=kind, data=data)
+            self._channels[full_name] = foxglove.Channel(
+                full_name, schema=schema, message_encoding=encoding, context=self._context
             )
-            self._channels[full_name] = channel
         self._by_id = {channel.id(): channel for channel in self._channels.values()}
 
     @property
@@ -72,8 +80,13 @@ class FoxgloveServer:
         return self._server.port
 
     def send(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Send a CDR message to the subscribers of its topic (full name); `time_ns`: time of receipt."""
+        """Send a CDR message to the subscribers of its topic (full name); `time_ns`: time of receipt.
+
+        Raises MessageError for a payload that is no string.
+        """
         channel = self._channels[topic]
+        if topic in self._json:
+            data = cdr.decode_string(data)
         if not self._topics[topic].latched:
             if channel.has_sinks():
                 channel.log(data, log_time=time_ns)
