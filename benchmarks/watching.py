@@ -113,7 +113,8 @@ def main() -> None:
             found = {way: flown(folder, way, *lockstep) for way in order}
             steps.append({way: statistics.mean(found[way].step_ms) for way in WAYS})
             work.append({way: cpu_per_step_ms(found[way]) for way in WAYS})
-            print(", ".join(f"{way} {ms:.3f} ms" for way, ms in steps[-1].items()), flush=True)
+            for title, of in (("time", steps[-1]), ("CPU time", work[-1])):
+                print(f"{title}: " + ", ".join(f"{way} {ms:.3f} ms" for way, ms in of.items()), flush=True)
         real = ("--scenario", scenario, "--policy", "five_clusters_hover_dueling", "--pace", 1)
         for _ in range(min(rounds, 3)):
             found = {way: flown(folder, way, *real) for way in WAYS[:3]}

@@ -1,5 +1,6 @@
 """Messages of one namespace on their way to the page: few are decoded, however many come."""
 
+import re
 import time
 from collections.abc import Callable
 
@@ -17,6 +18,8 @@ PENDING_MAX = 2000  # steps that wait for their other messages ...
 PENDING_BYTES = 64 * 2**20  # ... and their bytes: a dead channel monitor leaves users without rates
 
 Step = tuple[str, int, int]  # run, mission and step
+# As this package's nodes begin a payload: the header of another one takes a decoder.
+BEGIN = re.compile(rb'\{"run":"([0-9a-f]{16})","mission":(\d{1,9}),"step":(\d{1,9})[,}]')
 
 
 class _Header(msgspec.Struct):
@@ -61,12 +64,7 @@ class Inbox:
     def add(self, topic: str, data: bytes) -> None:
         """Add a serialized message of `users`, `rates` or `mission`; raises MessageError for no such one."""
         text = cdr.decode_string(data)
-        try:
-            header = msgspec.json.decode(text, type=_Header)
-        except (msgspec.DecodeError, RecursionError, UnicodeError) as error:
-            raise MessageError("malformed", messages.one_line(str(error))) from None
-        now_s = self._clock_s()
-        step = header.run, header.mission, header.step
+        now_s, step = self._clock_s(), _step(text)
         self._keep(step, topic, text, now_s)
         if topic == "mission":
             if self._statuses and is_routine(self._statuses[-1][0]):
@@ -158,6 +156,17 @@ class Inbox:
                 status if isinstance(status, Mission) else None,
                 at_s,
             )
+
+
+def _step(text: bytes) -> Step:
+    """Run, mission and step of a payload, whose other fields may be invalid; MessageError: it has none."""
+    if (begin := BEGIN.match(text)) is not None:
+        return begin[1].decode(), int(begin[2]), int(begin[3])
+    try:
+        header = msgspec.json.decode(text, type=_Header)
+    except (msgspec.DecodeError, RecursionError, UnicodeError) as error:
+        raise MessageError("malformed", messages.one_line(str(error))) from None
+    return header.run, header.mission, header.step
 
 
 def _sampled(steps: list[Step], maximum: int) -> list[Step]:
