@@ -18,6 +18,7 @@ COMMANDS = (
     ("run_all", "--help"),
     ("train", "--help"),
     ("evaluate", "--help"),
+    ("optimum", "--help"),
     ("paper", "--help"),
     ("bag", "--help"),
     ("bag", "info", "--help"),

@@ -151,7 +151,7 @@ def test_words_are_the_field_s(path: Path) -> None:
 
 def helps() -> Iterator[tuple[str, list[str]]]:
     """Each command's module, and the arguments that show its help."""
-    for module in ("run_all", "train", "evaluate", "paper", "bag"):
+    for module in ("run_all", "train", "evaluate", "optimum", "paper", "bag"):
         yield module, ["--help"]
     for verb in bag.VERBS:
         yield "bag", [verb, "--help"]

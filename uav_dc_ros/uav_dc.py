@@ -13,6 +13,10 @@ VERBS = {
     "fly": ("uav_dc_ros.run_all", "fly recorded missions with a trained policy, on ROS 2"),
     "train": ("uav_dc_ros.experiments.train.cli", "train a policy for a scenario"),
     "evaluate": ("uav_dc_ros.experiments.evaluate.cli", "fly policies over many missions, and compare them"),
+    "optimum": (
+        "uav_dc_ros.experiments.optimum.cli",
+        "bound what is possible, and how far policies are from it",
+    ),
     "paper": ("uav_dc_ros.experiments.paper.cli", "reproduce every figure of the paper, and test its claims"),
     "bag": ("uav_dc_ros.bag", "record, play, recover, verify and explain bags"),
     "scenario": ("uav_dc_ros.scenario", "make, check and draw scenarios"),

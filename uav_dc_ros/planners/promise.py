@@ -37,10 +37,12 @@ class Promise:
             self._refresh(self._model.walks.users_m[middle])
         left, home = self._n_steps - n_flown, self._model.steps_home[cell]
         is_open = ~collected & (self._steps_past[cell] <= left)
-        steps = self._steps_to[cell] - self._hover_steps * (data_bits / self._r_min_bits)
+        steps_alone = self._steps_to[cell] - self._hover_steps * (data_bits / self._r_min_bits)
         # By group, `[B, G]`: users to collect, and steps until the last of them is.
         n_open = np.add.reduceat(is_open[:, self._order], self._starts, axis=-1)
-        steps = np.maximum.reduceat(np.where(is_open, steps, 0.0)[:, self._order], self._starts, axis=-1)
+        steps = np.maximum.reduceat(
+            np.where(is_open, steps_alone, 0.0)[:, self._order], self._starts, axis=-1
+        )
         promise = -self._per_step * home
         for wanted in (n_open > 0, 2 * n_open > self._sizes):  # the second leaves stragglers behind
             sets = (wanted << np.arange(len(self._sizes))).sum(axis=-1)
@@ -50,6 +52,10 @@ class Promise:
                 value = self._tours[sets, group, after + 1]
                 value = value - self._per_step * steps[:, group] - self._per_user * missing
                 promise = np.maximum(promise, np.where(wanted[:, group], value, -np.inf))
+        # One user alone, where there is no time for a group.
+        in_time = is_open & (steps_alone + self._home <= left)
+        value = self._per_user - self._per_step * np.where(in_time, steps_alone + self._home, 0.0)
+        promise = np.maximum(promise, np.where(in_time, value, -np.inf).max(axis=-1))
         return self._per_user * collected.sum(axis=-1) + promise, is_open.sum(axis=-1)
 
     def _refresh(self, users_m: Array) -> None:
@@ -65,9 +71,10 @@ class Promise:
         self._hover_steps[~np.isfinite(self._hover_steps)] = 0.0
         self._steps_to = model.spread(hover)  # to fly to a cell and collect the user there, `[C, U]`
         home = np.where(bits > 0.0, model.steps_home[:, None], np.inf)
-        # Moves into the reach of the user, and from there home, at least, `[C, U]`
-        self._steps_past = model.spread(np.where(bits > 0.0, 0.0, np.inf)) + home.min(axis=0)
-        group = _groups(self._scenario, users_m)
+        self._home = home.min(axis=0)  # moves home from the reach of each user, at least, `[U]`
+        # And before them the moves into its reach, `[C, U]`
+        self._steps_past = model.spread(np.where(bits > 0.0, 0.0, np.inf)) + self._home
+        group = groups_of_users(self._scenario, users_m, _GROUPS_MAX)
         self._order = np.argsort(group, kind="stable")
         self._sizes = np.bincount(group)
         self._starts = np.cumsum([0, *self._sizes[:-1]])
@@ -101,14 +108,17 @@ class Promise:
         return tours
 
 
-def _groups(scenario: Scenario, users_m: Array) -> Array:
-    """Group of each user, integers `[U]` from 0: its cluster; with many clusters, users that are close."""
-    if scenario.n_clusters <= _GROUPS_MAX:
+def groups_of_users(scenario: Scenario, users_m: Array, n_max: int) -> Array:
+    """Group of each user, integers `[U]` from 0: its cluster; with more than `n_max`, users that are close.
+
+    The users are at `users_m` `[U, 2]`, metres.
+    """
+    if scenario.n_clusters <= n_max:
         return scenario.user_cluster
     # Farthest first: the next group begins with the user farthest from all others' first users.
     nearest = np.full(len(users_m), np.inf)
     group, first = np.zeros(len(users_m), np.int64), 0
-    for i in range(_GROUPS_MAX):
+    for i in range(n_max):
         distance = ((users_m - users_m[first]) ** 2).sum(axis=-1)
         group = np.where(distance < nearest, i, group)
         nearest = np.minimum(nearest, distance)

@@ -113,14 +113,8 @@ def _check_once(option: str, values: Sequence[str]) -> None:
 
 def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[tuple[Agent, Scenario]]:
     """Agents and scenarios in the order of the results: every policy in each scenario, or in its own."""
-    for option, values in (("--policy", policy_names), ("--scenario", scenario_names)):
-        _check_once(option, values)
-    candidates = [agents.load(value) for value in policy_names]
-    names = [candidate.name for candidate in candidates]
-    candidates = [  # equal names are replaced by the arguments, which differ
-        replace(candidate, name=value) if names.count(candidate.name) > 1 else candidate
-        for candidate, value in zip(candidates, policy_names, strict=True)
-    ]
+    _check_once("--scenario", scenario_names)
+    flown = candidates(policy_names)
     if scenario_names:
         worlds = [scenarios.load(value) for value in scenario_names]
         names = [world.name for world in worlds]
@@ -129,9 +123,9 @@ def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[t
                 f"--scenario {' '.join(scenario_names)}: their names are {', '.join(names)}; "
                 "expected different ones"
             )
-        return [(candidate, world) for world in worlds for candidate in candidates]
+        return [(candidate, world) for world in worlds for candidate in flown]
     pairs = []
-    for candidate in candidates:
+    for candidate in flown:
         if candidate.home is None:
             raise UavDcError(
                 f"--policy {candidate.name}: a planner has no scenario of its own; expected --scenario"
@@ -171,6 +165,20 @@ def _report(evaluated: Sequence[EvaluatedMissions]) -> EvaluationReport:
             comparisons.append(compare(one, baseline))
     evaluations = [one.evaluation for one in evaluated]
     return EvaluationReport(evaluations=evaluations, comparisons=comparisons, shifts=effects or UNSET)
+
+
+def candidates(names: Sequence[str]) -> list[Agent]:
+    """The policies and planners of `--policy`; those of one name are named by their arguments.
+
+    Raises UavDcError for a name that occurs twice, and PolicyError for a policy that cannot be loaded.
+    """
+    _check_once("--policy", names)
+    found = [agents.load(value) for value in names]
+    loaded = [one.name for one in found]
+    return [
+        replace(one, name=value) if loaded.count(one.name) > 1 else one
+        for one, value in zip(found, names, strict=True)
+    ]
 
 
 def show(report: EvaluationReport) -> None:

@@ -1,0 +1,1 @@
+"""The best mission that is possible, and bounds on it."""
