@@ -16,7 +16,7 @@ from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.experiments.optimum import mip
 from uav_dc_ros.experiments.optimum.cli import OptimumReport, main, report_of
 from uav_dc_ros.experiments.optimum.front import draw_front, greatest_users
-from uav_dc_ros.experiments.optimum.problem import Problem
+from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
 from uav_dc_ros.experiments.optimum.solve import fly, solve
 from uav_dc_ros.planners import PLANNERS
 
@@ -98,7 +98,7 @@ SMALL += [pytest.param(*of_seed(seed), marks=pytest.mark.long) for seed in LONG]
 @pytest.mark.parametrize(("seed", "weight", "end"), SMALL)
 def test_it_equals_exhaustive_search(seed, weight, end):
     scenario = small(seed, mission={"episode_end": end})
-    found = solve(Problem(scenario, seed), weight)
+    found = solve(ClairvoyantProblem(scenario, seed), weight)
     assert found.is_optimal
     assert found.objective == pytest.approx(exhaustive(scenario, seed, weight), abs=1e-12)
 
@@ -109,7 +109,7 @@ def test_it_equals_exhaustive_search(seed, weight, end):
 )
 def test_the_mixed_integer_program_has_the_same_optimum(seed, weight, end):
     pytest.importorskip("highspy")
-    problem = Problem(small(seed, mission={"episode_end": end}), seed)
+    problem = ClairvoyantProblem(small(seed, mission={"episode_end": end}), seed)
     program = mip.solve_program(problem, weight)
     flown = fly(problem.scenario, program.actions, seed).objective(problem.scenario, weight)[0]
     assert program.bound == pytest.approx(flown, abs=1e-6)
@@ -119,7 +119,7 @@ def test_the_mixed_integer_program_has_the_same_optimum(seed, weight, end):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_narrow_diagram_bounds_the_optimum(seed):
     """Whatever is merged, what is excluded is impossible: the bound is never below the optimum."""
-    problem = Problem(small(seed), seed)
+    problem = ClairvoyantProblem(small(seed), seed)
     optimum = solve(problem, 0.6).objective
     for width in (1, 3, 10):
         found = solve(problem, 0.6, widths=(width,))
@@ -134,14 +134,14 @@ def test_a_narrow_diagram_bounds_the_optimum(seed):
 )
 def test_no_policy_is_better_than_the_bound(name, policy):
     scenario = scenarios.load(name)
-    found = solve(Problem(scenario, 1), DEFAULT_WEIGHT, widths=(250,))
+    found = solve(ClairvoyantProblem(scenario, 1), DEFAULT_WEIGHT, widths=(250,))
     made = greedy_act(policies.load(policy), scenario)
     for act in (made, PLANNERS["tour"](scenario)):
         assert roll_out(scenario, act, [1]).objective(scenario)[0] <= found.objective <= found.bound
 
 
 def test_the_mission_of_five_clusters_is_proved_to_be_the_best():
-    found = solve(Problem(scenarios.load("five_clusters"), 0), DEFAULT_WEIGHT)
+    found = solve(ClairvoyantProblem(scenarios.load("five_clusters"), 0), DEFAULT_WEIGHT)
     assert found.is_optimal
     assert (found.users_collected, found.arrival_step) == (50, 29)
 
@@ -149,15 +149,15 @@ def test_the_mission_of_five_clusters_is_proved_to_be_the_best():
 def test_a_random_channel_is_known_to_the_clairvoyant():
     shadowing = {"shadowing": {"sigma_db": 6.0, "correlation_m": 60.0}, "fading": {"model": "rayleigh"}}
     scenario = small(3, radio=shadowing)
-    problem = Problem(scenario, 3)
+    problem = ClairvoyantProblem(scenario, 3)
     assert solve(problem, DEFAULT_WEIGHT).is_optimal
-    assert not np.array_equal(problem.share, Problem(small(3), 3).share)
+    assert not np.array_equal(problem.share, ClairvoyantProblem(small(3), 3).share)
 
 
 def test_obstacles_are_flown_around():
     wall = {"polygon_m": [[150.0, -60.0], [250.0, -60.0], [250.0, 360.0], [150.0, 360.0]], "kind": "no_fly"}
     open_field, walled = small(3), small(3, obstacles=[{"name": "wall", **wall}])
-    both = [solve(Problem(one, 3), 0.0) for one in (open_field, walled)]
+    both = [solve(ClairvoyantProblem(one, 3), 0.0) for one in (open_field, walled)]
     assert all(one.is_optimal for one in both)
     assert both[0].arrival_step < both[1].arrival_step
 
@@ -175,7 +175,7 @@ def test_obstacles_are_flown_around():
 )
 def test_a_world_that_has_no_table_is_refused(tables, error):
     with pytest.raises(ScenarioError, match=error):
-        Problem(changed("three_clusters_hover", **tables), 0)
+        ClairvoyantProblem(changed("three_clusters_hover", **tables), 0)
 
 
 def command(*arguments):
@@ -209,7 +209,7 @@ def test_the_command_reports_missions_and_policies(tmp_path, capsys):
 
 def test_the_front_bounds_users_at_every_arrival(tmp_path):
     scenario = small(5)
-    problem = Problem(scenario, 5)
+    problem = ClairvoyantProblem(scenario, 5)
     reports = [report_of(scenario, w, [solve(problem, w)], []) for w in (0.0, 0.3, 0.6, 0.9, 1.0)]
     for one in reports:
         (best,) = one.missions

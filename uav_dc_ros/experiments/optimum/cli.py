@@ -18,7 +18,7 @@ from uav_dc_ros.errors import FROM_TRAIN, UavDcError
 from uav_dc_ros.experiments.evaluate.cli import Candidate, candidates
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.experiments.optimum.mip import solve_program
-from uav_dc_ros.experiments.optimum.problem import Problem
+from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
 from uav_dc_ros.experiments.optimum.solve import DIAGRAM_WIDTHS, Solution, as_flown, solve
 
 PROG = "python -m uav_dc_ros.optimum"
@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> None:
         def best(weight: float) -> list[Solution]:
             found = []
             for seed in range(options.seeds):
-                problem = Problem(scenario, seed)
+                problem = ClairvoyantProblem(scenario, seed)
                 if options.method == "mip":
                     program = solve_program(problem, weight, options.time_limit)
                     found.append(as_flown(problem, program.actions, weight, program.bound))

@@ -24,7 +24,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.experiments.optimum.problem import Problem
+from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
 
 # `excluded`: there is no such mission. `found`: there may be one, see `Verdict.actions`. `stopped`: no time.
 Outcome: TypeAlias = Literal["excluded", "found", "stopped"]
@@ -61,7 +61,7 @@ class _Layer:
 class Prover:
     """Decides for one mission's walks whether n users can be collected with an arrival by a step."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: ClairvoyantProblem) -> None:
         self._problem = problem
         in_group = np.arange(problem.n_groups)[:, None] == problem.group
         self._in_group = in_group.astype(np.float64)  # `[G, U]`

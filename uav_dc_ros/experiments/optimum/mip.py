@@ -14,7 +14,7 @@ import numpy as np
 
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import UavDcError
-from uav_dc_ros.experiments.optimum.problem import Problem
+from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Program:
     bound: float  # of J
 
 
-def solve_program(problem: Problem, weight: float, time_limit_s: float = np.inf) -> Program:
+def solve_program(problem: ClairvoyantProblem, weight: float, time_limit_s: float = np.inf) -> Program:
     """Solve the program of a problem for J with the weight w.
 
     Raises:
@@ -81,7 +81,7 @@ def solve_program(problem: Problem, weight: float, time_limit_s: float = np.inf)
 class _Moves:
     """Every move of a mission that can still land: `[n]` each."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: ClairvoyantProblem) -> None:
         model, n_steps = problem.model, problem.n_steps
         n_cells = len(model.cells)
         # Phases before and after (1 begins with the arrival), step, cell before, action, cell after

@@ -20,7 +20,7 @@ _NODES_MAX = 6_000_000  # steps times cells times sets of groups
 _GROUPS_MAX = 5
 
 
-class Problem:
+class ClairvoyantProblem:
     """The mission of a seed. T steps, C cells, U users, G groups of users."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:

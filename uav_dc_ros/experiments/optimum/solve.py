@@ -12,7 +12,7 @@ from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import State
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out
 from uav_dc_ros.experiments.optimum.diagram import Prover
-from uav_dc_ros.experiments.optimum.problem import Problem
+from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
 from uav_dc_ros.planners.beam import search
 
 BEAM_WIDTH = 512
@@ -49,7 +49,7 @@ def fly(scenario: Scenario, actions: Array, seed: int) -> Missions:
 
 
 def solve(
-    problem: Problem,
+    problem: ClairvoyantProblem,
     weight: float,
     time_limit_s: float = np.inf,
     widths: tuple[int, ...] = DIAGRAM_WIDTHS,
@@ -62,7 +62,7 @@ def solve(
     return _Solver(problem, weight, time.monotonic() + time_limit_s).run(widths)
 
 
-def as_flown(problem: Problem, actions: Array, weight: float, bound: float) -> Solution:
+def as_flown(problem: ClairvoyantProblem, actions: Array, weight: float, bound: float) -> Solution:
     """The solution of a problem with these actions, flown in the world as it is."""
     missions = fly(problem.scenario, actions, problem.seed)
     return Solution(
@@ -77,7 +77,7 @@ def as_flown(problem: Problem, actions: Array, weight: float, bound: float) -> S
 
 
 class _Solver:
-    def __init__(self, problem: Problem, weight: float, until_s: float) -> None:
+    def __init__(self, problem: ClairvoyantProblem, weight: float, until_s: float) -> None:
         self._problem, self._weight, self._until_s = problem, weight, until_s
         self._prover = Prover(problem)
         plan = search(problem.model, problem.start, width=BEAM_WIDTH, weight=weight)
