@@ -11,6 +11,7 @@ from uav_dc_ros.errors import UavDcError
 from uav_dc_ros.experiments.optimum.cli import OptimumReport
 
 _SIZE_IN = (7.0, 4.5)
+_ROUNDING = 1e-9
 
 
 def greatest_users(reports: Sequence[OptimumReport], arrival_step: Array) -> Array:
@@ -21,9 +22,11 @@ def greatest_users(reports: Sequence[OptimumReport], arrival_step: Array) -> Arr
     most = np.full(np.shape(arrival_step), float(reports[0].users_total))
     for report in reports:
         w = report.objective_weight
+        left = report.bound - (1.0 - w) * (1.0 - arrival_step / report.max_steps)
         if w > 0.0:
-            time = (1.0 - w) * (1.0 - arrival_step / report.max_steps)
-            most = np.minimum(most, report.users_total * (report.bound - time) / w)
+            most = np.minimum(most, report.users_total * np.maximum(left, 0.0) / w)
+        else:
+            most = np.where(left >= -_ROUNDING, most, 0.0)
     return most
 
 
