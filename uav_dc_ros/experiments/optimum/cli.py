@@ -113,7 +113,7 @@ def main(argv: list[str] | None = None) -> None:
                 problem = ClairvoyantProblem(scenario, seed)
                 if options.method == "mip":
                     program = solve_program(problem, weight, options.time_limit)
-                    found.append(as_flown(problem, program.actions, weight, program.bound))
+                    found.append(as_flown(problem, program.actions, weight, program.bound, program.stopped))
                 else:
                     found.append(solve(problem, weight, options.time_limit, widths))
             return found

@@ -23,6 +23,7 @@ class Program:
 
     actions: Array  # of the best mission, integers; none where it found none in time
     bound: float  # of J
+    stopped: bool  # the time limit ended the search
 
 
 def solve_program(problem: ClairvoyantProblem, weight: float, time_limit_s: float = np.inf) -> Program:
@@ -71,11 +72,12 @@ def solve_program(problem: ClairvoyantProblem, weight: float, time_limit_s: floa
     solver.run()
     info = solver.getInfo()
     bound = min(float(info.mip_dual_bound), 1.0)
+    stopped = solver.getModelStatus() == highspy.HighsModelStatus.kTimeLimit
     if info.primal_solution_status != highspy.SolutionStatus.kSolutionStatusFeasible:
-        return Program(np.zeros(0, np.int64), bound)
+        return Program(np.zeros(0, np.int64), bound, stopped)
     flown = np.flatnonzero(np.asarray(solver.getSolution().col_value[:n_moves]) > 0.5)
     flown = flown[np.argsort(moves.step[flown], kind="stable")]
-    return Program(moves.action[flown], bound)
+    return Program(moves.action[flown], bound, stopped)
 
 
 class _Moves:

@@ -15,7 +15,7 @@ from uav_dc_ros.experiments.optimum.diagram import Prover
 from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
 from uav_dc_ros.planners.beam import search
 
-BEAM_WIDTH = 512
+BEAM_WIDTHS = (64, 512)  # a wider beam does not find a better mission every time
 DIAGRAM_WIDTHS = (250, 2000, 16_000)  # tried one after the other
 _EQUAL = 1e-12  # of two values of J
 
@@ -56,23 +56,26 @@ def solve(
 ) -> Solution:
     """The best mission of a problem by J with the weight w.
 
-    A beam search finds a mission. Then decision diagrams of growing `widths` exclude what would be better:
+    Beam searches find a mission. Then decision diagrams of growing `widths` exclude what would be better:
     for each number of users the arrivals up to some step. What is not excluded gives the bound.
     """
     return _Solver(problem, weight, time.monotonic() + time_limit_s).run(widths)
 
 
-def as_flown(problem: ClairvoyantProblem, actions: Array, weight: float, bound: float) -> Solution:
+def as_flown(
+    problem: ClairvoyantProblem, actions: Array, weight: float, bound: float = 1.0, stopped: bool = False
+) -> Solution:
     """The solution of a problem with these actions, flown in the world as it is."""
     missions = fly(problem.scenario, actions, problem.seed)
+    value = float(missions.objective(problem.scenario, weight)[0])
     return Solution(
         actions=np.concatenate([actions, np.full(problem.n_steps - len(actions), Action.HOVER)]),
-        objective=float(missions.objective(problem.scenario, weight)[0]),
+        objective=value,
         users_collected=int(missions.users_collected[0]),
         arrival_step=int(missions.arrival_step[0]) if missions.landed[0] else 0,
         data_bits=float(missions.data_bits[0]),
-        bound=bound,
-        stopped=False,
+        bound=max(bound, value),
+        stopped=stopped,
     )
 
 
@@ -80,8 +83,8 @@ class _Solver:
     def __init__(self, problem: ClairvoyantProblem, weight: float, until_s: float) -> None:
         self._problem, self._weight, self._until_s = problem, weight, until_s
         self._prover = Prover(problem)
-        plan = search(problem.model, problem.start, width=BEAM_WIDTH, weight=weight)
-        self._best = self._flown(plan.actions)
+        plans = [search(problem.model, problem.start, width=width, weight=weight) for width in BEAM_WIDTHS]
+        self._best = self._flown(max(plans, key=lambda plan: plan.objective).actions)
         # For each number of users 0 to U: the last arrival that is excluded for as many, and more.
         soonest = int(problem.model.steps_home[problem.start_cell])
         self._excluded = np.full(problem.n_users + 1, max(soonest, 1) - 1)
@@ -131,7 +134,7 @@ class _Solver:
         return progress and not self._stopped
 
     def _flown(self, actions: Array) -> Solution:
-        return as_flown(self._problem, actions, self._weight, 1.0)
+        return as_flown(self._problem, actions, self._weight)
 
     def _objective(self, n_users: Array, arrival_step: Array, landed: Array) -> Array:
         n_users_total, max_steps = self._problem.n_users, self._problem.n_steps
