@@ -53,8 +53,9 @@ class Promise:
                 value = value - self._per_step * steps[:, group] - self._per_user * missing
                 promise = np.maximum(promise, np.where(wanted[:, group], value, -np.inf))
         # One user alone, where there is no time for a group.
-        in_time = is_open & (steps_alone + self._home <= left)
-        value = self._per_user - self._per_step * np.where(in_time, steps_alone + self._home, 0.0)
+        alone = np.maximum(steps_alone + self._home, home[:, None])
+        in_time = is_open & (alone <= left)
+        value = self._per_user - self._per_step * np.where(in_time, alone, 0.0)
         promise = np.maximum(promise, np.where(in_time, value, -np.inf).max(axis=-1))
         return self._per_user * collected.sum(axis=-1) + promise, is_open.sum(axis=-1)
 

@@ -6,20 +6,18 @@ import pytest
 
 from tests.support.worlds import changed
 from uav_dc_ros import scenarios
-from uav_dc_ros.agents import policy as policies
+from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.core import mission, mobility, world
 from uav_dc_ros.core.grid import MOVES
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.errors import ScenarioError
-from uav_dc_ros.experiments.evaluate.evaluation import greedy_act
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.experiments.optimum import mip
 from uav_dc_ros.experiments.optimum.cli import OptimumReport, main, report_of
 from uav_dc_ros.experiments.optimum.front import draw_front, greatest_users
 from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
 from uav_dc_ros.experiments.optimum.solve import fly, solve
-from uav_dc_ros.experiments.scenarios import document
-from uav_dc_ros.planners import PLANNERS
+from uav_dc_ros.scenarios.generation import document
 
 
 def small(seed, **tables):
@@ -134,8 +132,8 @@ def test_a_narrow_diagram_bounds_the_optimum(seed):
 def test_no_policy_is_better_than_the_bound(name, policy):
     scenario = scenarios.load(name)
     found = solve(ClairvoyantProblem(scenario, 1), DEFAULT_WEIGHT, widths=(250,))
-    made = greedy_act(policies.load(policy), scenario)
-    for act in (made, PLANNERS["tour"](scenario)):
+    for name in (policy, "tour", "fixed_tour"):
+        act = agents.load(name).act_in(scenario)
         assert roll_out(scenario, act, [1]).objective(scenario)[0] <= found.objective <= found.bound
 
 
@@ -184,7 +182,15 @@ def command(*arguments):
 
 
 def test_the_command_reports_missions_and_policies(tmp_path, capsys):
-    arguments = ["--scenario", "three_clusters", "--seeds", 2, "--policy", "three_clusters_dueling", "tour"]
+    arguments = [
+        "--scenario",
+        "three_clusters",
+        "--seeds",
+        2,
+        "--policy",
+        "three_clusters_dueling",
+        "fixed_tour",
+    ]
     assert command(*arguments, "--json", tmp_path / "x.json") == 0
     written = (tmp_path / "x.json").read_bytes()
     report = msgspec.json.decode(written, type=OptimumReport)

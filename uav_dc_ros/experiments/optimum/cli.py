@@ -12,10 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from uav_dc_ros import __version__, cli, files, scenarios
+from uav_dc_ros.agents.agent import Agent
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT, EXPECTED_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import FROM_TRAIN, UavDcError
-from uav_dc_ros.experiments.evaluate.cli import Candidate, candidates
+from uav_dc_ros.experiments.evaluate.cli import candidates
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.experiments.optimum.mip import solve_program
 from uav_dc_ros.experiments.optimum.problem import ClairvoyantProblem
@@ -102,7 +103,7 @@ def main(argv: list[str] | None = None) -> None:
         scenario = scenarios.load(options.scenario)
         flown = candidates(options.policy)
         for one in flown:
-            one.act_in(scenario)  # an error now, and not after the search
+            one.act_in(scenario, options.objective)  # an error now, and not after the search
         for path in filter(None, (options.json, options.front)):
             files.check_writable(path)
         widths = (*(width for width in DIAGRAM_WIDTHS if width < options.width), options.width)
@@ -134,7 +135,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def report_of(
-    scenario: Scenario, weight: float, found: Sequence[Solution], flown: Sequence[Candidate]
+    scenario: Scenario, weight: float, found: Sequence[Solution], flown: Sequence[Agent]
 ) -> OptimumReport:
     """The report of solutions, one for each seed from 0, and of policies in the same missions."""
     missions = [
@@ -168,8 +169,8 @@ def report_of(
     )
 
 
-def _standing(one: Candidate, scenario: Scenario, weight: float, seeds: range, bound: float) -> Standing:
-    missions = roll_out(scenario, one.act_in(scenario), seeds, service=False)
+def _standing(one: Agent, scenario: Scenario, weight: float, seeds: range, bound: float) -> Standing:
+    missions = roll_out(scenario, one.act_in(scenario, weight), seeds, service=False)
     values = missions.objective(scenario, weight)
     arrivals = missions.arrival_step[missions.landed]
     return Standing(
