@@ -43,6 +43,7 @@ SIMULATED = "simulated"
 VEHICLES = ("mavlink", "mavros", "px4")
 SYSTEM_MAX = 255  # highest MAVLink system number
 
+MARK = "mark"  # annotations of a recording, plain text: any node may publish it, see `bag mark`
 JSON = "std_msgs/msg/String"
 POSE = "geometry_msgs/msg/PoseStamped"
 PATH = "nav_msgs/msg/Path"

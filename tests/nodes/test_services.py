@@ -129,11 +129,11 @@ def test_run_all_ends_when_a_service_ends_the_mission(ros: Ros, service: str) ->
     process = ros.start(
         RUN_ALL, "--missions", 3, "--pace", 20, "--bag", "bag", "--set", "recorder.keep_last_s=5"
     )
-    ros.node("world")
+    ros.run_id()  # the mission has begun
     client = ros.stranger("framework/service_client")
     assert client.stdin is not None
     assert client.stdout is not None
-    time.sleep(3.0)
+    time.sleep(1.0)
     client.stdin.write(json.dumps({"call": f"/{service}"}) + "\n")
     client.stdin.flush()
     assert json.loads(client.stdout.readline())["success"]

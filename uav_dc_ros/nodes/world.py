@@ -42,6 +42,7 @@ CLOCK_PERIOD_S = 0.05
 POSE_AGE_MAX_S = 10.0  # of an external vehicle; an older pose was recorded
 USER_BYTES = 40  # of `users`, for each of them
 OVERRUN_S = 0.005  # a step that starts later than this after its time is an overrun
+STOP_REASON, ABORT_REASON = "stopped by a service call", "aborted by a service call"
 ABORTED = b"aborted"  # last line of the journal of a mission that a service ended
 
 
@@ -169,7 +170,7 @@ class WorldNode(MissionNode):
         if self._phase is None:
             self._open(0)
             self._is_flying = True  # no mission begins any more
-        self._abort("aborted by a service call")
+        self._abort(ABORT_REASON if at_once else STOP_REASON)
         self.publish_payload("mission", self._status())
         return f"mission {self._mission} is aborted at step {self._step}"
 
@@ -220,7 +221,7 @@ class WorldNode(MissionNode):
             self._move(action)
         self._may_start = True
         if is_aborted:
-            self._phase, self._reason = Phase.ABORTED, "aborted by a service call"
+            self._phase, self._reason = Phase.ABORTED, "ended by a service call, before a restart"
         self.get_logger().warning(f"resumes mission {self._mission} at step {self._step}")
 
     def on_move(self, payload: messages.Move) -> None:
@@ -256,7 +257,7 @@ class WorldNode(MissionNode):
         self.journal.append(b"%d" % int(action))
         self._move(action)
         if self._stops_after_step and self._phase is Phase.READY:
-            self._abort("stopped by a service call")
+            self._abort(STOP_REASON)
         self._step_began_s = time.monotonic()
         if self.pace is None:
             self._unacknowledged.step()
@@ -264,7 +265,8 @@ class WorldNode(MissionNode):
         if self._phase in (Phase.LANDED, Phase.TIMEOUT) and self._mission + 1 < self.values["missions"]:
             self._begin(self._mission + 1)
             if self._stops_after_step:
-                self._end_missions(at_once=True)
+                self._abort(STOP_REASON)
+                self.publish_payload("mission", self._status())
 
     def _move(self, action: Action) -> None:
         """One step of the world."""

@@ -6,9 +6,8 @@ from uav_dc_ros import cdr
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import MessageError
 from uav_dc_ros.messages import one_line
-from uav_dc_ros.topics import JSON
+from uav_dc_ros.topics import JSON, MARK
 
-TOPIC = "mark"  # relative to the namespace of the mission
 MARKS_MAX = 1000  # read of a bag
 
 
@@ -27,8 +26,8 @@ def read_marks(reader: BagReader, namespace: str | None = None) -> list[Mark]:
         topic.name
         for topic in reader.topics.values()
         if topic.type == JSON
-        and topic.name.endswith(f"/{TOPIC}")
-        and namespace in (None, topic.name.removesuffix(f"/{TOPIC}"))
+        and topic.name.endswith(f"/{MARK}")
+        and namespace in (None, topic.name.removesuffix(f"/{MARK}"))
     ]
     found: list[Mark] = []
     for message in reader.messages(wanted) if wanted else ():
@@ -37,7 +36,7 @@ def read_marks(reader: BagReader, namespace: str | None = None) -> list[Mark]:
         except MessageError:
             continue
         at_s = (message.log_time_ns - reader.first_ns) / 1e9
-        found.append(Mark(s=at_s, namespace=message.topic.removesuffix(f"/{TOPIC}"), text=text))
+        found.append(Mark(s=at_s, namespace=message.topic.removesuffix(f"/{MARK}"), text=text))
         if len(found) == MARKS_MAX:
             break
     return found

@@ -10,7 +10,7 @@ from uav_dc_ros import cdr, cli
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.messages import TEXT_MAX, printable
 from uav_dc_ros.nodes.ros import environment, fastdds
-from uav_dc_ros.recordings.marks import TOPIC
+from uav_dc_ros.topics import MARK
 
 NODE = "bag_mark"
 RECORDERS = ("recorder", "bag_record")  # names of nodes
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = Node(NODE, namespace=options.namespace, start_parameter_services=False, enable_rosout=False)
-        publisher = node.create_publisher(String, TOPIC, 10)
+        publisher = node.create_publisher(String, MARK, 10)
         topic, deadline_s = publisher.topic_name, time.monotonic() + options.timeout
 
         def recorders() -> list[str]:

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, NamedTuple
 from uav_dc_ros import cdr, messages
 from uav_dc_ros.errors import MessageError, NodeError
 from uav_dc_ros.messages import Mission, Phase
+from uav_dc_ros.topics import MARK
 
 if TYPE_CHECKING:
     from uav_dc_ros.bags.write import BagWriter
 
-MARK = "mark"  # topic of annotations, which a pause does not stop
 KEPT_BYTES_MAX = 512 * 2**20  # of the messages in memory; older ones go
 
 
