@@ -1,6 +1,7 @@
 """The observation `entities`: what it shows is so in the world, and its moves always land."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.conftest import ROOT
 from tests.support.worlds import changed, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.core import entities, observations, world
@@ -146,7 +148,9 @@ def test_a_field_that_is_too_large_has_no_such_observation():
     assert "with 101 clusters; expected at most 100" in (entities.problem(many) or "")
 
 
-def test_names_count_the_numbers():
+def test_names_count_the_numbers_and_are_explained():
+    explained = set(re.findall(r"`(\w+)`", (ROOT / "docs" / "generalist.md").read_text("utf-8")))
+    assert {*encoding.GLOBAL_NAMES, *CLUSTER_NAMES} <= explained
     assert len(CLUSTER_NAMES) - 1 + len(Action) == encoding.CLUSTER
     scenario = scenarios.load("farm")
     assert entities.size(scenario) == GLOBAL + CLUSTER * 16

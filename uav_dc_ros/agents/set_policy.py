@@ -26,7 +26,7 @@ class PqnSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     batch_size: Count = 512  # decisions in a mini-batch
     learning_rate: Annotated[float, Meta(gt=0, le=1)] = 7e-4  # of Adam; it falls to a fiftieth
     trace: Probability = 0.95  # lambda of the returns
-    # Share of the missions that the planner `tour` flies at the start, as demonstrations
+    # Share of the missions that the planner `fixed_tour` flies at the start, as demonstrations
     demonstrations: Probability = 1.0
     shown: Annotated[float, Meta(gt=0, le=1)] = 0.6  # share of the iterations in which that share falls to 0
     epsilon: Probability = 0.93  # probability of the greedy action, or the planner's

@@ -1,5 +1,6 @@
 """The command line of `python -m uav_dc_ros.evaluate`."""
 
+import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -37,6 +38,7 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
     save_mission_picture,
     shift_effect,
 )
+from uav_dc_ros.experiments.evaluate.fields import evaluate_fields, show_fields
 from uav_dc_ros.experiments.evaluate.shifts import (
     MISSING,
     Shift,
@@ -65,7 +67,9 @@ def main(argv: list[str] | None = None) -> None:
     text = f"every policy flies in each; shipped: {', '.join(scenarios.names())}; "
     text += "default: by the name of the policy's own"
     add("--scenario", nargs="+", default=[], metavar="NAME|FILE|random:SEED", help=text)
-    add("--seeds", type=cli.count, default=100, metavar="N", help="missions, seeds 0 to N-1")
+    add("--seeds", type=cli.count, metavar="N", help="missions, seeds 0 to N-1; default 100, of --fields 10")
+    text = "instead of --scenario: the random fields of seeds 0 to N-1 (random:SEED), compared field by field"
+    add("--fields", type=cli.count, metavar="N", help=text)
     text = "w of the objective J, which tour and search maximise: 1 counts the users only, 0 the time only; "
     text += "default 10/11"
     weight = cli.number(0.0, 1.0, EXPECTED_WEIGHT)
@@ -79,6 +83,8 @@ def main(argv: list[str] | None = None) -> None:
     def command() -> int:
         options = parser.parse_args(argv)
         _check_once("--shift", [request.text for request in options.shift])
+        if options.fields:
+            return _fly_in_fields(options)
         pairs = _pairs(options.policy, options.scenario)
         flights = [flight for pair in pairs for flight in _flights(*pair, options.shift, options.objective)]
         if options.picture and len(flights) > 1:
@@ -91,7 +97,7 @@ def main(argv: list[str] | None = None) -> None:
             candidate, scenario = pairs[0]
             save_mission_picture(candidate.act_in(scenario, options.objective), scenario, 0, options.picture)
 
-        seeds = range(options.seeds)
+        seeds = range(options.seeds or 100)
         evaluated = [
             evaluate_act(one.name, one.sha256, act, world.scenario, seeds, world.shift, options.objective)
             for one, world, act in flights
@@ -109,6 +115,20 @@ def _check_once(option: str, values: Sequence[str]) -> None:
     for value in values:
         if values.count(value) > 1:
             raise UavDcError(f"{option} {value} is given {values.count(value)} times; expected once")
+
+
+def _fly_in_fields(options: argparse.Namespace) -> int:
+    for name in ("scenario", "shift", "picture"):
+        if getattr(options, name):
+            raise UavDcError(f"--fields {options.fields} beside --{name}; expected one or the other")
+    if options.json:
+        files.check_writable(options.json)
+    seeds = range(options.seeds or 10)
+    report = evaluate_fields(candidates(options.policy), options.fields, seeds, options.objective)
+    if options.json:
+        files.write(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
+    show_fields(report, _console(), _table())
+    return 0
 
 
 def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[tuple[Agent, Scenario]]:
@@ -183,8 +203,7 @@ def candidates(names: Sequence[str]) -> list[Agent]:
 
 def show(report: EvaluationReport) -> None:
     """Print a table for each evaluation without a shift, an overview of several, and the shifts."""
-    # A file or a pipe has no width; rich wraps at 80 by default.
-    console = Console(width=None if sys.stdout.isatty() else 100, highlight=False)
+    console = _console()
     evaluations = [one for one in report.evaluations if one.shift is UNSET]
     for evaluation in evaluations:
         title = f"{_where(evaluation)}, {_missions(evaluation)}"
@@ -261,6 +280,11 @@ def _figures_table(names: Sequence[str]) -> Table:
     for name in names:
         table.add_column(TITLES[name].replace(" ", "\n", 1), justify="right", no_wrap=True)
     return table
+
+
+def _console() -> Console:
+    # A file or a pipe has no width; rich wraps at 80 by default.
+    return Console(width=None if sys.stdout.isatty() else 100, highlight=False)
 
 
 def _table() -> Table:

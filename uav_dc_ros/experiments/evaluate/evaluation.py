@@ -160,7 +160,7 @@ def evaluate_act(
         users_total=scenario.n_users,
         objective_weight=weight,
         reward_data=scenario.reward.data,
-        **{name: _figure(each, _RANGES.get(name)) for name, each in values.items()},
+        **{name: figure(each, _RANGES.get(name)) for name, each in values.items()},
     )
     return EvaluatedMissions(evaluation=evaluation, values=values)
 
@@ -196,13 +196,14 @@ def _differences(evaluated: EvaluatedMissions, baseline: EvaluatedMissions) -> d
     pairs = {
         name: (evaluated.values[name], baseline.values[name]) for name in TITLES if name in evaluated.values
     }
-    return {name: _figure(one - other) for name, (one, other) in pairs.items()}
+    return {name: figure(one - other) for name, (one, other) in pairs.items()}
 
 
 _RANGES = dict.fromkeys(("objective", "landing_rate", "fairness"), (0.0, 1.0))  # intervals end there
 
 
-def _figure(values: Array, possible: tuple[float, float] | None = None) -> Figure:
+def figure(values: Array, possible: tuple[float, float] | None = None) -> Figure:
+    """Statistics of values `[n]`, of which NaN are left out; `possible`: the range of possible values."""
     known = values[np.isfinite(values)]
     if not known.size:
         return Figure(n=0)

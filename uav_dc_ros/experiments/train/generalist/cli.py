@@ -34,7 +34,7 @@ _OPTIONS = {
     "batch_size": "decisions in a mini-batch",
     "learning_rate": "of Adam at the start; it falls to a fiftieth",
     "trace": "lambda of the returns",
-    "demonstrations": "share of the missions that the planner `tour` flies at the start",
+    "demonstrations": "share of the missions that the planner `fixed_tour` flies at the start",
     "shown": "share of the iterations in which that share falls to 0",
     "epsilon": "probability of the greedy action, or the planner's",
 }
@@ -81,6 +81,7 @@ def options_parser(prog: str) -> cli.Parser:
 def train(options: argparse.Namespace, command: str, prog: str) -> int:
     """Train, and write the policy with the highest J in the layouts that select; the exit status."""
     config = _config(options)
+    command = command.replace(" --resume", "")  # which changes nothing of the result
     torch_device("cpu", options.threads)
     # These need torch.
     from uav_dc_ros.experiments.train import checkpoint

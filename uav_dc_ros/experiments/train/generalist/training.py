@@ -21,7 +21,8 @@ from uav_dc_ros.experiments.train.generalist.layouts import SELECTION_LAYOUTS, S
 from uav_dc_ros.experiments.train.generalist.missions import LayoutMissions
 from uav_dc_ros.experiments.train.generalist.pqn import Batch, PqnLearner, lambda_returns
 
-BASELINES = ("nearest", "tour")
+DEMONSTRATOR = "fixed_tour"
+BASELINES = ("nearest", DEMONSTRATOR)
 PREFERRED_FROM = 0.5  # weight of the objective from which a tour of all clusters is to be preferred
 _REWARD_SCALE = np.float32(10.0)  # J lies in [0, 1]; errors of a tenth of that are large
 _STREAM = 2  # separates a run's generators from those of other trainings
@@ -64,7 +65,7 @@ class GeneralistTraining:
         # Most weights are near those that users want.
         weights = 1.0 - rng.random((settings.layouts, settings.missions)) ** 2
         flown = LayoutMissions(drawn, weights, rng)
-        tours = [planners.PLANNERS["tour"](layout) for layout in drawn]
+        tours = [planners.PLANNERS[DEMONSTRATOR](layout) for layout in drawn]
         n_shown = round(settings.demonstrations * max(0.0, 1.0 - done / settings.shown) * settings.missions)
         shown = np.tile(np.arange(settings.missions) < n_shown, settings.layouts)
         steps: list[tuple[Array, ...]] = []
