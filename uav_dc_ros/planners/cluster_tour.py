@@ -6,7 +6,8 @@ It knows where clusters are, how large their discs are, and the data collected s
 - one order of all stops, the shortest way from the start past them to the dock: exact for up to
   `EXACT_MAX` stops; with more, improved by 2-opt (Croes, 1958) and Or-opt (Or, 1976) from the nearest
   neighbour's order;
-- the steps at the stop that each waiting user still needs, from the rates there and from its own data.
+- the steps at the stop that each waiting user still needs, from the rates there and on the way there, and
+  from its own data.
 
 At each step it chooses, in that order, which clusters to visit and how many users of each to wait for. The
 choice maximises the value of the users, w / U each, less the steps until the dock times a price. The price is
@@ -26,6 +27,7 @@ from uav_dc_ros.core.world import Act, State
 from uav_dc_ros.planners.cells import FAR, Cells, Delivery
 
 HOVERS_MAX = 16  # steps over a stop within which a user is collected, or not counted
+APPROACH_MAX = 8  # moves to a stop on which it is expected to receive data
 EXACT_MAX = 8  # stops of which every order is tried
 BISECTIONS = 16  # of the price of time
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
@@ -43,7 +45,7 @@ class _Tour:
         self.scenario, self.cells = scenario, Cells(scenario)
         self._user_value = weight / scenario.n_users
         self._step_cost = (1.0 - weight) / scenario.mission.max_steps
-        stops, needs = _stops(self.cells)
+        stops, needs, approaches = _stops(self.cells)
         legs = np.stack([self.cells.steps_to(int(stop)) for stop in stops])  # [M, C], moves to each stop
         start = self.cells.index(np.asarray(scenario.start_cell))
         to_dock = self.cells.steps_home
@@ -52,6 +54,8 @@ class _Tour:
         self._between = self._legs[:, self._stops]  # [M, M], symmetric
         starts = np.cumsum([0, *scenario.users.sizes])
         self._users = [np.arange(starts[i], starts[i + 1]) for i in order]
+        # Share of a user's data that the last 0, 1, ... moves to the stop deliver, `[M, APPROACH_MAX + 1]`
+        self._approaches = approaches[order]
         self._need = needs[order, 0]  # mean steps at the stop until a user is collected, `[M]`
         # The step at which a stop closes, if one of its users is collected, `[M]`: when its own and earlier
         # ways and waits have lasted as long as expected. Users that have walked out of reach are left behind.
@@ -65,7 +69,7 @@ class _Tour:
         left = self._left(state).reshape(-1)
         data_bits = state.data_bits.reshape(len(left), -1)
         collected = state.collected.reshape(len(left), -1)
-        needs = self._needs(state.step.reshape(-1), data_bits, collected)
+        needs = self._needs(number, state.step.reshape(-1), data_bits, collected)
         goal = self._goals(number, left, needs)
         return self._towards(number, left, goal).reshape(shape)
 
@@ -79,7 +83,7 @@ class _Tour:
         steps = (energy.battery_j - state.energy_used_j) / max(self.scenario.step_energies_j)
         return np.minimum(left, np.floor(steps).astype(np.int64))
 
-    def _needs(self, step: Array, data_bits: Array, collected: Array) -> Array:
+    def _needs(self, number: Array, step: Array, data_bits: Array, collected: Array) -> Array:
         """Steps at each stop until 0 to K more users are collected, K the largest cluster, `[S, M, K + 1]`.
 
         They are infinite where no more users wait, or the stop is closed.
@@ -91,7 +95,9 @@ class _Tour:
         for i, (users, steps) in enumerate(zip(self._users, self._need, strict=True)):
             waiting, data, wanted = ~collected[:, users], data_bits[:, users], r_min_bits[:, users]
             is_open = ((step < self._deadlines[i]) | waiting.all(axis=1))[:, None]
-            need = np.where(waiting & is_open, steps * (1.0 - data / wanted), np.inf)
+            moves = np.minimum(self._legs[i, number], APPROACH_MAX)
+            left = np.maximum(1.0 - data / wanted - self._approaches[i, moves][:, None], 0.0)
+            need = np.where(waiting & is_open, steps * left, np.inf)
             needs[:, i, 1 : len(users) + 1] = np.sort(need, axis=1)
         return needs
 
@@ -168,11 +174,12 @@ _PREFERRED = np.asarray(
 )
 
 
-def _stops(cells: Cells) -> tuple[Array, Array]:
+def _stops(cells: Cells) -> tuple[Array, Array, Array]:
     """The number of the stop over each cluster, `[M]`, and the steps there until its users are collected.
 
     Users are spread evenly over their disc. The stop is the cell over which they wait least in sum. The steps
-    are the mean and the maximum of those that are collected within `HOVERS_MAX`, `[M, 2]`.
+    are the mean and the maximum of those that are collected within `HOVERS_MAX`, `[M, 2]`. The last result is
+    the share of a user's data that the last 0, 1, ... moves to the stop deliver, `[M, APPROACH_MAX + 1]`.
     """
     scenario = cells.scenario
     discs, sizes = scenario.users.clusters, scenario.users.sizes
@@ -196,7 +203,16 @@ def _stops(cells: Cells) -> tuple[Array, Array]:
         needs.append(
             (steps[stop, of_cluster].mean(), steps[stop, of_cluster].max()) if of_cluster.any() else (1, 1)
         )
-    return stops, np.asarray(needs, dtype=np.float64)
+    shares = delivery.everywhere(np.zeros(scenario.n_users, dtype=bool)) / r_min_bits
+    approaches = np.zeros((len(stops), APPROACH_MAX + 1))
+    for cluster, stop in enumerate(stops):
+        mean_share = shares[:, scenario.user_cluster == cluster].mean(axis=1)
+        in_layer = cells.cells[:, 2] == cells.cells[stop, 2]
+        for moves in range(1, APPROACH_MAX):
+            there = in_layer & (cells.steps_to(int(stop)) == moves)
+            approaches[cluster, moves + 1] = approaches[cluster, moves]
+            approaches[cluster, moves + 1] += mean_share[there].mean() if there.any() else 0.0
+    return stops, np.asarray(needs, dtype=np.float64), approaches
 
 
 def _spread(centre_m: tuple[float, float], radius_m: float, n: int) -> Array:
