@@ -32,6 +32,16 @@ def test_obstacles_are_in_the_picture():
     assert height == pytest.approx(2 * width, rel=0.05)  # the zone, and nothing else
 
 
+@pytest.mark.parametrize(("n_x", "n_y"), [(9, 9), (13, 10), (20, 6), (8, 12)])
+def test_a_field_of_any_shape_leaves_no_blank_bands(n_x, n_y):
+    env = DataCollectionEnv(tiny(grid={"n_x": n_x, "n_y": n_y}), render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    blank = (picture == picture[0, 0]).all(axis=(1, 2))
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], blank, [False])).astype(int)))
+    assert np.max(edges[1::2] - edges[::2]) < 0.06 * picture.shape[1], "rows, of its width"
+
+
 def test_the_last_picture_can_still_be_made_when_the_mission_is_over():
     env = DataCollectionEnv(tiny(mission={"max_steps": 4}), render_mode="rgb_array")
     env.reset(seed=0)

@@ -1,5 +1,6 @@
 """A picture of a mission: the field from above, and altitude and users collected over the steps."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ INK, PAPER, FAINT = "#1d2733", "#fbfaf7", "#d9d5cb"
 WAITING, COLLECTED, DOCK = "#c9502c", "#2a8c6e", "#1d2733"
 BUILDING: dict[str, Any] = {"fc": "#b3ab98", "ec": "#7d7665", "lw": 0.8}
 NO_FLY: dict[str, Any] = {"fc": "#f3d9d2", "ec": "#c9502c", "lw": 0.8, "hatch": "///"}
+BORDER, TICKS_MAX = 0.8, 20  # cells around the field's outermost centres; cells with a tick at every other
 PATH_COLOURS = LinearSegmentedColormap.from_list("path", ["#2b3f7e", "#8c5aa6", "#f0a83a"])
 
 
@@ -38,8 +40,14 @@ def save_picture(trajectory: Trajectory, path: Path) -> None:
 
 
 def _figure(trajectory: Trajectory, dpi: int) -> Figure:
-    figure = Figure(figsize=(7.2, 8.7), dpi=dpi, facecolor=PAPER)
-    field, steps = figure.add_axes((0.1, 0.235, 0.81, 0.67)), figure.add_axes((0.1, 0.06, 0.81, 0.115))
+    grid = trajectory.scenario.grid
+    # Height of the field over its width; beyond these limits bands are left blank.
+    ratio = min(1.6, max(0.2, (grid.n_y - 1 + 2 * BORDER) / (grid.n_x - 1 + 2 * BORDER)))
+    height = 8.7 - 0.67 * 8.7 * (1.0 - ratio)
+    per = 8.7 / height  # of the lengths below, which are shares of a square field's picture
+    figure = Figure(figsize=(7.2, height), dpi=dpi, facecolor=PAPER)
+    field = figure.add_axes((0.1, 0.235 * per, 0.81, 0.67 * ratio * per))
+    steps = figure.add_axes((0.1, 0.06 * per, 0.81, 0.115 * per))
     _draw_field(field, trajectory)
     _draw_steps(steps, trajectory)
     step, n_steps = len(trajectory.cells) - 1, trajectory.scenario.mission.max_steps
@@ -47,8 +55,8 @@ def _figure(trajectory: Trajectory, dpi: int) -> Figure:
     status = "over the dock" if docked else f"sum-rate {trajectory.sum_rate_bps[-1] / 1e6:.2f} Mbit/s"
     title = f"{trajectory.n_collected[-1]} of {trajectory.scenario.n_users} users collected"
     facts = f"{trajectory.scenario.name}   ·   step {step} of {n_steps}   ·   {status}"
-    figure.text(0.1, 0.952, title, color=INK, size=15, weight="bold")
-    figure.text(0.1, 0.926, facts, color=INK, size=9.5)
+    figure.text(0.1, 1.0 - 0.048 * per, title, color=INK, size=15, weight="bold")
+    figure.text(0.1, 1.0 - 0.074 * per, facts, color=INK, size=9.5)
     return figure
 
 
@@ -98,10 +106,12 @@ def _draw_field(axes: Axes, trajectory: Trajectory) -> None:
     axes.scatter(x_m, y_m, marker="^", s=90, c="#f2c14e", edgecolors=INK, lw=1.1, zorder=8, label="UAV")
 
     wide_m, high_m = (scenario.grid.n_x - 1) * cell_m, (scenario.grid.n_y - 1) * cell_m
-    axes.set(xlim=(-0.8 * cell_m, wide_m + 0.8 * cell_m), ylim=(-0.8 * cell_m, high_m + 0.8 * cell_m))
+    border_m = BORDER * cell_m
+    axes.set(xlim=(-border_m, wide_m + border_m), ylim=(-border_m, high_m + border_m))
     axes.set_aspect("equal")
-    axes.set_xticks(np.arange(0, wide_m + 1, 2 * cell_m))
-    axes.set_yticks(np.arange(0, high_m + 1, 2 * cell_m))
+    apart_m = 2 * cell_m * math.ceil(max(scenario.grid.n_x, scenario.grid.n_y) / TICKS_MAX)
+    axes.set_xticks(np.arange(0, wide_m + 1, apart_m))
+    axes.set_yticks(np.arange(0, high_m + 1, apart_m))
     axes.set_xlabel("east, m", color=INK, size=9)
     axes.set_ylabel("north, m", color=INK, size=9)
     axes.legend(loc="upper left", frameon=False, fontsize=9, labelcolor=INK, handletextpad=0.2)
