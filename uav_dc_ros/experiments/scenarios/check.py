@@ -83,10 +83,12 @@ def words(scenario: Scenario, examined: Flyable) -> list[str]:
         "tour without a limit: "
         + (f"{tour.without_limit:.1f} steps" if tour.without_limit else "cannot collect every cluster"),
     ]
-    for i, cluster in enumerate(examined.clusters[:CLUSTERS_MAX]):
+    names = scenario.users.cluster_names or (None,) * len(examined.clusters)
+    for i, (name, cluster) in enumerate(zip(names, examined.clusters[:CLUSTERS_MAX], strict=False)):
+        title = f"cluster {i}" if name is None else f"cluster {i} {name!r}"
         x_m, y_m = cluster.centre_m
         lines.append(
-            f"cluster {i} at {x_m:.0f}, {y_m:.0f} m: {cluster.in_reach:.0%} in reach (farthest point "
+            f"{title} at {x_m:.0f}, {y_m:.0f} m: {cluster.in_reach:.0%} in reach (farthest point "
             f"{cluster.reach_m:.0f} m from a cell, d_cons {limits.d_cons_m:g} m), {cluster.collected:.1f} of "
             f"{cluster.users} users collected"
         )
