@@ -100,17 +100,19 @@ def forks(tmp_path_factory):
     forks.close()
 
 
-def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field):
+def test_from_a_scenario_file_to_a_policy_that_flies(tmp_path, field, forks):
+    """In a process of its own the command is run by tests/test_examples.py."""
     out = tmp_path / "made"
     arguments = ["--scenario", field, "--algo", "dueling_dqn", "--out", out, "--observation", "map"]
     arguments += ["--episodes", 6, "--runs", 2, "--seed", 5, "--checkpoint-every", 3, "--hidden", 12, 10]
     arguments += ["--batch-size", 16, "--gamma", 0.8, "--beta", 3, "--reward-form", "immediate"]
     arguments += ["--reward-data", "step", "--data-scale-bits", 4e5]
     arguments += ["--tensorboard", tmp_path / "scalars"]
-    status, printed, progress = command(*arguments)
-    assert status == 0, progress
-    assert "brought home in validation" in printed
-    assert [line.split()[1] for line in progress.splitlines()] == ["3", "6"], "plain lines off a terminal"
+    child = forks.start([str(argument) for argument in arguments])
+    assert child.wait() == 0, child.output
+    assert "brought home in validation" in child.output
+    progress = [line.split()[1] for line in child.output.splitlines() if line.startswith("episode ")]
+    assert progress == ["3", "6"], "plain lines off a terminal"
     left = sorted(path.name for path in tmp_path.iterdir())
     assert left == ["made", "scalars", "tiny.toml"], "no checkpoint is left"
     assert sorted(path.name for path in (tmp_path / "scalars" / "made").iterdir()) == ["seed_5", "seed_6"]
