@@ -171,11 +171,11 @@ def test_a_lockstep_waits_for_who_is_held_up(ros: Ros, arguments: list[object], 
 
     While the recorder stands still, who shares a process can be seen: the flight cannot end meanwhile.
     """
-    missions = 80
+    missions = 56
     process = ros.start("uav_dc_ros.run_all", *arguments, "--pace", "lockstep", "--missions", missions)
     assert process.stdout is not None
     recorder = ros.node("recorder")
-    for mission, held_up in ((5, recorder), (40, process.pid)):
+    for mission, held_up in ((5, recorder), (28, process.pid)):
         wait_for(process.stdout, f"mission {mission} of")
         os.kill(held_up, signal.SIGSTOP)
         time.sleep(0.8)
