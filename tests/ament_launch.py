@@ -25,7 +25,7 @@ ATTRIBUTES = {
     "param": {"name", "value", "type"},
 }
 BOOLEAN = {"true": True, "True": True, "1": True, "false": False, "False": False, "0": False}
-TYPES: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "bool": BOOLEAN.__getitem__}
+TYPES: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float, "bool": BOOLEAN.__getitem__}
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ pytestmark = pytest.mark.xdist_group("packaging")
 
 TOP_LEVEL = {
     ".ci",
+    ".devcontainer",
     ".gitignore",
     "CHANGELOG.md",
     "CITATION.cff",
