@@ -41,7 +41,7 @@ def parser(prog: str = PROG) -> cli.Parser:
     )
     add("--policy", metavar="NAME|DIR", help=policy)
     weight = cli.number(0.0, 1.0, "a weight between 0 (time only) and 1 (users only)")
-    objective = "weight w of the users in the objective of tour or search, 0 to 1 (default: 10/11)"
+    objective = "weight w of the users in the objective, for what depends on it, 0 to 1 (default: 10/11)"
     add("--objective", type=weight, metavar="W", help=objective)
     seed = "seed of the users (default: %(default)s)"
     add("--seed", type=cli.whole_number(0), default=0, metavar="N", help=seed)
