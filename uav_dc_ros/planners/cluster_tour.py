@@ -12,7 +12,8 @@ It knows where clusters are, how large their discs are, and the data collected s
 At each step it chooses, in that order, which clusters to visit and how many users of each to wait for. The
 choice maximises the value of the users, w / U each, less the steps until the dock times a price. The price is
 (1 - w) / T_cons, which gives J, where the time is enough for that choice, and otherwise the lowest one at
-which it is. For a given price the choice is exact (dynamic programming over the order).
+which it is. For a given price the choice is exact (dynamic programming over the order). Where the lowest
+price leaves out more than the time demands, a limit of all waits is chosen instead.
 """
 
 import itertools
@@ -104,19 +105,27 @@ class _Tour:
     def _goals(self, number: Array, left: Array, needs: Array) -> Array:
         """The stop to fly to, integers `[S]`, by its place in the order; M is the dock."""
         low = np.full(len(left), self._step_cost)
-        goal, steps = self._best(number, low, needs)
+        goal, steps, _ = self._best(number, low, needs)
         if (late := steps > left).any():
-            high = np.full(len(left), 1.0)  # a step is dearer than all users
+            cheapest, high = low, np.full(len(left), 1.0)  # a step is dearer than all users
             for _ in range(BISECTIONS):
                 price = np.sqrt(np.maximum(low, 1e-9) * high)
-                _, steps_at = self._best(number, price, needs)
+                steps_at = self._best(number, price, needs)[1]
                 fits = steps_at <= left
                 high, low = np.where(fits, price, high), np.where(fits, low, price)
-            goal = np.where(late, self._best(number, high, needs)[0], goal)
+            at_price, steps, value = self._best(number, high, needs)
+            goal = np.where(late, at_price, goal)
+            # One price may skip a whole stop and leave steps unused: a limit of all waits may lose less.
+            best = value + (high - cheapest) * steps
+            for wait_max in range(1, HOVERS_MAX + 1):
+                within = np.where(needs <= wait_max, needs, np.inf)
+                limited, steps, value = self._best(number, cheapest, within)
+                better = late & (steps <= left) & (value > best)
+                goal, best = np.where(better, limited, goal), np.where(better, value, best)
         return goal
 
-    def _best(self, number: Array, price: Array, needs: Array) -> tuple[Array, Array]:
-        """The best choice for a price of time `[S]`: the first stop, and the steps until the dock, `[S]`."""
+    def _best(self, number: Array, price: Array, needs: Array) -> tuple[Array, Array, Array]:
+        """The best choice for a price of time `[S]`: first stop, steps until the dock, and value, `[S]`."""
         is_offered = np.isfinite(needs)
         cost = price[:, None, None] * np.where(is_offered, needs, 0.0)
         worth = np.where(is_offered, self._user_value * np.arange(needs.shape[-1]) - cost, -np.inf)
@@ -134,8 +143,8 @@ class _Tour:
             value[:, i], steps[:, i] = worth[:, i] + after, stays[:, i] + length
         # A stop at which no user is worth waiting for gives nothing.
         value[:, :-1] = np.where(kept[..., 0] > 0, value[:, :-1], -np.inf)
-        _, length, goal = self._next(0, self._legs[:, number].T, to_dock[number], price, value, steps)
-        return goal, length
+        best, length, goal = self._next(0, self._legs[:, number].T, to_dock[number], price, value, steps)
+        return goal, length, best
 
     def _next(
         self, first: int, legs: Array, home: Array, price: Array, value: Array, steps: Array
