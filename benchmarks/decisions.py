@@ -1,8 +1,9 @@
-"""Time of a decision of a policy, as the policy node takes it: observation and network, one at a time.
+"""CPU time of a decision of policies and planners, milliseconds, over whole missions.
 
-It is the CPU's time of the thread, which other programs do not lengthen much.
+    OMP_NUM_THREADS=1 python benchmarks/decisions.py [--missions N] [--agent NAME ...] [--scenario NAME ...]
 
-    python benchmarks/decisions.py --policy generalist --scenario five_clusters farm
+Each line is one of them in one scenario, one mission at a time, as in the policy node: the first decision,
+which prepares tables, and the median, the 99th percentile and the maximum of the others.
 """
 
 import argparse
@@ -10,47 +11,43 @@ import time
 
 import numpy as np
 
-from uav_dc_ros import load_policy, load_scenario
-from uav_dc_ros.core import world
-from uav_dc_ros.core.world import initial, step
+from uav_dc_ros import scenarios
+from uav_dc_ros.agents import agent
+from uav_dc_ros.core.world import Act, State, rollout_steps
+from uav_dc_ros.planners import PLANNERS
+
+
+def timed(act: Act, times_s: list[float]) -> Act:
+    """The actions of `act`; adds the CPU time of each decision to `times_s`."""
+
+    def measured(state: State) -> np.ndarray:
+        begun_s = time.process_time()
+        action = act(state)
+        times_s.append(time.process_time() - begun_s)
+        return action
+
+    return measured
 
 
 def main() -> None:
-    """Print the median and the 99th percentile in each scenario."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--policy", default="generalist", metavar="NAME|DIR")
-    parser.add_argument("--scenario", nargs="+", default=["five_clusters", "town", "farm"])
-    parser.add_argument("--missions", type=int, default=40)
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--missions", type=int, default=3)
+    parser.add_argument("--agent", nargs="+", default=list(PLANNERS), metavar="NAME|DIR")
+    parser.add_argument("--scenario", nargs="+", default=scenarios.names())
     options = parser.parse_args()
-    policy = load_policy(options.policy)
+    print(f"{'':22} {'':22} {'first':>7} {'median':>7} {'99%':>7} {'maximum':>7}")
     for name in options.scenario:
-        scenario = load_scenario(name)
-        policy.check(scenario)
-        started = time.perf_counter()
-        times_s = []
-        for seed in range(options.missions):
-            rng = np.random.default_rng(seed)
-            state, over = initial(scenario, rng.random(scenario.draws_shape)), False
-            while not over:
-                before = time.thread_time()
-                observation = policy.observe(
-                    scenario,
-                    cell=state.cell,
-                    step=state.step,
-                    data_bits=state.data_bits,
-                    collected=state.collected,
-                    energy_used_j=state.energy_used_j,
-                )
-                action = policy.act(observation, world.action_mask(scenario, state.cell))
-                times_s.append(time.thread_time() - before)
-                state, outcome = step(scenario, state, action, rng.random(scenario.draws_shape))
-                over = bool(outcome.terminated | outcome.truncated)
-        first_ms, rest = times_s[0] * 1e3, np.asarray(times_s[1:]) * 1e3
-        print(
-            f"{name}: first {first_ms:.1f} ms; then median {np.median(rest):.3f}, 99th percentile "
-            f"{np.quantile(rest, 0.99):.3f}, maximum {rest.max():.3f} ms over {len(rest)} decisions "
-            f"({time.perf_counter() - started:.1f} s)"
-        )
+        scenario = scenarios.load(name)
+        for one in map(agent.load, options.agent):
+            times_s: list[float] = []
+            act = timed(one.act_in(scenario), times_s)
+            for seed in range(options.missions):
+                for _ in rollout_steps(scenario, act, [seed]):
+                    pass
+            ms = 1e3 * np.asarray(times_s)
+            figures = ms[0], *np.percentile(ms[1:], [50, 99, 100])
+            print(f"{name:22} {one.name:22} " + " ".join(f"{value:7.2f}" for value in figures), flush=True)
 
 
 if __name__ == "__main__":

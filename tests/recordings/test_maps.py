@@ -102,13 +102,15 @@ def test_the_datum_of_a_bridge_s_flight_is_in_the_bag(tmp_path: Path, capsys: Ca
         data=made.pose((50.0, 0.0, 100.0), 1),
         log_time_ns=recorded[3].log_time_ns + 1,
     )
-    told = [
+    reports = [
         BagMessage("/diagnostics", topics.DIAGNOSTICS, diagnostics(name, 0, "", {"grid": grid}), at_ns, at_ns)
         for name, grid in (("bridge", "local 1,2,3 m"), ("bridge", "47.0,8.0,488.25"), ("other", "1,2,3"))
         for at_ns in [recorded[0].log_time_ns]
     ]
     about = made.about(world, vehicle="mavlink")
-    bag = made.write(tmp_path / "bag", sorted([*recorded, extra, *told], key=lambda m: m.log_time_ns), about)
+    bag = made.write(
+        tmp_path / "bag", sorted([*recorded, extra, *reports], key=lambda m: m.log_time_ns), about
+    )
     out = run(capsys, "export", bag, "--geojson", "--out", tmp_path / "m.geojson")
     assert "1 mission, 10 poses, datum 47, 8, 488.25" in out
     (line, *_) = json.loads((tmp_path / "m.geojson").read_text())["features"]

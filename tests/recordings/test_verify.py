@@ -562,7 +562,7 @@ def test_a_monitor_that_outlives_a_flight_takes_no_pose_of_it_for_the_next(ros: 
 
 
 def test_json_has_what_the_text_has(tmp_path, capsys):
-    """The status is the same; a difference, a gap and a clean check are told apart."""
+    """The status is the same; a difference, a gap and a clean check have other words."""
     bag = write(tmp_path / "bag", flight(TINY, missions=2), about(TINY))
     status, out = verify(capsys, bag, "--json")
     report = json.loads(out)

@@ -18,13 +18,14 @@ from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.env.trajectory import Trajectory
-from uav_dc_ros.errors import FROM_TRAIN, BagError, MessageError, UavDcError
+from uav_dc_ros.errors import BagError, MessageError, UavDcError
 from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
 from uav_dc_ros.recordings.export.tables import check_new
 from uav_dc_ros.recordings.recorded_step import RecordedStep, mission_name
 from uav_dc_ros.recordings.step_reader import Steps
 
+FROM_VIDEO = 'is not installed; expected it from: pip install "uav_dc_ros[video]"'
 FRAMES_MAX = 600
 LAST_S = 3.0  # for which the last frame stays
 COLOURS = 256
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     out: Path = options.out or Path(f"{options.bag.absolute().stem}.gif")
     check_new(out, ".gif", ".mp4")
     write = _write_gif if out.suffix == ".gif" else _write_mp4
-    _module("PIL.Image", "Pillow", FROM_TRAIN)
+    _module("PIL.Image", "Pillow", FROM_VIDEO)
     with BagReader(options.bag) as reader:
         namespace = step_reader.namespace(reader, options.namespace)
         scenario = step_reader.scenario(reader, namespace, options.scenario)
@@ -103,8 +104,8 @@ def _mission(
 
 def _frames(scenario: Scenario, steps: Iterable[RecordedStep], stride: int, width_px: int) -> Iterator[Any]:
     """A picture (Pillow) of every `stride`-th step, and of the last one."""
-    image_module = _module("PIL.Image", "Pillow", FROM_TRAIN)
-    render = _module("uav_dc_ros.env.render", "matplotlib", FROM_TRAIN)
+    image_module = _module("PIL.Image", "Pillow", FROM_VIDEO)
+    render = _module("uav_dc_ros.env.render", "matplotlib", FROM_VIDEO)
     trajectory = Trajectory(scenario)
     recorded = list(steps)
     for number, (state, link) in enumerate(_states(scenario, recorded)):
@@ -154,7 +155,7 @@ def _replaced(state: world.State, **values: Array) -> world.State:
 
 def _write_gif(path: Path, frames: Iterator[Any], fps: float) -> None:
     """One palette for all frames: an unchanged pixel costs nothing."""
-    image_module = _module("PIL.Image", "Pillow", FROM_TRAIN)
+    image_module = _module("PIL.Image", "Pillow", FROM_VIDEO)
     images = list(frames)
     few = [images[0], images[len(images) // 2], images[-1]]
     strip = image_module.new("RGB", (few[0].width * len(few), few[0].height))
@@ -170,8 +171,7 @@ def _write_gif(path: Path, frames: Iterator[Any], fps: float) -> None:
 
 def _write_mp4(path: Path, frames: Iterator[Any], fps: float) -> None:
     """H.264, which browsers and presentations play."""
-    help = 'is not installed; expected it from: pip install "uav_dc_ros[video]"'
-    ffmpeg = _module("imageio_ffmpeg", "imageio-ffmpeg", help)
+    ffmpeg = _module("imageio_ffmpeg", "imageio-ffmpeg", FROM_VIDEO)
     encoder: Any = None
     try:
         for image in frames:

@@ -27,7 +27,7 @@ from uav_dc_ros.experiments.train.policy_card import card, checkpoint_card
 from uav_dc_ros.experiments.train.population import Population, Run
 from uav_dc_ros.experiments.train.progress import TrainingProgress
 from uav_dc_ros.experiments.train.replay_from_bags import PrefilledReplay, prefill_replay
-from uav_dc_ros.experiments.train.start import make_folder, torch_device
+from uav_dc_ros.experiments.train.start import make_folder, option_error, torch_device
 
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.train.training import Training
@@ -114,7 +114,9 @@ def options_parser() -> cli.Parser:
     learning = parser.add_argument_group("learning")
     for name, text in _LEARNING_OPTIONS.items():
         default = getattr(Hyperparameters(), name)
-        learning.add_argument(_option(name), metavar="X", default=default, type=type(default), help=text)
+        learning.add_argument(
+            f"--{name.replace('_', '-')}", metavar="X", default=default, type=type(default), help=text
+        )
     learning.add_argument("--n-step", default=1, help="steps of a return", **count)
     title = "reward, instead of the scenario's own; kept in the policy's config"
     add = parser.add_argument_group(title, argument_default=argparse.SUPPRESS).add_argument
@@ -264,16 +266,4 @@ def _config(options: argparse.Namespace, shipped: Scenario) -> PolicyConfig:
             PolicyConfig,
         )
     except msgspec.ValidationError as error:
-        # Such as: Expected `float` <= 1.0 - at `$.hyperparameters.gamma`
-        expected, _, path = str(error).replace("`", "").replace("Expected", "expected").partition(" - at $.")
-        key = path.split(".")[-1].split("[")[0]
-        if key == "name":
-            raise TrainingError(
-                f"--out {options.out}: {options.out.name!r} is no name of a policy; expected "
-                f"{policy.NAME_IN_WORDS}"
-            ) from None
-        raise TrainingError(f"{_option(key)} is {getattr(options, key)!r}; {expected}") from None
-
-
-def _option(key: str) -> str:
-    return f"--{key.replace('_', '-')}"
+        raise option_error(error, options) from None

@@ -1,14 +1,30 @@
-"""What every training begins with: torch on a device, and the folder of its checkpoints."""
+"""What every training begins with: its options, torch on a device, and the folder of its checkpoints."""
 
+import argparse
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from uav_dc_ros.agents import policy
 from uav_dc_ros.errors import FROM_TRAIN, TrainingError
 
 if TYPE_CHECKING:
     import torch
+
+
+def option_error(error: msgspec.ValidationError, options: argparse.Namespace) -> TrainingError:
+    """The error of a policy's config that `options` do not fit, with the option and its value."""
+    # Such as: Expected `float` <= 1.0 - at `$.hyperparameters.gamma`
+    expected, _, path = str(error).replace("`", "").replace("Expected", "expected").partition(" - at $.")
+    key = path.split(".")[-1].split("[")[0]
+    if key == "name":
+        return TrainingError(
+            f"--out {options.out}: {options.out.name!r} is no name of a policy; "
+            f"expected {policy.NAME_IN_WORDS}"
+        )
+    return TrainingError(f"--{key.replace('_', '-')} is {getattr(options, key)!r}; {expected}")
 
 
 def torch_device(name: str, n_threads: int) -> "torch.device":

@@ -16,10 +16,9 @@ from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Policy
 from uav_dc_ros.agents.set_policy import PqnSettings, SetPolicyConfig
 from uav_dc_ros.core.keys import leaves
-from uav_dc_ros.errors import TrainingError
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture
 from uav_dc_ros.experiments.train.generalist.card import card, checkpoint_card
-from uav_dc_ros.experiments.train.start import make_folder, torch_device
+from uav_dc_ros.experiments.train.start import make_folder, option_error, torch_device
 
 if TYPE_CHECKING:
     from uav_dc_ros.experiments.train.generalist.training import GeneralistTraining
@@ -182,12 +181,4 @@ def _config(options: argparse.Namespace) -> SetPolicyConfig:
             SetPolicyConfig,
         )
     except msgspec.ValidationError as error:
-        expected, _, path = str(error).replace("`", "").replace("Expected", "expected").partition(" - at $.")
-        key = path.split(".")[-1].split("[")[0]
-        if key == "name":
-            raise TrainingError(
-                f"--out {options.out}: {options.out.name!r} is no name of a policy; expected "
-                f"{policy.NAME_IN_WORDS}"
-            ) from None
-        option = f"--{key.replace('_', '-')}"
-        raise TrainingError(f"{option} is {getattr(options, key)!r}; {expected}") from None
+        raise option_error(error, options) from None
