@@ -29,7 +29,8 @@ class PqnSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     # Share of the missions that the planner `fixed_tour` flies at the start, as demonstrations
     demonstrations: Probability = 1.0
     shown: Annotated[float, Meta(gt=0, le=1)] = 0.6  # share of the iterations in which that share falls to 0
-    epsilon: Probability = 0.93  # probability of the greedy action, or the planner's
+    epsilon: Probability = 0.93  # probability of the greedy action, or the planner's, at the start
+    epsilon_end: Probability = 0.98  # and at the end
 
 
 class SetPolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

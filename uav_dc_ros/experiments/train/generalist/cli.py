@@ -35,7 +35,8 @@ _OPTIONS = {
     "trace": "lambda of the returns",
     "demonstrations": "share of the missions that the planner `fixed_tour` flies at the start",
     "shown": "share of the iterations in which that share falls to 0",
-    "epsilon": "probability of the greedy action, or the planner's",
+    "epsilon": "probability of the greedy action, or the planner's, at the start",
+    "epsilon_end": "that probability at the end",
 }
 
 

@@ -65,15 +65,17 @@ class GeneralistTraining:
         # Most weights are near those that users want.
         weights = 1.0 - rng.random((settings.layouts, settings.missions)) ** 2
         flown = LayoutMissions(drawn, weights, rng)
-        tours = [planners.PLANNERS[DEMONSTRATOR](layout) for layout in drawn]
         n_shown = round(settings.demonstrations * max(0.0, 1.0 - done / settings.shown) * settings.missions)
+        # Planning the tours of a layout takes as long as flying its missions.
+        tours = [planners.PLANNERS[DEMONSTRATOR](layout) for layout in drawn] if n_shown else []
+        epsilon = settings.epsilon + done * (settings.epsilon_end - settings.epsilon)
         shown = np.tile(np.arange(settings.missions) < n_shown, settings.layouts)
         steps: list[tuple[Array, ...]] = []
         while not flown.all_over:
             observed = flown.observe()
             mask, q_values = self._choices(*observed)
             drawn_action = (rng.random(mask.shape, np.float32) * mask).argmax(axis=-1)
-            explore = rng.random(len(mask), np.float32) >= settings.epsilon
+            explore = rng.random(len(mask), np.float32) >= epsilon
             action = np.where(explore, drawn_action, q_values.argmax(axis=-1))
             follows = np.zeros(len(mask), bool)
             if n_shown:
