@@ -4,14 +4,14 @@ import csv
 import importlib.util
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.bags.test_foreign import run
-from tests.recordings import made
+from tests.recordings import made, report_bags
 from tests.support.worlds import tiny
 from uav_dc_ros import topics
 from uav_dc_ros.bags.read import BagMessage
@@ -46,6 +46,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.write(tmp_path_factory.mktemp("flown") / "B", recorded, about)
 
 
+Samples = Iterable[tuple[int, np.ndarray]]
+
+
 def samples() -> Iterator[tuple[int, np.ndarray]]:
     """Time since the autopilot's start, microseconds, and its own place (east, north, up), at 25 Hz."""
     for n in range(25 * 40):
@@ -53,8 +56,8 @@ def samples() -> Iterator[tuple[int, np.ndarray]]:
         yield round(at_s * 1e6), place_m(at_s + OFFSET_S - 0.001) - ORIGIN_M  # the bag begins with a receipt
 
 
-def ardupilot(path: Path) -> Path:
-    """A dataflash log: formats, then messages."""
+def ardupilot(path: Path, flown: Samples | None = None) -> Path:
+    """A dataflash log of `flown`, by default `samples()`: formats, then messages."""
     kinds = {
         "XKF1": ("QBfff", "TimeUS,C,PN,PE,PD"),
         "BAT": ("QBff", "TimeUS,Inst,Volt,Curr"),
@@ -85,7 +88,7 @@ def ardupilot(path: Path) -> Path:
     starts_utc_s = made.BEGUN_NS / 1e9 + OFFSET_S - CLOCK_AHEAD_S
     for at_s, number, _ in MODES[:1]:
         message("MODE", round((at_s + 1) * 1e6), number, number, 1)
-    for n, (at_us, own_m) in enumerate(samples()):
+    for n, (at_us, own_m) in enumerate(flown or samples()):
         east, north, up = own_m
         message("XKF1", at_us, 0, north, east, -up)
         message("XKF1", at_us, 1, 0.0, 0.0, 0.0)  # the second estimator
@@ -180,6 +183,29 @@ def test_logs_of_other_flights_and_no_logs(bag: Path, tmp_path: Path, capsys: Ca
         ("log.txt", "expected a log of ArduPilot (.bin) or PX4 (.ulg)"),
     ):
         assert expected in run(capsys, "log", bag, tmp_path / name, status=2)
+
+
+def test_a_report_shows_the_log(bag: Path, tmp_path: Path, capsys: Capture) -> None:
+    log, out = ardupilot(tmp_path / "flight.bin"), tmp_path / "page.html"
+    run(capsys, "report", bag, "--log", log, "--out", out)
+    shown = report_bags.unpacked(out)["data"]["log"]
+    assert shown["offset_s"] == pytest.approx(OFFSET_S, abs=0.01)
+    assert shown["ahead_of_gps_s"] == pytest.approx(CLOCK_AHEAD_S, abs=0.02)
+    assert [event["text"] for event in shown["events"]][-2:] == ["error: subsystem 12, code 1", "mode LAND"]
+    assert len(shown["s"]) == len(shown["deviation_m"]) == len(shown["battery_v"]) == 1000
+    assert max(filter(None, shown["deviation_m"])) < 0.6
+    assert shown["s"][0] == pytest.approx(OFFSET_S + 2.0, abs=0.02)
+    run(capsys, "report", bag, "--log", log, "--log-offset", 3, "--out", out)
+    assert report_bags.unpacked(out)["data"]["log"]["offset_s"] == 3.0
+
+
+def test_a_log_of_no_page(bag: Path, tmp_path: Path, capsys: Capture) -> None:
+    log = ardupilot(tmp_path / "flight.bin")
+    alone = run(capsys, "report", bag, "--log-offset", 3, status=2)
+    assert "--log-offset applies to --log only" in alone
+    assert "expected no --compare" in run(capsys, "report", bag, "--log", log, "--compare", status=2)
+    other = made.write(tmp_path / "other", made.flight(tiny()), made.about(tiny()))
+    assert "or --log-offset S" in run(capsys, "report", other, "--log", log, status=2)
 
 
 def test_a_path_that_stands_still_has_no_time() -> None:

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from tests.recordings import report_bags
+from tests.recordings.test_flight_log import ardupilot
 from tests.recordings.test_report import HOSTILE, report
 from tests.support import flights
 from tests.support.worlds import tiny
@@ -276,8 +278,18 @@ def test_the_flight_of_a_real_vehicle(browser, tmp_path):
     bag = flights.write(tmp_path / "bag", recorded, flights.flown_about(scenario))
     assert report(bag, "--out", tmp_path / "page.html") == 0
     timeline = report_bags.unpacked(tmp_path / "page.html")["mission-0"]["timeline"]
+    columns = (timeline["path"][axis] for axis in "sxyz")
+    log = ardupilot(
+        tmp_path / "f.bin", [(round(s * 1e6), np.array(at)) for s, *at in zip(*columns, strict=True)]
+    )
+    assert report(bag, "--out", tmp_path / "page.html", "--log", log) == 0
     opened = Opened(browser, tmp_path / "page.html", DESKTOP)
     page = opened.page
+    deviation_m = page.evaluate("() => document.getElementById('log-deviation').data[0].y")
+    assert 0 < max(filter(None, deviation_m)) < 0.2, "the page's path is thinned"
+    assert page.evaluate("() => document.getElementById('log-battery').data.length") == 2
+    events = page.get_by_role("region", name="Events of the log").locator("tbody tr")
+    assert "GUIDED" in events.first.inner_text()
     assert page.locator("#why").inner_text() == f"aborted: {HOSTILE}"
     rows = page.get_by_role("region", name="Phases").locator("tbody tr")
     assert rows.count() == len(timeline["phases"]) == len(statuses)

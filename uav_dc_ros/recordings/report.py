@@ -11,7 +11,9 @@ from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.errors import BagError, ParameterError
 from uav_dc_ros.messages import printable
 from uav_dc_ros.recordings import step_reader
+from uav_dc_ros.recordings.flight_log import aligned
 from uav_dc_ros.recordings.pages import compare
+from uav_dc_ros.recordings.pages.flight_log import log_data
 from uav_dc_ros.recordings.pages.health import Health
 from uav_dc_ros.recordings.pages.missions import read_missions
 from uav_dc_ros.recordings.pages.page import Page, world_data
@@ -22,6 +24,7 @@ SUMMARIES_MAX = 2_000  # rows in the list of missions
 SYSTEM_ROOM = 150_000  # bytes kept for latencies, nodes and faults
 GENERATOR = b'<meta name="generator" content="uav_dc_ros report">'
 HEAD_SIZE = 1_000  # bytes of a page that contain the generator
+LOG_OFFSET = "--log-offset"
 ABOUT = ("pace", "objective_weight", "policy_sha256")  # of a bag, that the page shows
 
 
@@ -35,6 +38,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--mission", type=cli.whole_number(0), nargs="+", metavar="N", help=missions)
     bags = "bags to compare with the first one; without any, the missions of the first one side by side"
     add("--compare", type=Path, nargs="*", metavar="BAG", help=bags)
+    what = f"the autopilot's own log of the flight, aligned as by the verb `log`: {aligned.LOG_HELP}"
+    add("--log", type=Path, metavar="LOG", help=what)
+    aligned.add_offset(parser, LOG_OFFSET)
     add("--scenario", metavar="NAME|FILE", help="the world, for a bag without one")
     add("--namespace", metavar="NAME", help="of the missions, for a bag with several")
 
@@ -42,6 +48,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the page and print its content; the exit status."""
     out: Path = options.out or Path(f"{options.bag.absolute().stem}.html")
+    if options.log is not None and options.compare is not None:
+        raise ParameterError("--log applies to the page of one bag; expected no --compare beside it")
+    if options.log_offset is not None and options.log is None:
+        raise ParameterError(f"{LOG_OFFSET} applies to --log only")
     _check_out(out)
     if options.compare is None:
         page, summary = _report(options)
@@ -67,6 +77,9 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
         vehicle = step_reader.vehicle(reader, name)
         real = vehicle != SIMULATED
         path = read_path(reader, name, scenario) if real else None
+        log = None
+        if options.log is not None:
+            log = log_data(aligned.load(reader, name, options.log, options.log_offset, LOG_OFFSET))
         summaries: list[dict[str, Any]] = []
         shown: list[int] = []
         total = 0
@@ -91,9 +104,7 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
             "bag": bag,
             "recorded": start.strftime("%Y-%m-%d %H:%M UTC"),
             "policy": reader.about.get("policy", "unknown"),
-            "about": {
-                k: reader.about[k] for k in ("pace", "objective_weight", "policy_sha256") if k in reader.about
-            },
+            "about": {key: reader.about[key] for key in ABOUT if key in reader.about},
             **({"vehicle": vehicle} if real else {}),
             "version": __version__,
             "world": world_data(scenario),
@@ -101,6 +112,7 @@ def _report(options: argparse.Namespace) -> tuple[Page, str]:
             "missions_total": total,
             "shown": shown,
             "health": health.data(),
+            "log": log,
         }
     if not shown or not page.add("data", overview):
         raise BagError(f"bag {options.bag}: its report does not fit into 3 MB; expected --mission N")

@@ -52,6 +52,7 @@ open(async (page, data) => {
         card("Data of each user over the steps", make("div", { class: "chart tall", id: "data" })),
         make("div", { class: "card", id: "users" }))),
     make("div", { id: "vehicle" }),
+    data.log ? flightLog(data.log) : "",
     system(data.health),
     missionList(),
     make("footer", {}, footer()));
@@ -283,7 +284,7 @@ open(async (page, data) => {
     go(steps().length - 1);
   }
 
-  function draw() { drawScene(); drawCharts(); drawSystem(data.health); if (state.mission.timeline) drawVehicle(state.mission.timeline); if (steps().length) go(state.at); }
+  function draw() { drawScene(); drawCharts(); drawSystem(data.health); if (state.mission.timeline) drawVehicle(state.mission.timeline); if (data.log) drawFlightLog(data.log); if (steps().length) go(state.at); }
 
   function userTable() {
     const columns = state.mission.table;

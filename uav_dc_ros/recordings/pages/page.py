@@ -27,7 +27,9 @@ class Page:
     """A page with a title; `kind`, `mission` or `compare`, names the script that draws it."""
 
     def __init__(self, kind: str, title: str) -> None:
-        scripts = ("common", "system", "vehicle", kind) if kind == "mission" else ("common", kind)
+        scripts = (
+            ("common", "system", "vehicle", "flight_log", kind) if kind == "mission" else ("common", kind)
+        )
         self._parts = {
             "title": html.escape(title),
             "style": _text("style.css"),
