@@ -53,8 +53,9 @@ def test_lambda_returns_are_those_of_the_definition():
     reward, best = rng.random((2, 6, 3))
     over = np.zeros((6, 3), bool)
     over[3:, 0] = over[5:] = True
-    for trace in (0.0, 0.7, 1.0):
-        found = lambda_returns(reward, over, best, trace)
+    for trace, discount in ((0.0, 0.9), (0.7, 1.0), (0.7, 0.9), (1.0, 0.9)):
+        found = lambda_returns(reward, over, best, trace, discount)
+        worth = discount ** np.arange(7)
         for mission, t in itertools.product(range(3), range(6)):
             last = int(over[:, mission].argmax())
             if t > last:
@@ -63,7 +64,8 @@ def test_lambda_returns_are_those_of_the_definition():
             expected, left = 0.0, 1.0
             for n in range(1, last - t + 2):
                 whole = t + n > last
-                value = reward[t : t + n, mission].sum() + (0.0 if whole else best[t + n, mission])
+                value = worth[:n] @ reward[t : t + n, mission]
+                value += 0.0 if whole else worth[n] * best[t + n, mission]
                 share = left if whole else left * (1.0 - trace)
                 expected, left = expected + share * value, left - share
             assert found[t, mission] == pytest.approx(expected)

@@ -26,11 +26,14 @@ class PqnSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     batch_size: Count = 512  # decisions in a mini-batch
     learning_rate: Annotated[float, Meta(gt=0, le=1)] = 7e-4  # of Adam; it falls to a fiftieth
     trace: Probability = 0.95  # lambda of the returns
+    # Of a step. J alone makes a step that is lost cost (1 - w) / T_cons, which is less than what a network
+    # resolves: with a discount of 1 it hovers between two cells until time presses.
+    discount: Probability = 0.99
     # Share of the missions that the planner `fixed_tour` flies at the start, as demonstrations
     demonstrations: Probability = 1.0
     shown: Annotated[float, Meta(gt=0, le=1)] = 0.6  # share of the iterations in which that share falls to 0
     epsilon: Probability = 0.93  # probability of the greedy action, or the planner's, at the start
-    epsilon_end: Probability = 0.98  # and at the end
+    epsilon_end: Probability = 0.99  # and at the end
 
 
 class SetPolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -68,7 +68,8 @@ weight w of the objective J is an input: it is chosen when the policy flies.
   {others}
 - {values.layouts} layouts of {values.missions} missions an iteration, {values.epochs} pass(es), batches of
   {values.batch_size}, learning rate {values.learning_rate:g} falling to a fiftieth, lambda {values.trace:g},
-  epsilon {values.epsilon:g} to {values.epsilon_end:g} (probability of the greedy action)
+  discount {values.discount:g}, probability of the greedy action (epsilon) {values.epsilon:g} to
+  {values.epsilon_end:g}
 
 ## How it does
 

@@ -33,6 +33,7 @@ _OPTIONS = {
     "batch_size": "decisions in a mini-batch",
     "learning_rate": "of Adam at the start; it falls to a fiftieth",
     "trace": "lambda of the returns",
+    "discount": "of a step",
     "demonstrations": "share of the missions that the planner `fixed_tour` flies at the start",
     "shown": "share of the iterations in which that share falls to 0",
     "epsilon": "probability of the greedy action, or the planner's, at the start",

@@ -20,7 +20,7 @@ SELECTION_SEEDS = range(1_000_000, 2_000_000)
 SELECTION_LAYOUTS, SELECTION_MISSIONS = 64, 8  # the first of these seeds, and missions of each
 TRIES = 100  # drafts of a layout
 
-_SINGLES, _ZONES, _BATTERY, _ON_ARRIVAL = 0.1, 0.08, 0.06, 0.15  # shares of the layouts
+_SINGLES, _ZONES, _BATTERY, _ON_ARRIVAL = 0.2, 0.08, 0.06, 0.15  # shares of the layouts
 _APART = 0.6  # share of those with clusters in which discs do not touch, where there is room
 _HOVERS_MAX = 8  # steps over a cluster that the budget counts at most
 
@@ -107,8 +107,10 @@ def _draft(rng: np.random.Generator, seed: int) -> Scenario:
     tour = float((ways[tables.first] + tables.tours[-1]).min())
     home = float(tables.of_cell[start_row, draft.n_clusters])
     hovers = np.minimum(np.ceil(values["mission"]["r_min_bits"] / np.maximum(tables.best, 1e-9)), _HOVERS_MAX)
-    # Single users around one cell are collected together.
-    n_hovers = float(hovers.sum()) if not users.get("user") else 1.5 * len(tables.first)
+    n_hovers = float(hovers.sum())
+    if users.get("user"):  # those around one cell are collected together, or one after another
+        together = 1.5 * len(tables.first)
+        n_hovers = scaled(together, max(together, n_hovers))
     max_steps = max(math.ceil(factor * (tour + n_hovers)), math.ceil(home), 4)
     values["mission"]["max_steps"] = min(max_steps, 160)
     if battery is not None:
@@ -122,7 +124,7 @@ def _users(rng: np.random.Generator, size_m: tuple[float, float], cell_m: float)
     """A table `users` without speed: clusters, or single users."""
     wide_m, high_m = size_m
     if rng.random() < _SINGLES:
-        n = int(rng.integers(6, 25))
+        n = int(rng.integers(6, 41))
         places = rng.uniform(0.0, 1.0, (n, 2)) * (wide_m, high_m)
         return {"user": [{"x_m": round(x_m, 1), "y_m": round(y_m, 1)} for x_m, y_m in places.tolist()]}
     n, radius_m = int(rng.integers(1, 9)), round(float(rng.uniform(0.1, 1.5)) * cell_m, 1)

@@ -2,7 +2,7 @@
 
 Gallici et al., "Simplifying Deep Temporal Difference Learning", ICLR 2025. Missions are flown to their end,
 and the network is fitted to their lambda-returns. Deviation: a batch holds whole missions, so no return is
-cut off, and the discount is 1: the return is the objective itself.
+cut off.
 
 Demonstrated actions have a margin over the others (Hester et al., "Deep Q-learning from Demonstrations", AAAI
 2018), so that the policy begins with what the planner does.
@@ -97,8 +97,8 @@ class PqnLearner:
         self._optimiser.load_state_dict(self._optimiser.state_dict() | {"state": moments})
 
 
-def lambda_returns(reward: Array, over: Array, best_q: Array, trace: float) -> Array:
-    """Targets of missions, `[T, B]`: G_t = r_t + (1 - trace) max_a Q(s_{t+1}, a) + trace G_{t+1}.
+def lambda_returns(reward: Array, over: Array, best_q: Array, trace: float, discount: float) -> Array:
+    """Targets of missions, `[T, B]`: G_t = r_t + discount ((1 - trace) max_a Q(s_{t+1}, a) + trace G_{t+1}).
 
     Behind the step with which a mission is `over`, bool `[T, B]`, nothing counts. `best_q` `[T, B]` is max_a
     Q(s_t, a) over the actions that are allowed.
@@ -107,7 +107,7 @@ def lambda_returns(reward: Array, over: Array, best_q: Array, trace: float) -> A
     for t in reversed(range(len(reward))):
         if t + 1 < len(reward):
             after = (1.0 - trace) * best_q[t + 1] + trace * targets[t + 1]
-        targets[t] = reward[t] + np.where(over[t], 0.0, after)
+        targets[t] = reward[t] + np.where(over[t], 0.0, discount * after)
     return targets
 
 

@@ -87,7 +87,7 @@ class GeneralistTraining:
             follows &= weights.reshape(-1) >= PREFERRED_FROM
             steps.append((*observed, action, follows, q_values.max(axis=-1), *stepped))
         observation, flying, action, shows, best, reward, over = map(np.stack, zip(*steps, strict=True))
-        target = lambda_returns(_REWARD_SCALE * reward, over, best, settings.trace)
+        target = lambda_returns(_REWARD_SCALE * reward, over, best, settings.trace, settings.discount)
         batch = Batch(*(values[flying] for values in (observation, action, target, shows)))
         rate = settings.learning_rate * max(1.0 - done, 0.02)
         losses = [
