@@ -45,7 +45,8 @@ def refused(ros: Ros, *arguments: object) -> str:
         (("--seed", "\u0663"), "argument --seed: '\u0663'; expected a whole number"),
         (("--missions", "0"), "argument --missions: '0'; expected a whole number of at least 1"),
         (("--system", "256"), "argument --system: '256'; expected a MAVLink system number from 1 to 255"),
-        (("--system", "7"), "--system: expected --vehicle mavlink, mavros, px4 with it"),
+        (("--system", "7"), "--system: expected --vehicle mavlink with it"),
+        (("--datum", "here"), "--datum: expected --vehicle mavlink, mavros, px4 with it"),
         (("--pace", "0"), "argument --pace: '0'; expected 'lockstep' or a number above 0"),
         (("--pace", "1e6"), "pace: 1e+06; expected at most 3560, which makes steps of 5 ms, or 'lockstep'"),
         (

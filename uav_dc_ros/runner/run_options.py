@@ -18,7 +18,14 @@ from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED, VEHICLES
 
-VEHICLE_OPTIONS = ("connect", "system", "arm", "datum", "upload_fence")
+# Options of a vehicle, and the vehicles that have them.
+VEHICLE_OPTIONS = {
+    "connect": ("mavlink",),
+    "system": ("mavlink",),
+    "arm": VEHICLES,
+    "datum": VEHICLES,
+    "upload_fence": ("mavlink",),
+}
 _SHARED = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", *VEHICLE_OPTIONS)
 # Parameters that are options of run_all, and their options.
 OPTIONS = {name: name.replace("_", "-") for name in _SHARED} | {"objective_weight": "objective"}
@@ -103,11 +110,11 @@ def weight(config: RunConfig, agent: Agent) -> float:
 def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> None:
     """Raise UavDcError for contradicting options of a vehicle, or a connection that this machine lacks."""
     simulated = config.vehicle == SIMULATED
-    for name in VEHICLE_OPTIONS:
+    for name, vehicles_with_it in VEHICLE_OPTIONS.items():
         value = getattr(config, name)
         option = f"--{name.replace('_', '-')}"
         if value and simulated:
-            raise ParameterError(f"{option}: expected --vehicle {', '.join(VEHICLES)} with it")
+            raise ParameterError(f"{option}: expected --vehicle {', '.join(vehicles_with_it)} with it")
         if value and "bridge" not in nodes:
             raise ParameterError(f"{option}: expected the node 'bridge' among --nodes")
     if simulated:
