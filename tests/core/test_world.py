@@ -345,8 +345,7 @@ def reward_settings(array, dtype, shape=(-1,)):
     )
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("batch", [(4,), (4, 3)], ids=str)
+@pytest.mark.parametrize(("batch", "dtype"), [((4,), np.float64), ((4, 3), np.float32)], ids=str)
 def test_worlds_that_are_paid_in_different_ways_are_each_paid_as_alone(three, changed, array, batch, dtype):
     """Nothing but the pay differs; each is what a scenario with that reward gives, to the last bit."""
     draws, actions = flight(three, batch, seed=6)
