@@ -29,9 +29,12 @@ class PqnSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     # Of a step. J alone makes a step that is lost cost (1 - w) / T_cons, which is less than what a network
     # resolves: with a discount of 1 it hovers between two cells until time presses.
     discount: Probability = 0.99
-    # Share of the missions that the planner `fixed_tour` flies at the start, as demonstrations
+    # alpha of advantage learning: it makes the differences between actions 1 / (1 - alpha) times as large
+    advantage: Annotated[float, Meta(ge=0, lt=1)] = 0.8
+    # Share of the layouts that the planner `fixed_tour` flies as demonstrations, at the start and later
     demonstrations: Probability = 1.0
-    shown: Annotated[float, Meta(gt=0, le=1)] = 0.6  # share of the iterations in which that share falls to 0
+    demonstrations_end: Probability = 0.25
+    shown: Annotated[float, Meta(gt=0, le=1)] = 0.1  # share of the iterations in which it falls to that
     epsilon: Probability = 0.93  # probability of the greedy action, or the planner's, at the start
     epsilon_end: Probability = 0.99  # and at the end
 

@@ -34,8 +34,10 @@ _OPTIONS = {
     "learning_rate": "of Adam at the start; it falls to a fiftieth",
     "trace": "lambda of the returns",
     "discount": "of a step",
-    "demonstrations": "share of the missions that the planner `fixed_tour` flies at the start",
-    "shown": "share of the iterations in which that share falls to 0",
+    "advantage": "alpha of advantage learning",
+    "demonstrations": "share of the layouts that the planner `fixed_tour` flies at the start",
+    "demonstrations_end": "that share later",
+    "shown": "share of the iterations in which it falls to that",
     "epsilon": "probability of the greedy action, or the planner's, at the start",
     "epsilon_end": "that probability at the end",
 }

@@ -4,6 +4,10 @@ Gallici et al., "Simplifying Deep Temporal Difference Learning", ICLR 2025. Miss
 and the network is fitted to their lambda-returns. Deviation: a batch holds whole missions, so no return is
 cut off.
 
+Targets of actions that the network does not prefer are lowered by a share of what it holds against them
+(advantage learning: Bellemare et al., "Increasing the Action Gap", AAAI 2016). The best actions stay the
+same, and errors of the network decide less.
+
 Demonstrated actions have a margin over the others (Hester et al., "Deep Q-learning from Demonstrations", AAAI
 2018), so that the policy begins with what the planner does.
 """
@@ -30,7 +34,7 @@ class Batch(NamedTuple):
 
     observation: Array  # float32 `[R, D]`
     action: Array  # integers `[R]`
-    target: Array  # lambda-return, float32 `[R]`
+    target: Array  # float32 `[R]`
     demonstrated: Array  # the action is a planner's, which is to be preferred, bool `[R]`
 
 

@@ -65,11 +65,13 @@ class GeneralistTraining:
         # Most weights are near those that users want.
         weights = 1.0 - rng.random((settings.layouts, settings.missions)) ** 2
         flown = LayoutMissions(drawn, weights, rng)
-        n_shown = round(settings.demonstrations * max(0.0, 1.0 - done / settings.shown) * settings.missions)
+        last, first_share = settings.demonstrations_end, settings.demonstrations
+        share = last + (first_share - last) * max(0.0, 1.0 - done / settings.shown)
         # Planning the tours of a layout takes as long as flying its missions.
-        tours = [planners.PLANNERS[DEMONSTRATOR](layout) for layout in drawn] if n_shown else []
+        n_toured = round(share * settings.layouts)
+        tours = [planners.PLANNERS[DEMONSTRATOR](layout) for layout in drawn[:n_toured]]
+        n_shown = n_toured * settings.missions
         epsilon = settings.epsilon + done * (settings.epsilon_end - settings.epsilon)
-        shown = np.tile(np.arange(settings.missions) < n_shown, settings.layouts)
         steps: list[tuple[Array, ...]] = []
         while not flown.all_over:
             observed = flown.observe()
@@ -78,16 +80,20 @@ class GeneralistTraining:
             explore = rng.random(len(mask), np.float32) >= epsilon
             action = np.where(explore, drawn_action, q_values.argmax(axis=-1))
             follows = np.zeros(len(mask), bool)
-            if n_shown:
-                toured = np.concatenate([act(one) for act, one in zip(tours, flown.states, strict=True)])
-                lands = np.take_along_axis(mask, toured[:, None], axis=-1)[:, 0]
-                follows = shown & ~explore & lands
-                action = np.where(follows, toured, action)
+            if n_toured:
+                states = flown.states[:n_toured]
+                toured = np.concatenate([act(one) for act, one in zip(tours, states, strict=True)])
+                lands = np.take_along_axis(mask[:n_shown], toured[:, None], axis=-1)[:, 0]
+                follows[:n_shown] = ~explore[:n_shown] & lands
+                action[:n_shown] = np.where(follows[:n_shown], toured, action[:n_shown])
+            best = q_values.max(axis=-1)
+            gap = best - np.take_along_axis(q_values, action[:, None], axis=-1)[:, 0]
             stepped = flown.step(action)
             follows &= weights.reshape(-1) >= PREFERRED_FROM
-            steps.append((*observed, action, follows, q_values.max(axis=-1), *stepped))
-        observation, flying, action, shows, best, reward, over = map(np.stack, zip(*steps, strict=True))
-        target = lambda_returns(_REWARD_SCALE * reward, over, best, settings.trace, settings.discount)
+            steps.append((*observed, action, follows, best, gap, *stepped))
+        observation, flying, action, shows, best, gap, reward, over = map(np.stack, zip(*steps, strict=True))
+        returns = lambda_returns(_REWARD_SCALE * reward, over, best, settings.trace, settings.discount)
+        target = returns - np.float32(settings.advantage) * gap
         batch = Batch(*(values[flying] for values in (observation, action, target, shows)))
         rate = settings.learning_rate * max(1.0 - done, 0.02)
         losses = [
