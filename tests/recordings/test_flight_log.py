@@ -178,7 +178,7 @@ def test_logs_of_other_flights_and_no_logs(bag: Path, tmp_path: Path, capsys: Ca
     (tmp_path / "empty.bin").write_bytes(b"")
     for name, expected in (
         ("junk.ulg", "is damaged, or no log"),
-        ("empty.bin", "empty.bin"),
+        ("empty.bin", "empty.bin is empty; expected a log of"),
         ("none.bin", "cannot be read: No such file"),
         ("log.txt", "expected a log of ArduPilot (.bin) or PX4 (.ulg)"),
     ):

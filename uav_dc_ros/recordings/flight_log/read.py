@@ -70,7 +70,9 @@ def read(path: Path) -> FlightLog:
     if reader is None:
         raise ParameterError(f"{path}: expected a log of ArduPilot (.bin) or PX4 (.ulg)")
     try:
-        path.open("rb").close()
+        with path.open("rb") as file:
+            if not file.read(1):
+                raise BagError(f"{path} is empty; expected a log of ArduPilot (.bin) or PX4 (.ulg)")
         log = reader(path)
     except OSError as error:
         raise BagError(f"{path} cannot be read: {error.strerror or error}") from None
@@ -95,26 +97,26 @@ def _module(name: str) -> Any:
 def _ardupilot(path: Path) -> FlightLog:
     log = FlightLog(autopilot="ArduPilot")
     names: dict[int, str] = _module("pymavlink.mavutil").mode_mapping_acm
-    reader = _module("pymavlink.DFReader").DFReader_binary(str(path))
     wanted = ["XKF1", "BAT", "GPS", "MODE", "MSG", "ERR"]
-    for message in iter(lambda: reader.recv_match(type=wanted), None):
-        at_s = message.TimeUS / 1e6
-        match message.get_type():
-            case "XKF1" if getattr(message, "C", 0) == 0:  # its first estimator
-                log.position_s.append(at_s)
-                log.position_m.append((message.PE, message.PN, -message.PD))
-            case "BAT" if getattr(message, "Inst", getattr(message, "Instance", 0)) == 0:
-                log.battery_s.append(at_s)
-                log.battery.append((message.Volt, message.Curr))
-            case "GPS" if message.Status >= FIX_3D:
-                log.utc.append((at_s, GPS_EPOCH_S + message.GWk * WEEK_S + message.GMS / 1e3 - LEAP_S))
-            case "MODE":
-                number = int(message.ModeNum)
-                log.events.append((at_s, f"mode {names.get(number, number)}"))
-            case "MSG":
-                log.events.append((at_s, one_line(message.Message)))
-            case "ERR":
-                log.events.append((at_s, f"error: subsystem {message.Subsys}, code {message.ECode}"))
+    with _module("pymavlink.DFReader").DFReader_binary(str(path)) as reader:
+        for message in iter(lambda: reader.recv_match(type=wanted), None):
+            at_s = message.TimeUS / 1e6
+            match message.get_type():
+                case "XKF1" if getattr(message, "C", 0) == 0:  # its first estimator
+                    log.position_s.append(at_s)
+                    log.position_m.append((message.PE, message.PN, -message.PD))
+                case "BAT" if getattr(message, "Inst", getattr(message, "Instance", 0)) == 0:
+                    log.battery_s.append(at_s)
+                    log.battery.append((message.Volt, message.Curr))
+                case "GPS" if message.Status >= FIX_3D:
+                    log.utc.append((at_s, GPS_EPOCH_S + message.GWk * WEEK_S + message.GMS / 1e3 - LEAP_S))
+                case "MODE":
+                    number = int(message.ModeNum)
+                    log.events.append((at_s, f"mode {names.get(number, number)}"))
+                case "MSG":
+                    log.events.append((at_s, one_line(message.Message)))
+                case "ERR":
+                    log.events.append((at_s, f"error: subsystem {message.Subsys}, code {message.ECode}"))
     return log
 
 
@@ -122,7 +124,8 @@ def _px4(path: Path) -> FlightLog:
     log = FlightLog(autopilot="PX4")
     gps = ("sensor_gps", "vehicle_gps_position")  # newer and older versions
     wanted = ["vehicle_local_position", "battery_status", "vehicle_status", *gps]
-    ulog = _module("pyulog").ULog(str(path), wanted)
+    with path.open("rb") as file:
+        ulog = _module("pyulog").ULog(file, wanted)
 
     def rows(topic: str, *columns: str) -> Iterator[tuple[float, ...]]:
         for data in ulog.data_list:
