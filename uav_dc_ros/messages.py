@@ -213,6 +213,13 @@ class Move(Stepped, frozen=True, kw_only=True):
         ActionLabel,
         Meta(description="left is -x (west), right +x (east), forward +y (north), backward -y (south)"),
     ]
+    search_timed_out: Annotated[
+        bool | UnsetType,
+        Meta(
+            description="true: the search of this step ran out of time, and the action is the policy's own; "
+            "absent otherwise"
+        ),
+    ] = UNSET
 
 
 class Ready(RunPayload, frozen=True, kw_only=True):

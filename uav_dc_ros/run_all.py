@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NoReturn
 from uav_dc_ros import __version__, cli
 from uav_dc_ros.core import pace as paces
 from uav_dc_ros.errors import NodeError, ParameterError
-from uav_dc_ros.run_config import PORT_MAX, RunConfig
+from uav_dc_ros.run_config import PORT_MAX, SEARCH_MAX, SEARCH_TIME_S, RunConfig
 from uav_dc_ros.topics import SIMULATED, SYSTEM_MAX, VEHICLES
 
 if TYPE_CHECKING:  # the command line is parsed before slow imports
@@ -43,6 +43,15 @@ def parser(prog: str = PROG) -> cli.Parser:
     weight = cli.number(0.0, 1.0, "a weight between 0 (time only) and 1 (users only)")
     objective = "weight w of the users in the objective, for what depends on it, 0 to 1 (default: 10/11)"
     add("--objective", type=weight, metavar="W", help=objective)
+    search = f"missions that a policy flies in a model before each move, 0 to {SEARCH_MAX} (default: 0)"
+    number = cli.whole_number(0, SEARCH_MAX, f"a whole number from 0 to {SEARCH_MAX}")
+    add("--search", type=number, default=0, metavar="N", help=search)
+    limit = (
+        "time of a search, after which the policy's own move is taken (default: half of a step's time); not "
+        "in lockstep, which waits"
+    )
+    seconds = cli.number(*SEARCH_TIME_S, "a number of seconds from {:g} to {:g}".format(*SEARCH_TIME_S))
+    add("--search-time-limit", type=seconds, metavar="SECONDS", help=limit)
     seed = "seed of the users (default: %(default)s)"
     add("--seed", type=cli.whole_number(0), default=0, metavar="N", help=seed)
     missions = "missions, with seeds N, N+1, ... (default: %(default)s)"

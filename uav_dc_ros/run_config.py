@@ -13,14 +13,17 @@ from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.topics import SIMULATED, SYSTEM_MAX, VEHICLES
 
 PORT_MAX = 65535
+SEARCH_MAX = 1024  # missions of a search
+SEARCH_TIME_S = (0.001, 3600.0)  # range of its time limit
 RANGES = {  # of whole numbers
     "seed": (0, 2**62 - 1),  # sums of it fit into 64 bits
     "missions": (1, 2**62 - 1),
     "system": (1, SYSTEM_MAX),
     "live": (0, PORT_MAX),
     "view": (0, PORT_MAX),
+    "search": (0, SEARCH_MAX),
 }
-OPTIONAL = ("policy", "objective", "bag", "summary", "system", "live", "view", "compose")
+OPTIONAL = ("policy", "objective", "bag", "summary", "system", "live", "view", "compose", "search_time_limit")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +37,9 @@ class RunConfig:
     # Shipped policy, its folder, or a planner; None: the scenario's name with `_dueling`
     policy: str | Path | None = None
     objective: float | None = None  # weight w of the users in a planner's objective, 0 to 1; None: 10/11
+    search: int = 0  # missions that a policy flies in a model before each move; 0: it does not search
+    # Time of a search, seconds; None: half of a step's time, and no limit in lockstep
+    search_time_limit: float | None = None
     seed: int = 0  # seed of the first mission's users; each further mission takes the next one
     missions: int = 1  # number of missions
     pace: float | Literal["lockstep"] = paces.WATCHABLE  # times faster than real time, or as fast as possible
@@ -74,6 +80,11 @@ class RunConfig:
         self._check_type("objective", int | float, "a number from 0 to 1")
         if self.objective is not None and not 0.0 <= self.objective <= 1.0:
             raise ParameterError(f"objective: {self.objective!r}; expected a number from 0 to 1")
+        low_s, high_s = SEARCH_TIME_S
+        expected = f"a number of seconds from {low_s:g} to {high_s:g}"
+        self._check_type("search_time_limit", int | float, expected)
+        if self.search_time_limit is not None and not low_s <= self.search_time_limit <= high_s:
+            raise ParameterError(f"search_time_limit: {self.search_time_limit!r}; expected {expected}")
         if self.vehicle not in (SIMULATED, *VEHICLES):
             expected = ", ".join((SIMULATED, *VEHICLES))
             raise ParameterError(f"vehicle: {self.vehicle!r}; expected one of {expected}")

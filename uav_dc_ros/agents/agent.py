@@ -7,20 +7,33 @@ import numpy as np
 
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.agents.policy import Policy
+from uav_dc_ros.agents.policy_search import PolicySearch
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act, State, action_mask
-from uav_dc_ros.errors import PolicyError
+from uav_dc_ros.errors import ParameterError, PolicyError
 from uav_dc_ros.planners import PLANNERS, Planner
 
 
 @dataclass(frozen=True)
 class Agent:
-    """A policy or a planner, before it has a scenario."""
+    """A policy or a planner, before it has a scenario.
+
+    Raises:
+        ParameterError: a planner with a `search`.
+    """
 
     name: str
     source: Policy | Planner
+    search: int = 0  # missions of a policy's search before each move, see `policy_search`; 0: none
+
+    def __post_init__(self) -> None:
+        """Reject a search on top of a planner."""
+        if self.search and self.policy is None:
+            raise ParameterError(
+                f"search {self.search}: {self.name!r} is a planner; expected it with a policy only"
+            )
 
     @property
     def policy(self) -> Policy | None:
@@ -40,13 +53,15 @@ class Agent:
     @property
     def knows_positions(self) -> bool:
         """Whether it needs the users' positions, `State.users_m`."""
-        return isinstance(self.source, Planner) and self.source.knows == "positions"
+        if isinstance(self.source, Policy):
+            return self.search > 0
+        return self.source.knows == "positions"
 
     @property
     def weighs(self) -> bool:
         """Whether its moves depend on the weight of the objective."""
         if isinstance(self.source, Policy):
-            return self.source.config.observation == "entities"
+            return self.search > 0 or self.source.config.observation == "entities"
         return self.source.weighs
 
     @property
@@ -62,26 +77,29 @@ class Agent:
             ParameterError: a scenario that is too large for a planner.
         """
         if isinstance(self.source, Policy):
+            if self.search:
+                return PolicySearch(self.source, scenario, weight, self.search)
             return greedy_act(self.source, scenario, weight)
         return self.source(scenario, weight)
 
 
-def load(name_or_path: str | Path) -> Agent:
-    """The planner with a name, or the policy with a shipped name or in a folder.
+def load(name_or_path: str | Path, search: int = 0) -> Agent:
+    """The planner with a name, or the policy with a shipped name or in a folder; see `Agent.search`.
 
     Raises:
         PolicyError: neither, or both; see also `policy.load`.
+        ParameterError: a planner with a `search`.
     """
     name = str(name_or_path)
     if name not in PLANNERS:
         policy = policies.load(name_or_path)
-        return Agent(policy.name, policy)
+        return Agent(policy.name, policy, search)
     if name in policies.names() or Path(name, policies.CONFIG).exists():
         raise PolicyError(
             f"policy {name!r} is a planner, and a policy's folder has the same name; expected another name "
             f"of the folder, or a path such as ./{name}"
         )
-    return Agent(name, PLANNERS[name])
+    return Agent(name, PLANNERS[name], search)
 
 
 def greedy_act(policy: Policy, scenario: Scenario, weight: float = DEFAULT_WEIGHT) -> Act:

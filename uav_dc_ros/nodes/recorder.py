@@ -42,12 +42,14 @@ class RecorderNode(RecorderBase):
         if values["vehicle"] == SIMULATED:  # a real one has no pace
             about["pace"] = pace.text(values["pace"])
         if values["policy"]:
-            agent = agents.load(values["policy"])
+            agent = agents.load(values["policy"], values["search"])
             about["policy"] = agent.name
             if agent.sha256 is not None:
                 about["policy_sha256"] = agent.sha256
             if agent.weighs:
                 about["objective_weight"] = repr(values["objective_weight"])
+            if agent.search:
+                about["search"] = str(agent.search)
         return about
 
     def on_peers(self) -> None:

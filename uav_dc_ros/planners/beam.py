@@ -13,10 +13,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from uav_dc_ros.core import mission, world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.objective import DEFAULT_WEIGHT, objective
+from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.world import State
+from uav_dc_ros.planners.missions import ModelMissions, advance, begin, objective_of
 from uav_dc_ros.planners.model import MissionModel, Model
 from uav_dc_ros.planners.promise import Promise
 
@@ -32,24 +32,9 @@ class Plan:
     """The best mission found from a state."""
 
     actions: Array  # of the next steps, integers `[n]`; n <= H
-    objective: float  # J; 0 if the mission does not land within H steps
+    objective: float  # J; without actions 0, or the J to exceed
     users_collected: int
     arrival_step: int  # 0 if the mission does not land within H steps
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Beam:
-    """Missions at one step, `B` of them, the most promising first."""
-
-    cell: Array  # index in `MissionModel.cells`, integers `[B]`
-    data_bits: Array  # `[B, U]`
-    collected: Array  # bool `[B, U]`
-    since: Array  # step from which the UAV has been over the dock, 0 if it is not there, integers `[B]`
-    energy_used_j: Array  # `[B]`
-
-    def take(self, where: Array) -> "_Beam":
-        """The missions with these indices, or of a mask."""
-        return _Beam(**{name: getattr(self, name)[where] for name in self.__dataclass_fields__})
 
 
 def search(
@@ -59,6 +44,8 @@ def search(
     width: int = WIDTH,
     weight: float = DEFAULT_WEIGHT,
     ranking: Ranking | None = None,
+    above: float = 0.0,
+    before_step: Callable[[], None] = lambda: None,
 ) -> Plan:
     """The best mission from a state, by the objective J with the weight w.
 
@@ -68,20 +55,25 @@ def search(
         width: missions that are kept in each step.
         weight: w of J.
         ranking: what missions are compared by; default: `Promise`, for a `MissionModel`.
+        above: J that a mission must exceed.
+        before_step: called before each step; an exception in it ends the search.
 
     Returns:
-        The actions up to the arrival; the UAV hovers from then on. They are none where no mission lands.
+        The actions up to the arrival; the UAV hovers from then on. They are none where no mission lands, or
+        none has a J above `above`.
     """
     if ranking is None:
         assert isinstance(model, MissionModel), "needed by `Promise`"
         ranking = Promise(model, model.scenario.user_r_min_bits(state.data_bits), weight)
-    return _Search(model, state, width, weight, ranking).run()
+    return _Search(model, state, width, weight, ranking, above).run(before_step)
 
 
 class _Search:
     """A search, step by step."""
 
-    def __init__(self, model: Model, state: State, width: int, weight: float, ranking: Ranking) -> None:
+    def __init__(
+        self, model: Model, state: State, width: int, weight: float, ranking: Ranking, above: float
+    ) -> None:
         scenario = model.scenario
         self._model, self._scenario, self._width, self._weight = model, scenario, width, weight
         self._first_step = int(state.step)
@@ -89,21 +81,14 @@ class _Search:
         self._promise = ranking
         # Sums of random numbers: equal ones are those of equal sets of users, but for one in 2^64.
         self._numbers = np.random.default_rng(0).integers(0, 2**64, scenario.n_users, np.uint64)
-        cell = model.index(np.asarray(state.cell))[None]
-        docked = model.docked[cell] & (self._first_step > 0)
-        self._beam = _Beam(
-            cell=cell,
-            data_bits=state.data_bits[None],
-            collected=state.collected[None],
-            since=np.where(docked, self._first_step, 0),
-            energy_used_j=np.reshape(state.energy_used_j, (1,)),
-        )
+        self._beam = begin(model, state)  # the most promising first
         self._history: list[tuple[Array, Array]] = []  # of each step: mission before, and action, `[B]`
-        self._best = Plan(actions=np.zeros(0, np.int64), objective=0.0, users_collected=0, arrival_step=0)
+        self._best = Plan(actions=np.zeros(0, np.int64), objective=above, users_collected=0, arrival_step=0)
 
-    def run(self) -> Plan:
+    def run(self, before_step: Callable[[], None]) -> Plan:
         """The best plan; the search ends when no mission of the beam can become better."""
         for step in range(self._model.n_steps):
+            before_step()
             self._advance(step)
             if not len(self._beam.cell):
                 break
@@ -117,27 +102,11 @@ class _Search:
         cell = model.after[before.cell[parent], action]
         in_time = model.steps_home[cell] <= scenario.mission.max_steps - n_flown
         parent, action, cell = parent[in_time], action[in_time], cell[in_time]
-        before = before.take(parent)
-        delivered_bits = model.delivered(step, cell, before.collected)
-        data_bits, collected = mission.collect(
-            before.data_bits, before.collected, delivered_bits, self._r_min_bits
-        )
-        arrived = np.where(before.since > 0, before.since, n_flown)
-        at_m, to_m = model.cells[before.cell], model.cells[cell]
-        beam = _Beam(
-            cell=cell,
-            data_bits=data_bits,
-            collected=collected,
-            since=np.where(model.docked[cell], arrived, 0),
-            energy_used_j=world.energy_after(scenario, before.energy_used_j, at_m, to_m),
-        )
-        terminated, truncated, landed = world.end_of_mission(
-            scenario, np.full(cell.shape, n_flown), to_m, beam.energy_used_j
-        )
-        over = terminated | truncated
-        # A UAV over the dock that stays there lands.
+        beam, over, lands = advance(model, before.take(parent), cell, step, n_flown, self._r_min_bits)
+        data_bits, collected = beam.data_bits, beam.collected
         n_users = collected.sum(axis=-1)
-        value = self._objective(n_users, beam.since, landed | (model.docked[cell] & ~over))
+        # A UAV over the dock that stays there lands.
+        value = self._objective(n_users, beam.since, lands)
         if len(value) and value.max() > self._best.objective:
             best = int(value.argmax())
             self._best = Plan(
@@ -149,11 +118,11 @@ class _Search:
         soonest = np.where(beam.since > 0, beam.since, n_flown + model.steps_home[cell])
         promise, possible = self._promise(step, n_flown, cell, data_bits, collected)
         hope = self._objective(n_users + possible, soonest, ~over)
-        kept = self._most_promising(beam, promise, (hope > self._best.objective) & self._lasts_home(beam))
+        kept = self._most_promising(beam, promise, (hope > self._best.objective) & beam.lasts_home(model))
         self._history.append((parent[kept], action[kept]))
         self._beam = beam.take(kept)
 
-    def _most_promising(self, beam: _Beam, promise: Array, eligible: Array) -> Array:
+    def _most_promising(self, beam: ModelMissions, promise: Array, eligible: Array) -> Array:
         """Indices of at most `width` missions: for each cell and set of collected users the first one."""
         order = np.flatnonzero(eligible)
         order = order[np.lexsort((beam.energy_used_j[order], -promise[order]))]
@@ -162,23 +131,8 @@ class _Search:
         _, first = np.unique(keys, return_index=True)
         return order[np.sort(first)[: self._width]]
 
-    def _lasts_home(self, beam: _Beam) -> Array:
-        """Whether the battery lasts for the way home, bool `[B]`."""
-        energy = self._scenario.energy
-        if energy is None or energy.ends == "steps":
-            return np.ones(beam.cell.shape, bool)
-        way_j = self._model.steps_home[beam.cell] * self._scenario.step_energies_j.level
-        return beam.energy_used_j + way_j <= energy.battery_j
-
     def _objective(self, n_users: Array, arrival_step: Array, landed: Array) -> Array:
-        return objective(
-            n_users,
-            arrival_step,
-            landed,
-            n_users=self._scenario.n_users,
-            max_steps=self._scenario.mission.max_steps,
-            weight=self._weight,
-        )
+        return objective_of(self._scenario, n_users, arrival_step, landed, self._weight)
 
     def _actions(self, entry: int, last: int) -> Array:
         """The actions of a mission whose last one is `last`, from mission `entry` of the beam before."""

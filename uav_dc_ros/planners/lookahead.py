@@ -12,8 +12,6 @@ stop and the steps that its slowest user needs there. Of all subsets of the grou
 the time counts, in the order of the shortest way (Held and Karp, 1962).
 """
 
-from dataclasses import fields
-
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
@@ -23,6 +21,7 @@ from uav_dc_ros.core.world import Act, State
 from uav_dc_ros.planners import beam
 from uav_dc_ros.planners.beam import Ranking
 from uav_dc_ros.planners.cells import FAR, Cells, Delivery
+from uav_dc_ros.planners.missions import one_by_one
 from uav_dc_ros.planners.model import Model
 
 WIDTH = 48  # missions of the beam
@@ -61,19 +60,12 @@ def search(scenario: Scenario, weight: float, width: int = WIDTH) -> Act:
     def decide(state: State) -> int:
         ranking = estimate(model, model.look(state), state, weight)
         plan = beam.search(model, state, width=width, weight=weight, ranking=ranking)
-        return int(plan.actions[0]) if len(plan.actions) else _homewards(model, int(model.index(state.cell)))
+        return int(plan.actions[0]) if len(plan.actions) else homewards(model, int(model.index(state.cell)))
 
-    def act(state: State) -> Array:
-        shape, n = state.step.shape, state.step.size
-        each = {one.name: getattr(state, one.name) for one in fields(State)}
-        rows = {name: values.reshape((n, *values.shape[len(shape) :])) for name, values in each.items()}
-        states = (State(**{name: rows[name][i] for name in rows}) for i in range(n))
-        return np.asarray([decide(one) for one in states]).reshape(shape)
-
-    return act
+    return one_by_one(decide)
 
 
-def _homewards(cells: Cells, cell: int) -> int:
+def homewards(cells: Cells, cell: int) -> int:
     """The first action of the shortest way to the dock; over it, hover."""
     steps = np.where(cells.has_effect[cell], cells.steps_home[cells.after[cell]], FAR)
     return int(Action.HOVER if steps[Action.HOVER] == steps.min() else steps.argmin())

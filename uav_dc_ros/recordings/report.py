@@ -25,7 +25,7 @@ SYSTEM_ROOM = 150_000  # bytes kept for latencies, nodes and faults
 GENERATOR = b'<meta name="generator" content="uav_dc_ros report">'
 HEAD_SIZE = 1_000  # bytes of a page that contain the generator
 LOG_OFFSET = "--log-offset"
-ABOUT = ("pace", "objective_weight", "policy_sha256")  # of a bag, that the page shows
+ABOUT = ("pace", "objective_weight", "search", "policy_sha256")  # of a bag, that the page shows
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

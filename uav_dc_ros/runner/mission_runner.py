@@ -68,8 +68,9 @@ class MissionRunner:
     def __init__(self, config: RunConfig, *, show: bool = True) -> None:
         self.config = config
         self.scenario = scenarios.load(config.scenario)
-        self.agent = agents.load(config.policy or f"{self.scenario.name}_dueling")
+        self.agent = agents.load(config.policy or f"{self.scenario.name}_dueling", config.search)
         self.weight = run_options.weight(config, self.agent)
+        self.search_time_limit_s = run_options.search_time_limit_s(config, self.scenario)
         self.agent.act_in(self.scenario, self.weight)  # raises UavDcError where it does not fit
         self.is_simulated = config.vehicle == SIMULATED
         if self.is_simulated:
@@ -280,6 +281,8 @@ class MissionRunner:
             "scenario": scenarios.from_anywhere(config.scenario),
             "policy": self.agent.argument,
             "objective_weight": self.weight,
+            "search": config.search,
+            "search_time_limit_s": self.search_time_limit_s,
             "seed": config.seed,
             "missions": config.missions,
             "pace": pace.text(config.factor),

@@ -26,9 +26,12 @@ VEHICLE_OPTIONS = {
     "datum": VEHICLES,
     "upload_fence": ("mavlink",),
 }
-_SHARED = ("scenario", "policy", "seed", "missions", "pace", "bag", "vehicle", *VEHICLE_OPTIONS)
+_SHARED = ("scenario", "policy", "search", "seed", "missions", "pace", "bag", "vehicle", *VEHICLE_OPTIONS)
 # Parameters that are options of run_all, and their options.
-OPTIONS = {name: name.replace("_", "-") for name in _SHARED} | {"objective_weight": "objective"}
+OPTIONS = {name: name.replace("_", "-") for name in _SHARED} | {
+    "objective_weight": "objective",
+    "search_time_limit_s": "search-time-limit",
+}
 
 
 def nodes(config: RunConfig) -> list[str]:
@@ -105,6 +108,17 @@ def weight(config: RunConfig, agent: Agent) -> float:
             f"with {weighed}, or a policy that observes 'entities'"
         )
     return float(config.objective)
+
+
+def search_time_limit_s(config: RunConfig, scenario: Scenario) -> float:
+    """The time of a search, seconds, 0 without a limit; raises ParameterError where it has no use."""
+    limit_s, factor = config.search_time_limit, config.factor if config.vehicle == SIMULATED else 1.0
+    if limit_s is None:
+        return pace.period_s(scenario, factor) / 2.0 if config.search else 0.0
+    if not config.search or factor is None:
+        expected = "a --pace in real time: a lockstep waits" if config.search else "--search with it"
+        raise ParameterError(f"--search-time-limit {limit_s:g}: expected {expected}")
+    return float(limit_s)
 
 
 def check_vehicle(config: RunConfig, nodes: list[str], scenario: Scenario) -> None:

@@ -93,8 +93,7 @@ def encode(
     data_bits, collected = (values.reshape((-1, scenario.n_users)) for values in (data_bits, collected))
     tables = scenario.entity_tables.on(cell)
     grid, limits, n_clusters = scenario.grid, scenario.mission, scenario.n_clusters
-    here = (cell[:, 0] * grid.n_y + cell[:, 1]) * grid.n_z + cell[:, 2]
-    after = _rows(xp, tables.of_cell, _rows(xp, tables.after, here))  # [N, 7, 2 M + 8]
+    after = _after(xp, scenario, tables, cell)
     ways_after, progress_after = after[..., :n_clusters], after[..., n_clusters + 1 : 2 * n_clusters + 1]
     home_after, valid = after[..., n_clusters], after[:, Action.HOVER, 2 * n_clusters + 1 :] > 0.5  # [N, 7]
     ways, home = ways_after[:, Action.HOVER], home_after[:, Action.HOVER]  # [N, M], [N]
@@ -206,12 +205,30 @@ def allowed(observation: Array) -> Array:
     return observation[..., ALLOWED : ALLOWED + N_ACTIONS] > 0.5
 
 
+def can_land(scenario: "Scenario", *, cell: Array, step: Array, energy_used_j: Array) -> Array:
+    """The actions after which the UAV can still land, bool `[N, 7]`; see `allowed`, which is never none.
+
+    `cell` is `[N, 3]`, `step` and `energy_used_j` are `[N]`, as those of `observations.encode`.
+    """
+    xp, n_clusters = array_namespace(cell), scenario.n_clusters
+    after = _after(xp, scenario, scenario.entity_tables.on(cell), cell)
+    home_after, valid = after[..., n_clusters], after[:, Action.HOVER, 2 * n_clusters + 1 :] > 0.5
+    return _budget(xp, scenario, step, energy_used_j, home_after, valid).safe
+
+
+def _after(xp: Any, scenario: "Scenario", tables: EntityTables, cell: Array) -> Array:
+    """`EntityTables.of_cell` of the cells after each action, `[N, 7, 2 M + 8]`."""
+    here = (cell[:, 0] * scenario.grid.n_y + cell[:, 1]) * scenario.grid.n_z + cell[:, 2]
+    return _rows(xp, tables.of_cell, _rows(xp, tables.after, here))
+
+
 class _Budget(NamedTuple):
     """What a mission has left, `[N]` each."""
 
     left: Array  # steps
     most: float  # steps at its start
     charge: Array  # of the battery, 0 to 1; 1 without one
+    safe: Array  # bool `[N, 7]`, see `can_land`
     allowed: Array  # bool `[N, 7]`, see `allowed`
 
 
@@ -236,7 +253,7 @@ def _budget(
             most = min(most, settings.battery_j / max(energies_j))
     nearest = xp.min(xp.where(valid, home_after, 0.0 * home_after + 2.0 * FAR), axis=-1, keepdims=True)
     any_safe = xp.any(safe, axis=-1, keepdims=True)
-    return _Budget(left, most, charge, xp.where(any_safe, safe, valid & (home_after <= nearest)))
+    return _Budget(left, most, charge, safe, xp.where(any_safe, safe, valid & (home_after <= nearest)))
 
 
 class _Tour(NamedTuple):

@@ -48,6 +48,7 @@ from uav_dc_ros.experiments.evaluate.shifts import (
     parse,
 )
 from uav_dc_ros.planners import PLANNERS
+from uav_dc_ros.run_config import SEARCH_MAX
 
 PROG = "python -m uav_dc_ros.evaluate"
 
@@ -68,6 +69,10 @@ def main(argv: list[str] | None = None) -> None:
     text += "default: by the name of the policy's own"
     add("--scenario", nargs="+", default=[], metavar="NAME|FILE|random:SEED", help=text)
     add("--seeds", type=cli.count, metavar="N", help="missions, seeds 0 to N-1; default 100, of --fields 10")
+    text = "missions that a policy flies in a model before each move, see docs/generalist.md; several: each "
+    text += "policy flies with each, and 0 is without; planners fly as they are; default 0"
+    number = cli.whole_number(0, SEARCH_MAX, f"a whole number from 0 to {SEARCH_MAX}")
+    add("--search", type=number, nargs="+", default=[0], metavar="N", help=text)
     text = "instead of --scenario: the random fields of seeds 0 to N-1 (random:SEED), compared field by field"
     add("--fields", type=cli.count, metavar="N", help=text)
     text = "w of the objective J, which tour and search maximise: 1 counts the users only, 0 the time only; "
@@ -85,7 +90,7 @@ def main(argv: list[str] | None = None) -> None:
         _check_once("--shift", [request.text for request in options.shift])
         if options.fields:
             return _fly_in_fields(options)
-        pairs = _pairs(options.policy, options.scenario)
+        pairs = _pairs(candidates(options.policy, options.search), options.scenario)
         flights = [flight for pair in pairs for flight in _flights(*pair, options.shift, options.objective)]
         if options.picture and len(flights) > 1:
             raise UavDcError(
@@ -124,17 +129,18 @@ def _fly_in_fields(options: argparse.Namespace) -> int:
     if options.json:
         files.check_writable(options.json)
     seeds = range(options.seeds or 10)
-    report = evaluate_fields(candidates(options.policy), options.fields, seeds, options.objective)
+    report = evaluate_fields(
+        candidates(options.policy, options.search), options.fields, seeds, options.objective
+    )
     if options.json:
         files.write(options.json, msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
     show_fields(report, _console(), _table())
     return 0
 
 
-def _pairs(policy_names: Sequence[str], scenario_names: Sequence[str]) -> list[tuple[Agent, Scenario]]:
+def _pairs(flown: Sequence[Agent], scenario_names: Sequence[str]) -> list[tuple[Agent, Scenario]]:
     """Agents and scenarios in the order of the results: every policy in each scenario, or in its own."""
     _check_once("--scenario", scenario_names)
-    flown = candidates(policy_names)
     if scenario_names:
         worlds = [scenarios.load(value) for value in scenario_names]
         names = [world.name for world in worlds]
@@ -187,17 +193,29 @@ def _report(evaluated: Sequence[EvaluatedMissions]) -> EvaluationReport:
     return EvaluationReport(evaluations=evaluations, comparisons=comparisons, shifts=effects or UNSET)
 
 
-def candidates(names: Sequence[str]) -> list[Agent]:
-    """The policies and planners of `--policy`; those of one name are named by their arguments.
+def candidates(names: Sequence[str], searches: Sequence[int] = (0,)) -> list[Agent]:
+    """The policies of `--policy`, each with each search, and the planners.
 
-    Raises UavDcError for a name that occurs twice, and PolicyError for a policy that cannot be loaded.
+    Those of one name are named by their arguments, and those that search by the number of missions, too.
+    Raises UavDcError for a name or a search that occurs twice, and for a search without a policy; and
+    PolicyError for a policy that cannot be loaded.
     """
     _check_once("--policy", names)
+    _check_once("--search", list(map(str, searches)))
     found = [agents.load(value) for value in names]
     loaded = [one.name for one in found]
-    return [
+    if any(searches) and not any(one.policy for one in found):
+        raise UavDcError(
+            f"--search {max(searches)}: {', '.join(loaded)}: planners only; expected a policy in --policy"
+        )
+    named = [
         replace(one, name=value) if loaded.count(one.name) > 1 else one
         for one, value in zip(found, names, strict=True)
+    ]
+    return [
+        replace(one, name=f"{one.name}, search {n}", search=n) if n else one
+        for one in named
+        for n in (searches if one.policy else (0,))
     ]
 
 

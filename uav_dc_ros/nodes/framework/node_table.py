@@ -79,7 +79,13 @@ NODES: dict[str, NodeRow] = {
             name="policy",
             publishes=("move", "ready", "diagnostics"),
             subscribes=("mission", "rates"),
-            parameters=(p.POLICY, p.SCENARIO_OF_POLICY, p.OBJECTIVE_WEIGHT),
+            parameters=(
+                p.POLICY,
+                p.SCENARIO_OF_POLICY,
+                p.OBJECTIVE_WEIGHT,
+                p.SEARCH,
+                p.SEARCH_TIME_LIMIT_S,
+            ),
             composable=True,
         ),
         NodeRow(
@@ -91,6 +97,7 @@ NODES: dict[str, NodeRow] = {
                     p.SCENARIO,
                     p.RECORDED_POLICY,
                     p.OBJECTIVE_WEIGHT,
+                    p.SEARCH,
                     p.SEED,
                     p.MISSIONS,
                     p.PACE,

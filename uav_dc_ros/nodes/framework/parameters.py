@@ -14,6 +14,7 @@ from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.messages import Run
 from uav_dc_ros.offboard.mission.fault_detector import SafetySettings
 from uav_dc_ros.offboard.mission.geofence import MARGIN_M
+from uav_dc_ros.run_config import SEARCH_MAX, SEARCH_TIME_S
 from uav_dc_ros.topics import SIMULATED, SYSTEM_MAX, VEHICLES
 
 EXTERNAL = "external"  # value of the world's `vehicle` beside a bridge
@@ -130,6 +131,17 @@ OBJECTIVE_WEIGHT = Parameter(
     "",
     0.0,
     1.0,
+)
+SEARCH = Parameter(
+    "search", 0, "missions that a policy flies in a model before each move; 0: no search", "", 0, SEARCH_MAX
+)
+SEARCH_TIME_LIMIT_S = Parameter(
+    "search_time_limit_s",
+    0.0,
+    "time of a search, after which the policy's own move is taken; 0: no limit",
+    "s",
+    0.0,
+    SEARCH_TIME_S[1],
 )
 SEED = Parameter("seed", 0, "seed of the first mission's users", "", 0, INTEGER_MAX)
 MISSIONS = Parameter("missions", 1, "number of missions, with consecutive seeds", "", 1, INTEGER_MAX)

@@ -27,6 +27,7 @@ from uav_dc_ros.recordings.step_reader import Steps
 from uav_dc_ros.recordings.verify.recompute import ChannelCheck, Check, DecisionCheck, WorldCheck
 from uav_dc_ros.recordings.verify.service import ServiceSummary
 from uav_dc_ros.recordings.verify.vehicle_flights import VehicleCheck
+from uav_dc_ros.run_config import SEARCH_MAX
 from uav_dc_ros.topics import SIMULATED
 
 NEEDED = ("pose", "users", "rates", "mission")  # topics without which nothing can be recomputed
@@ -109,6 +110,8 @@ class VerifyReport(msgspec.Struct, frozen=True, kw_only=True):
     policy: str | None  # the policy or planner whose decisions are recomputed
     policy_sha256: str | None  # null for a planner
     objective_weight: float | None  # w of a planner that depends on it
+    search: int  # missions of the policy's search before each move; 0: none
+    searches_out_of_time: int  # recomputed steps in which it took the policy's own move
     decisions_missing: str  # why no decisions are recomputed; empty
     recorded_by: str | None  # version of this package
     verified_by: str  # likewise
@@ -175,7 +178,7 @@ def _verify(reader: BagReader, namespace: str, scenario: Scenario, options: argp
     other = OtherPolicy(scenario, agents.load(options.policy), weight) if options.policy else None
     vehicle = step_reader.vehicle(reader, namespace)
     seed, lockstep, real = about.get("seed"), about.get("pace") == pace.LOCKSTEP, vehicle != SIMULATED
-    agent, missing_policy = _agent(about, scenario, options.policy_dir)
+    agent, missing_policy = _agent(about, scenario, options.policy_dir, _search(reader))
     channel = ChannelCheck(scenario, tolerance)
     world = WorldCheck(scenario, seed=seed, lockstep=lockstep, real=real, tolerance=tolerance)
     flights = VehicleCheck(scenario, vehicle) if real else None
@@ -220,6 +223,8 @@ def _verify(reader: BagReader, namespace: str, scenario: Scenario, options: argp
         policy=agent.name if agent else None,
         policy_sha256=agent.sha256 if agent else None,
         objective_weight=weight if agent and agent.weighs else None,
+        search=agent.search if agent else 0,
+        searches_out_of_time=decisions.timed_out if decisions else 0,
         decisions_missing=missing_policy,
         recorded_by=about.get("version"),
         verified_by=__version__,
@@ -258,7 +263,8 @@ def _check_topics(reader: BagReader, namespace: str) -> None:
 
 def _title(agent: Agent, weight: float) -> str:
     sha256, weighed = agent.sha256, f"w = {weight:.6g}" if agent.weighs else ""
-    details = ", ".join(filter(None, (sha256 and f"sha256 {sha256[:12]}", weighed)))
+    searched = f"search {agent.search}" if agent.search else ""
+    details = ", ".join(filter(None, (sha256 and f"sha256 {sha256[:12]}", searched, weighed)))
     return f"{'policy' if sha256 else 'planner'} {agent.name!r}" + (f" ({details})" if details else "")
 
 
@@ -273,13 +279,23 @@ def _weight(reader: BagReader) -> float:
         ) from None
 
 
-def _agent(about: dict[str, str], scenario: Scenario, folder: Path | None) -> tuple[Agent | None, str]:
+def _search(reader: BagReader) -> int:
+    """The missions of a search in the bag, 0 for none; raises BagError if it is no such number."""
+    text = reader.about.get("search", "0")
+    if not (text.isascii() and text.isdecimal() and int(text) <= SEARCH_MAX):
+        raise BagError(f"bag {reader.path}: search {text!r}; expected a whole number from 0 to {SEARCH_MAX}")
+    return int(text)
+
+
+def _agent(
+    about: dict[str, str], scenario: Scenario, folder: Path | None, search: int
+) -> tuple[Agent | None, str]:
     """The policy that flew, by the hash in the bag, or the planner; or why there is none."""
     if folder is not None and not folder.is_dir():
         raise ParameterError(f"--policy-dir {folder}: no such folder")
     name, sha256 = about.get("policy"), about.get("policy_sha256")
     if name in PLANNERS and sha256 is None:
-        return Agent(name, PLANNERS[name]), ""
+        return Agent(name, PLANNERS[name], search), ""
     if name is None or sha256 is None:
         return None, "the bag does not name the policy that flew; --policy NAME|DIR compares with one"
     candidates: list[str | Path] = [name, *policies.names()]
@@ -293,7 +309,7 @@ def _agent(about: dict[str, str], scenario: Scenario, folder: Path | None) -> tu
             continue
         if policy.sha256 == sha256:
             policy.check(scenario)
-            return Agent(policy.name, policy), ""
+            return Agent(policy.name, policy, search), ""
         if policy.name == name and not other:
             other = f"; {str(candidate)!r} is another one (sha256 {policy.sha256[:12]})"
     missing = f"policy {name!r} (sha256 {sha256[:12]}) is missing{other}"

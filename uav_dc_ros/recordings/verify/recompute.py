@@ -12,6 +12,7 @@ import numpy as np
 
 from uav_dc_ros import payloads
 from uav_dc_ros.agents.agent import Agent, state_of
+from uav_dc_ros.agents.policy_search import PolicySearch
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.grid import Action
@@ -340,6 +341,7 @@ class DecisionCheck(Check):
         super().__init__()
         self.agent, self._scenario = agent, scenario
         self._act = agent.act_in(scenario, weight)
+        self.timed_out = 0  # recomputed steps whose search ran out of time: the move is the policy's own
 
     def add(self, step: RecordedStep) -> str | None:
         """Recompute the decision of a step; the label of the action if it differs."""
@@ -362,10 +364,21 @@ class DecisionCheck(Check):
             self.skipped[f"no {'rates' if observed is None else 'users'} recorded"] += 1
             return None
         state = state_of(self._scenario, **observed)
-        action = Action(int(self._act(state))).label
+        if move.search_timed_out is True and isinstance(self._act, PolicySearch):
+            self.timed_out += 1
+            action = Action(self._act.own(state)).label
+        else:
+            action = Action(int(self._act(state))).label
         found = [difference(step, "move", "action", move.action, action)] if action != move.action else []
         self.count(found)
         return action if found else None
+
+    def lines(self) -> list[str]:
+        """The result as text."""
+        lines = super().lines()
+        if self.timed_out:
+            lines.append(f"  {self.timed_out} searches ran out of time: their moves are the policy's own")
+        return lines
 
 
 def _cell(step: RecordedStep, cell: list[int], reached: list[list[int]]) -> list[Difference]:
