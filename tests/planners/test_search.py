@@ -16,7 +16,7 @@ from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.experiments.evaluate.rollout import roll_out
 from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.planners.cells import SIZE_MAX, Cells, Delivery
-from uav_dc_ros.planners.cluster_tour import _order
+from uav_dc_ros.planners.cluster_tour import _order, _Tour
 
 THREE = scenarios.load("three_clusters_hover")
 GAUSS_MARKOV = {"model": "gauss_markov", "alpha": 0.8, "mean_speed_mps": 9.0}
@@ -106,6 +106,50 @@ def test_a_stop_that_takes_too_long_is_left_out():
     missions = roll_out(scenario, PLANNERS["tour"](scenario), range(3))
     assert missions.landed.all()
     assert (missions.users_collected > 15).all()
+
+
+def test_where_time_is_short_the_choice_is_the_best_of_all():
+    """Of the stops, in their order, and the waits at each; against all choices."""
+    tour = _Tour(THREE, 0.9)
+    rng, n_stops = np.random.default_rng(1), 3
+    between, home = tour._between, tour.cells.steps_home
+    for _ in range(40):
+        number, needs = rng.integers(len(home), size=1), np.full((1, n_stops, 4), np.inf)
+        needs[..., 0] = 0.0
+        for i in range(n_stops):
+            n = rng.integers(0, 4)
+            needs[0, i, 1 : n + 1] = np.sort(rng.uniform(0.0, 5.0, n))
+        left, best = int(home[number[0]]) + int(rng.integers(0, 16)), {}
+        for users in itertools.product(range(4), repeat=n_stops):
+            waits = [needs[0, i, k] for i, k in enumerate(users)]
+            stops = [i for i, k in enumerate(users) if k]
+            if not np.isfinite(waits).all():
+                continue
+            legs = (
+                [tour._legs[stops[0], number[0]], *(between[a, b] for a, b in itertools.pairwise(stops))]
+                if stops
+                else []
+            )
+            last = home[tour._stops[stops[-1]]] if stops else home[number[0]]
+            steps = sum(legs) + last + np.ceil(waits).sum()
+            if steps <= left:
+                goal = stops[0] if stops else n_stops
+                value = tour._user_value * sum(users) - tour._step_cost * steps
+                best[goal] = max(value, best.get(goal, -np.inf))
+        chosen = int(tour._best_in_time(number, np.asarray([left]), needs)[0])
+        assert best[chosen] == pytest.approx(max(best.values()), abs=1e-12)
+
+
+def test_among_obstacles_in_short_time_tour_is_at_least_as_good_as_a_fixed_one():
+    tower = {"polygon_m": [[350, 350], [450, 350], [450, 450], [350, 450]], "height_m": 170.0}
+    zone = {"polygon_m": [[600, -50], [720, -50], [700, 900], [640, 900]], "kind": "no_fly"}
+    radio = {"obstruction_loss_db": 20.0}
+    field = changed("five_clusters_hover", radio=radio, obstacles=[tower, zone])
+    fixed, tour = (
+        roll_out(field, PLANNERS[name](field), range(10)).objective(field).mean()
+        for name in ("fixed_tour", "tour")
+    )
+    assert tour > fixed
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)

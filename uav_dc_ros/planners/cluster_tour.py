@@ -10,10 +10,9 @@ It knows where clusters are, how large their discs are, and the data collected s
   from its own data.
 
 At each step it chooses, in that order, which clusters to visit and how many users of each to wait for. The
-choice maximises the value of the users, w / U each, less the steps until the dock times a price. The price is
-(1 - w) / T_cons, which gives J, where the time is enough for that choice, and otherwise the lowest one at
-which it is. For a given price the choice is exact (dynamic programming over the order). Where the lowest
-price leaves out more than the time demands, a limit of all waits is chosen instead.
+choice maximises J: w / U for each user, less (1 - w) / T_cons for each step until the dock. It is exact, by
+dynamic programming over the order; where the time is too short for it, over the order and the steps that are
+left.
 """
 
 import itertools
@@ -30,7 +29,6 @@ from uav_dc_ros.planners.cells import FAR, Cells, Delivery
 HOVERS_MAX = 16  # steps over a stop within which a user is collected, or not counted
 APPROACH_MAX = 8  # moves to a stop on which it is expected to receive data
 EXACT_MAX = 8  # stops of which every order is tried
-BISECTIONS = 16  # of the price of time
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -104,28 +102,42 @@ class _Tour:
 
     def _goals(self, number: Array, left: Array, needs: Array) -> Array:
         """The stop to fly to, integers `[S]`, by its place in the order; M is the dock."""
-        low = np.full(len(left), self._step_cost)
-        goal, steps, _ = self._best(number, low, needs)
-        if (late := steps > left).any():
-            cheapest, high = low, np.full(len(left), 1.0)  # a step is dearer than all users
-            for _ in range(BISECTIONS):
-                price = np.sqrt(np.maximum(low, 1e-9) * high)
-                steps_at = self._best(number, price, needs)[1]
-                fits = steps_at <= left
-                high, low = np.where(fits, price, high), np.where(fits, low, price)
-            at_price, steps, value = self._best(number, high, needs)
-            goal = np.where(late, at_price, goal)
-            # One price may skip a whole stop and leave steps unused: a limit of all waits may lose less.
-            best = value + (high - cheapest) * steps
-            for wait_max in range(1, HOVERS_MAX + 1):
-                within = np.where(needs <= wait_max, needs, np.inf)
-                limited, steps, value = self._best(number, cheapest, within)
-                better = late & (steps <= left) & (value > best)
-                goal, best = np.where(better, limited, goal), np.where(better, value, best)
+        goal, steps = self._best(number, needs)
+        late = np.flatnonzero(steps > left)
+        if late.size:
+            goal[late] = self._best_in_time(number[late], left[late], needs[late])
         return goal
 
-    def _best(self, number: Array, price: Array, needs: Array) -> tuple[Array, Array, Array]:
-        """The best choice for a price of time `[S]`: first stop, steps until the dock, and value, `[S]`."""
+    def _best_in_time(self, number: Array, left: Array, needs: Array) -> Array:
+        """As `_goals`, of the choices that last no longer than the steps that are left."""
+        n_stops, n_steps, price = len(self._stops), max(int(left.max()), 0), self._step_cost
+        waits = np.arange(min(n_steps, HOVERS_MAX) + 1)
+        # Users that are collected at each stop within some waits, [S, M, W]
+        users = (np.ceil(needs)[..., 1:, None] <= waits).sum(axis=2)
+        worth = np.where(users > 0, self._user_value * users - price * waits, -np.inf)
+        # Of a tour from stop i on, by the steps that are left there; the last column is the dock.
+        value = np.full((len(left), n_stops + 1, n_steps + 1), -np.inf)
+        value[:, n_stops] = 0.0
+        row = np.arange(len(left))[:, None, None]
+        for i in reversed(range(n_stops)):
+            legs = np.append(self._between[i, i + 1 :], self.cells.steps_home[self._stops[i]])
+            then = np.arange(n_steps + 1) - legs[:, None]  # steps left there, [M - i, T + 1]
+            there = value[row, np.arange(i + 1, n_stops + 1)[:, None], np.maximum(then, 0)]
+            after = np.where(then >= 0, there - price * legs[:, None], -np.inf).max(axis=1)
+            for wait in waits:
+                value[:, i, wait:] = np.maximum(
+                    value[:, i, wait:], worth[:, i, wait, None] + after[:, : n_steps + 1 - wait]
+                )
+        legs = np.column_stack([self._legs[:, number].T, self.cells.steps_home[number]])
+        then = left[:, None] - legs
+        there = value[row[..., 0], np.arange(n_stops + 1), np.maximum(then, 0)]
+        values = np.where(then >= 0, there - price * legs, -np.inf)
+        values[:, -1] = np.maximum(values[:, -1], -1e9)  # the dock, where nothing is in time
+        return values.argmax(axis=1)
+
+    def _best(self, number: Array, needs: Array) -> tuple[Array, Array]:
+        """The best choice without a limit of time: its first stop, and its steps until the dock, `[S]`."""
+        price = np.full(len(number), self._step_cost)
         is_offered = np.isfinite(needs)
         cost = price[:, None, None] * np.where(is_offered, needs, 0.0)
         worth = np.where(is_offered, self._user_value * np.arange(needs.shape[-1]) - cost, -np.inf)
@@ -143,8 +155,8 @@ class _Tour:
             value[:, i], steps[:, i] = worth[:, i] + after, stays[:, i] + length
         # A stop at which no user is worth waiting for gives nothing.
         value[:, :-1] = np.where(kept[..., 0] > 0, value[:, :-1], -np.inf)
-        best, length, goal = self._next(0, self._legs[:, number].T, to_dock[number], price, value, steps)
-        return goal, length, best
+        _, length, goal = self._next(0, self._legs[:, number].T, to_dock[number], price, value, steps)
+        return goal, length
 
     def _next(
         self, first: int, legs: Array, home: Array, price: Array, value: Array, steps: Array
