@@ -53,7 +53,7 @@ def one(state, i=0):
     return replace(State(**alone), total_reward=unknown, mission_reward=unknown)
 
 
-@settings(derandomize=True, deadline=None, max_examples=24)
+@settings(derandomize=True, deadline=None, max_examples=20)
 @given(
     observation=st.sampled_from(["position", "mission", "entities"]),
     seed=st.integers(0, 9),
@@ -61,12 +61,11 @@ def one(state, i=0):
     max_steps=st.integers(5, 12),
     interference=st.sampled_from(["all", "associated", "none"]),
     ends=st.sampled_from(["at_time_limit", "on_arrival"]),
-    more=st.sampled_from([0, 17]),
 )
 def test_where_the_model_is_right_it_is_never_worse_than_the_policy(
-    observation, seed, weight, max_steps, interference, ends, more
+    observation, seed, weight, max_steps, interference, ends
 ):
-    """Users stay and the channel draws nothing. Seven missions are the policy's own and all other actions."""
+    """Users stay, the channel draws nothing, and a beam of 24 missions is wide in so small a field."""
     scenario = tiny(
         mission={"max_steps": max_steps, "episode_end": ends, "r_min_bits": 2e6},
         radio={"interference": interference},
@@ -74,7 +73,7 @@ def test_where_the_model_is_right_it_is_never_worse_than_the_policy(
     )
     policy = random_policy(scenario, observation, seed)
     own = roll_out(scenario, greedy_act(policy, scenario, weight), range(2), service=False)
-    search = PolicySearch(policy, scenario, weight, 7 + more)
+    search = PolicySearch(policy, scenario, weight, 25)
     found = roll_out(scenario, search, range(2), service=False)
     assert found.landed.all()
     assert (found.objective(scenario, weight) >= own.objective(scenario, weight)).all()

@@ -1,21 +1,19 @@
-"""Search on top of a policy: before each move, missions are flown to their ends in a model.
+"""Search on top of a policy: before each move, N missions are flown to their ends in a model.
 
 The model is that of the planner `search`: users stay where they are at present, over the channel without
-shadowing and fading. It knows neither where users will go nor what a random channel will draw. Of a budget of
-N missions
+shadowing and fading. It knows neither where users will go nor what a random channel will draw.
 
-- the first takes the policy's actions;
-- up to six begin with another action, the ones with the highest Q-values first, and then take the policy's.
-  From each of its states a mission may also fly home at once. So it is worth the highest J (see
-  `core.objective`) of its states: the users collected so far, and the arrival by the shortest way;
-- the rest is the width of a beam search (`planners.beam`) for a mission that is better than all of these.
+One mission takes the policy's actions. From each of its states it may also fly home at once. So it is worth
+the highest J of its states (see `core.objective`): users collected so far, and arrival by the shortest way.
+The others are those of a beam search that is N - 1 missions wide (`planners.beam`). The move is the first
+one of the best mission, of equal ones the policy's own: in the model, it is never worse than the policy's.
+After it the UAV can still reach the dock, unless no move allows that.
 
-The move is the first one of the best mission, of equal ones the policy's own. So it is never worse than the
-policy's where the model is right: see Tesauro and Galperin, "On-line Policy Improvement using Monte-Carlo
-Search", NIPS 1996. After it the UAV can still reach the dock, unless no move allows that.
+To begin with each action, and then to follow the policy (Tesauro and Galperin, "On-line Policy Improvement
+using Monte-Carlo Search", NIPS 1996), takes as many missions from the beam, and was worse with few of them.
 
 N is a number of missions, not of seconds: a decision depends on the state only. With a time limit, a decision
-that does not end in time is the policy's own action, and says so.
+that does not end in time is the policy's own action, and reports that.
 """
 
 import math
@@ -28,7 +26,7 @@ import numpy as np
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.core import world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.entities.encoding import allowed, can_land
+from uav_dc_ros.core.entities.encoding import can_land
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import State
@@ -90,91 +88,60 @@ class PolicySearch:
         """The first action of the best mission."""
         model, start = self._model, begin(self._model, state)
         delivery = model.look(state)
-        if not model.n_steps or (self._scenario.mission.episode_end == "on_arrival" and start.since[0]):
-            return own  # the mission is over
-        firsts = self._firsts(start, int(state.step), own)
-        worth = self._fly(state, start, firsts, check_time)
-        best = int(worth.argmax())
-        if (width := self._n - len(firsts)) > 0:
-            plan = beam.search(
-                model,
-                state,
-                width=width,
-                weight=self._weight,
-                ranking=estimate(model, delivery, state, self._weight),
-                above=float(worth[best]),
-                before_step=check_time,
-            )
-            if len(plan.actions):
-                return int(plan.actions[0])
-        return int(firsts[best])
+        landed = self._scenario.mission.episode_end == "on_arrival" and start.since[0] > 0
+        if landed or not model.n_steps or self._n == 1:
+            return own
+        ranking = estimate(model, delivery, state, self._weight)
+        plan = beam.search(
+            model, state, width=self._n - 1, weight=self._weight, ranking=ranking, before_step=check_time
+        )
+        if not len(plan.actions) or self._reaches(plan.objective, state, start, own, check_time):
+            return own
+        return int(plan.actions[0])
 
-    def _fly(
-        self, state: State, start: ModelMissions, firsts: Array, check_time: Callable[[], None]
-    ) -> Array:
-        """The worth of missions that take these actions first, integers `[B]`, then the policy's; `[B]`."""
-        model, scenario, n_flown = self._model, self._scenario, int(state.step)
+    def _reaches(
+        self, goal: float, state: State, mission: ModelMissions, own: int, check_time: Callable[[], None]
+    ) -> bool:
+        """Whether the mission of the policy's actions, of which `own` is the next, is worth a J of `goal`."""
+        model, scenario, n_flown, action = self._model, self._scenario, int(state.step), np.asarray([own])
         r_min_bits = scenario.user_r_min_bits(state.data_bits)
-        number, action, worth = np.arange(len(firsts)), firsts, np.zeros(len(firsts))
-        missions = start.take(0 * number)
         for step in range(model.n_steps):
             check_time()
             if step:
-                action = self._greedy(missions, n_flown)
+                action = self._greedy(mission, n_flown)
             n_flown += 1
-            cell = model.after[missions.cell, action]
-            missions, over, lands = advance(model, missions, cell, step, n_flown, r_min_bits)
-            soonest = np.where(missions.since > 0, missions.since, n_flown + model.steps_home[cell])
-            goes_on = ~over & (soonest <= scenario.mission.max_steps) & missions.lasts_home(model)
-            n_users = missions.collected.sum(axis=-1)
-            here = objective_of(scenario, n_users, soonest, lands | goes_on, self._weight)
-            worth[number] = np.maximum(worth[number], here)
-            best = int(worth.argmax())
-            # A mission goes on while it may become the best, or an equal one that is preferred.
-            hope = objective_of(scenario, 0 * n_users + scenario.n_users, soonest, goes_on, self._weight)
-            kept = goes_on & ((hope > worth[best]) | ((hope == worth[best]) & (number < best)))
-            if not kept.any():
-                break
-            missions, number = missions.take(kept), number[kept]
-        return worth
-
-    def _firsts(self, start: ModelMissions, n_flown: int, own: int) -> Array:
-        """The actions to begin with, integers: the policy's own and others after which the UAV can land."""
-        q_values, _ = self._q_values(start, n_flown)
-        others = np.argsort(-q_values[0], kind="stable")
-        others = others[self._can_land(start, n_flown)[0, others] & (others != own)]
-        return np.asarray([own, *others][: self._n])
+            cell = model.after[mission.cell, action]
+            mission, over, lands = advance(model, mission, cell, step, n_flown, r_min_bits)
+            soonest = np.where(mission.since > 0, mission.since, n_flown + model.steps_home[cell])
+            goes_on = ~over & (soonest <= scenario.mission.max_steps) & mission.lasts_home(model)
+            n_users = mission.collected.sum(axis=-1)
+            if objective_of(scenario, n_users, soonest, lands | goes_on, self._weight)[0] >= goal:
+                return True
+            n_users[:] = scenario.n_users  # at the most
+            if not goes_on[0] or objective_of(scenario, n_users, soonest, goes_on, self._weight)[0] < goal:
+                return False
+        return False
 
     def _greedy(self, missions: ModelMissions, n_flown: int) -> Array:
         """The policy's best actions after which the UAV can land, integers `[B]`."""
-        q_values, mask = self._q_values(missions, n_flown)
-        return np.where(mask, q_values, -np.inf).argmax(axis=-1)
-
-    def _q_values(self, missions: ModelMissions, n_flown: int) -> tuple[Array, Array]:
-        """Q(s, a), and the actions that the policy chooses from, `[B, 7]` each."""
         policy, scenario, cell = self._policy, self._scenario, self._model.cells[missions.cell]
+        step, used_j = np.full(len(cell), n_flown), missions.energy_used_j
         observation = policy.observe(
             scenario,
             cell=cell,
-            step=np.full(len(cell), n_flown),
+            step=step,
             data_bits=missions.data_bits,
             collected=missions.collected,
-            energy_used_j=missions.energy_used_j,
+            energy_used_j=used_j,
             weight=self._weight,
         )
-        q_values = policy.q_values(observation)
         if policy.config.observation == "entities":
-            return q_values, allowed(observation)
-        safe = self._can_land(missions, n_flown)
-        # A move off the grid is a hover. Another network than one for `entities` may choose it.
+            return policy.act(observation)  # it allows no other ones
+        safe = can_land(scenario, cell=cell, step=step, energy_used_j=used_j)
+        # A move off the grid is a hover.
         mask = np.where(self._model.has_effect[missions.cell], safe, safe[:, Action.HOVER, None])
         if (possible := world.action_mask(scenario, cell)) is not None:
             mask &= possible
         for i in np.flatnonzero(~mask.any(axis=-1)):
             mask[i, homewards(self._model, int(missions.cell[i]))] = True
-        return q_values, mask
-
-    def _can_land(self, missions: ModelMissions, n_flown: int) -> Array:
-        cell = self._model.cells[missions.cell]
-        step = np.full(len(cell), n_flown)
-        return can_land(self._scenario, cell=cell, step=step, energy_used_j=missions.energy_used_j)
+        return policy.act(observation, mask)

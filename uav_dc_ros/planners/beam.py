@@ -32,7 +32,7 @@ class Plan:
     """The best mission found from a state."""
 
     actions: Array  # of the next steps, integers `[n]`; n <= H
-    objective: float  # J; without actions 0, or the J to exceed
+    objective: float  # J; 0 if the mission does not land within H steps
     users_collected: int
     arrival_step: int  # 0 if the mission does not land within H steps
 
@@ -44,7 +44,6 @@ def search(
     width: int = WIDTH,
     weight: float = DEFAULT_WEIGHT,
     ranking: Ranking | None = None,
-    above: float = 0.0,
     before_step: Callable[[], None] = lambda: None,
 ) -> Plan:
     """The best mission from a state, by the objective J with the weight w.
@@ -55,25 +54,21 @@ def search(
         width: missions that are kept in each step.
         weight: w of J.
         ranking: what missions are compared by; default: `Promise`, for a `MissionModel`.
-        above: J that a mission must exceed.
         before_step: called before each step; an exception in it ends the search.
 
     Returns:
-        The actions up to the arrival; the UAV hovers from then on. They are none where no mission lands, or
-        none has a J above `above`.
+        The actions up to the arrival; the UAV hovers from then on. They are none where no mission lands.
     """
     if ranking is None:
         assert isinstance(model, MissionModel), "needed by `Promise`"
         ranking = Promise(model, model.scenario.user_r_min_bits(state.data_bits), weight)
-    return _Search(model, state, width, weight, ranking, above).run(before_step)
+    return _Search(model, state, width, weight, ranking).run(before_step)
 
 
 class _Search:
     """A search, step by step."""
 
-    def __init__(
-        self, model: Model, state: State, width: int, weight: float, ranking: Ranking, above: float
-    ) -> None:
+    def __init__(self, model: Model, state: State, width: int, weight: float, ranking: Ranking) -> None:
         scenario = model.scenario
         self._model, self._scenario, self._width, self._weight = model, scenario, width, weight
         self._first_step = int(state.step)
@@ -83,7 +78,7 @@ class _Search:
         self._numbers = np.random.default_rng(0).integers(0, 2**64, scenario.n_users, np.uint64)
         self._beam = begin(model, state)  # the most promising first
         self._history: list[tuple[Array, Array]] = []  # of each step: mission before, and action, `[B]`
-        self._best = Plan(actions=np.zeros(0, np.int64), objective=above, users_collected=0, arrival_step=0)
+        self._best = Plan(actions=np.zeros(0, np.int64), objective=0.0, users_collected=0, arrival_step=0)
 
     def run(self, before_step: Callable[[], None]) -> Plan:
         """The best plan; the search ends when no mission of the beam can become better."""

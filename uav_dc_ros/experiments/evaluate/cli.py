@@ -69,7 +69,7 @@ def main(argv: list[str] | None = None) -> None:
     text += "default: by the name of the policy's own"
     add("--scenario", nargs="+", default=[], metavar="NAME|FILE|random:SEED", help=text)
     add("--seeds", type=cli.count, metavar="N", help="missions, seeds 0 to N-1; default 100, of --fields 10")
-    text = "missions that a policy flies in a model before each move, see docs/generalist.md; several: each "
+    text = "missions that a policy flies in a model before each move, see docs/planners.md; several: each "
     text += "policy flies with each, and 0 is without; planners fly as they are; default 0"
     number = cli.whole_number(0, SEARCH_MAX, f"a whole number from 0 to {SEARCH_MAX}")
     add("--search", type=number, nargs="+", default=[0], metavar="N", help=text)
