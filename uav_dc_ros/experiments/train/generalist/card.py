@@ -6,6 +6,7 @@ from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.agents.set_policy import SetPolicyConfig
 from uav_dc_ros.core.entities.encoding import CLUSTERS_MAX, SHAPE_MAX
+from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, evaluate, mean_and_interval
 from uav_dc_ros.experiments.train.generalist.layouts import (
     SELECTION_LAYOUTS,
@@ -37,15 +38,7 @@ def card(
     used = first + config.seed * values.iterations * values.layouts
     others = ", ".join(f"{name} {value:.4f}" for name, value in baselines.items())
     lines = ["| scenario | J | landed | users collected | at the dock by step |", "|---|---|---|---|---|"]
-    for name in names():
-        scenario = load(name)
-        evaluation = evaluate(policy, scenario)
-        shown = [mean_and_interval(figure, getattr(evaluation, figure)) for figure in _FIGURES]
-        cells = [f"{mean} ({interval})" for mean, interval in shown]
-        cells[2] += f" of {scenario.n_users}"
-        cells[3] += f" of {scenario.mission.max_steps}"
-        lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    table = "\n".join(lines)
+    table = "\n".join([*lines, *(row(policy, load(name)) for name in names())])
     hidden, shape = " and ".join(map(str, config.hidden)), " x ".join(map(str, SHAPE_MAX))
     last = used + values.iterations * values.layouts - 1
     return f"""# {config.name}
@@ -68,8 +61,10 @@ weight w of the objective J is an input: it is chosen when the policy flies.
   {others}
 - {values.layouts} layouts of {values.missions} missions an iteration, {values.epochs} pass(es), batches of
   {values.batch_size}, learning rate {values.learning_rate:g} falling to a fiftieth, lambda {values.trace:g},
-  discount {values.discount:g}, probability of the greedy action (epsilon) {values.epsilon:g} to
-  {values.epsilon_end:g}
+  discount {values.discount:g}, advantage learning with alpha {values.advantage:g}, probability of the greedy
+  action (epsilon) {values.epsilon:g} to {values.epsilon_end:g}
+- the planner `fixed_tour` flies {values.demonstrations:.0%} of the layouts as demonstrations at first, and
+  {values.demonstrations_end:.0%} after {values.shown:.0%} of the iterations
 
 ## How it does
 
@@ -84,6 +79,16 @@ It takes grids up to {shape} cells and up to {CLUSTERS_MAX} clusters or single u
 clusters are, but not where single users walk, and expects each where it starts. It has met a line-of-sight
 channel in simulation only: no wind, no fading, no lost packets.
 """
+
+
+def row(policy: Policy, scenario: Scenario) -> str:
+    """The table's row of a scenario: missions of the test seeds, with the default weight."""
+    evaluation = evaluate(policy, scenario)
+    shown = [mean_and_interval(figure, getattr(evaluation, figure)) for figure in _FIGURES]
+    cells = [f"{mean} ({interval})" for mean, interval in shown]
+    cells[2] += f" of {scenario.n_users}"
+    cells[3] += f" of {scenario.mission.max_steps}"
+    return f"| `{scenario.name}` | {' | '.join(cells)} |"
 
 
 def checkpoint_card(policy: Policy, *, score: float, command: str) -> str:
