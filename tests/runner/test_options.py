@@ -78,6 +78,10 @@ def refused(ros: Ros, *arguments: object) -> str:
             ("--objective", "0.5"),
             "the moves of 'five_clusters_dueling' do not depend on it; expected it",
         ),
+        (
+            ("--policy", "search", "--search", "8"),
+            "search 8: 'search' is a planner; expected it with a policy only",
+        ),
         (("--scenario", "random:"), "scenario 'random:': no such name or file; expected one of "),
         (
             ("--policy", "search", "--set", "policy.objective_weight=0.5"),
