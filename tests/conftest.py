@@ -29,7 +29,7 @@ MARK = "UAV_DC_TEST"
 ROOT = Path(__file__).parents[1]
 # How long a test waits for what must come, wall time. Only what never comes takes this long: a machine with
 # much else to do may take twenty times as long as a calm one.
-PATIENCE_S = 90.0
+PATIENCE_S = 200.0
 
 # The tests start some hundred processes. Without bytecode each of them compiles this project anew.
 sys.dont_write_bytecode = False

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests import ament_launch
-from tests.conftest import ROOT, copy_repository, finish, read_bag, wait_for
+from tests.conftest import PATIENCE_S, ROOT, copy_repository, finish, read_bag, wait_for
 from uav_dc_ros import run_all
 from uav_dc_ros.nodes.framework.node_table import NODES
 
@@ -260,7 +260,7 @@ def test_the_launch_file_s_nodes_fly(workspace, ros):
         env=ros.environment,
         capture_output=True,
         text=True,
-        timeout=90,
+        timeout=PATIENCE_S,
         check=False,
     )
     probe.stdin.close()

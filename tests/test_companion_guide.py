@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import PATIENCE_S
 from tests.doc_commands import parameter, parsed
 from uav_dc_ros import files, run_all, scenarios
 from uav_dc_ros.core.scenario import Scenario
@@ -228,7 +229,7 @@ def test_the_figure_of_the_field_is_what_its_command_prints(tmp_path: Path) -> N
     assert told is not None
     summary = tmp_path / "summary.json"
     command = [sys.executable, "-m", *words, "--json", str(summary)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=90, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stderr
     seeds = words[words.index("--seeds") + 1]
     assert int(told[1]) == int(seeds) - 1
@@ -261,7 +262,7 @@ def test_systemd_has_nothing_to_say_against_the_units(tmp_path: Path) -> None:
 def verified(path: Path) -> str:
     """What systemd says of a unit."""
     command = ["systemd-analyze", "verify", "--man=no", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     return done.stdout + done.stderr
 
 

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 from ruamel.yaml import YAML
 
-from tests.conftest import ROOT
+from tests.conftest import PATIENCE_S, ROOT
 from tests.doc_commands import blocks, commands, parameter, parsed
 from uav_dc_ros import bag, files, scenarios
 from uav_dc_ros.core.energy import EnergySettings
@@ -252,7 +252,9 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     shutil.copy(ROOT / "mkdocs.yml", tmp_path)
     (tmp_path / "uav_dc_ros").symlink_to(PACKAGE)
     command = [sys.executable, "-m", "zensical", "build", "--strict"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     said = done.stdout + done.stderr
     assert done.returncode == 0, said
     assert "No issues found" in said

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.bags.test_foreign import run
+from tests.conftest import PATIENCE_S
 from tests.recordings import made
 from tests.support.bags import STRING, in_bag, in_mcap, information, text
 from tests.support.worlds import tiny
@@ -63,7 +64,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_node_reads_what_python_reads(node_reader: Path, bags: dict[str, Path], name: str) -> None:
     part = bags[name] / f"{name}_0.mcap"
     done = subprocess.run(
-        ["node", node_reader, part], capture_output=True, text=True, check=True, timeout=60
+        ["node", node_reader, part], capture_output=True, text=True, check=True, timeout=PATIENCE_S
     )  # fmt: skip
     found = [
         (topic, sequence, int(log_time), int(publish_time), base64.b64decode(data))
@@ -94,7 +95,7 @@ def test_node_validates_json_channels_against_their_schemas(
     run(capsys, "convert", bag, "--out", tmp_path / "json", "--json-channels")
     done = subprocess.run(
         ["node", node_reader.with_name("read_json.mjs"), tmp_path / "json" / "json_0.mcap"],
-        capture_output=True, text=True, check=False, timeout=60,
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     with BagReader(bag) as reader:

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.conftest import PATIENCE_S, Ros, finish, read_bag, wait_for
 from tests.nodes.conftest import LOW_BATTERY_J
 from tests.support.fake_autopilot.flight import Fake, fake
 from uav_dc_ros import bag as bag_command
@@ -85,7 +85,7 @@ def killed(ros: Ros, node: str, run_all: subprocess.Popen[str]) -> float:
     return time.monotonic()
 
 
-def until(condition: Callable[[], Any], process: subprocess.Popen[str], seconds: float = 90.0) -> None:
+def until(condition: Callable[[], Any], process: subprocess.Popen[str], seconds: float = PATIENCE_S) -> None:
     end_s = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()[0]
@@ -318,7 +318,7 @@ def test_who_is_stopped_in_the_air_brings_the_vehicle_home(
         process.send_signal(number)
         status, output = finish(process)
         assert status == wanted, output
-        end_s = time.monotonic() + 90.0
+        end_s = time.monotonic() + PATIENCE_S
         while (report := autopilot.report())["armed"]:
             assert time.monotonic() < end_s
             time.sleep(0.05)

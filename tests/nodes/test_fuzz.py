@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.conftest import Ros
+from tests.conftest import PATIENCE_S, Ros
 from tests.nodes import garbage
 from uav_dc_ros import cdr, messages, scenarios
 from uav_dc_ros.errors import MessageError
@@ -123,7 +123,7 @@ def fly_under_fire(ros: Ros, scenario: Path, policy: Path, per_topic: int, overs
     )
     running = {"stranger": stranger, **nodes, "run_all": flight}
     try:
-        status, output = stranger.end(timeout_s=60 + per_topic / 100)
+        status, output = stranger.end(timeout_s=PATIENCE_S + per_topic / 100)
         assert status == 0, "\n".join([output, *("".join(each.lines[-50:]) for each in running.values())])
         told = json.loads(output.splitlines()[-1])
         for name, node in nodes.items():

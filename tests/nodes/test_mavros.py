@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 
-from tests.conftest import Ros
+from tests.conftest import PATIENCE_S, Ros
 from tests.support.fake_autopilot.mavros_flight import START, Fake, Flight, fake, mavros_of, node_in, spin
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.messages import Phase
@@ -28,7 +28,7 @@ def until(
     executor: DirectExecutor,
     vehicle: MavrosVehicle,
     right: Callable[[Telemetry], bool],
-    seconds: float = 90.0,
+    seconds: float = PATIENCE_S,
 ) -> Telemetry:
     """Hear until something is so."""
     end = time.monotonic() + seconds

@@ -16,7 +16,7 @@ import pytest
 import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from tests.conftest import Ros, each_once
+from tests.conftest import PATIENCE_S, Ros, each_once
 from tests.nodes import px4_messages
 from tests.nodes.conftest import SMALL
 from tests.support.fake_autopilot.common import FakeProcess
@@ -92,7 +92,10 @@ class Spun:
         return made
 
     def until(
-        self, done: Callable[[], object], beat: Callable[[], object] = lambda: None, seconds: float = 90.0
+        self,
+        done: Callable[[], object],
+        beat: Callable[[], object] = lambda: None,
+        seconds: float = PATIENCE_S,
     ) -> None:
         """Spin until something is so, with a beat every few milliseconds."""
         end_s = time.monotonic() + seconds
@@ -730,7 +733,7 @@ class Flight:
             assert bridge.move(bridge.step, action) is None
         vehicle.set_setpoint(bridge.setpoint)
 
-    def until(self, done: Callable[[], object], seconds: float = 90.0) -> None:
+    def until(self, done: Callable[[], object], seconds: float = PATIENCE_S) -> None:
         """Fly until something is so."""
         try:
             self.spun.until(done, self.tick, seconds)

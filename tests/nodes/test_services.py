@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from std_srvs.srv import Trigger
 
-from tests.conftest import Ros, finish, read_bag
+from tests.conftest import PATIENCE_S, Ros, finish, read_bag
 from tests.nodes.record.test_recorder import numbers, published, record, stop, talk
 from tests.support.fake_autopilot.mavros_flight import node_in
 from uav_dc_ros.bags.read import BagReader
@@ -113,7 +113,7 @@ def test_a_recorder_s_services(ros: Ros) -> None:
         *(True, False, True, True, False)
     ]
     client.communicate()
-    talker.communicate(timeout=90)
+    talker.communicate(timeout=PATIENCE_S)
     output = stop(recorder)
     assert "service snapshot: " in output
     bag = ros.folder / "bag"
@@ -157,7 +157,7 @@ def test_run_all_waits_for_the_start(ros: Ros) -> None:
     assert client.stdin is not None
     assert client.stdout is not None
     response = {"success": False, "message": ""}
-    deadline_s = time.monotonic() + 90.0
+    deadline_s = time.monotonic() + PATIENCE_S
     while not response["success"]:
         assert time.monotonic() < deadline_s, response
         client.stdin.write(json.dumps({"call": "/start"}) + "\n")

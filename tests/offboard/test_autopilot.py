@@ -9,6 +9,7 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from tests.conftest import PATIENCE_S
 from tests.support.fake_autopilot.flight import Fake, fake
 
 SPEED = 40.0
@@ -24,7 +25,9 @@ class Client:
         self.link = mavutil.mavlink_connection(autopilot.address, dialect="ardupilotmega", retries=1)
         self.t_s = 0.0
 
-    def until(self, name: str, right: Callable[[Any], bool] = lambda m: True, seconds: float = 90.0) -> Any:
+    def until(
+        self, name: str, right: Callable[[Any], bool] = lambda m: True, seconds: float = PATIENCE_S
+    ) -> Any:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             message = self.link.recv_match(blocking=True, timeout=0.5)

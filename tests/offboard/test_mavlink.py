@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from tests.conftest import PATIENCE_S
 from tests.support.fake_autopilot.flight import ROOT, Fake, fake, free_udp_port
 from uav_dc_ros.errors import VehicleError
 from uav_dc_ros.offboard.flight_stacks import ARDUCOPTER, PX4
@@ -121,7 +122,7 @@ def test_a_mode_that_is_asked_for_is_the_one_that_is_understood(dialect: Any) ->
 def until(
     vehicle: MavlinkVehicle, right: Callable[[Telemetry], bool], setpoint: Enu | None = None
 ) -> Telemetry:
-    end = time.monotonic() + 90.0
+    end = time.monotonic() + PATIENCE_S
     while not right(known := vehicle.telemetry()):
         assert time.monotonic() < end, known
         vehicle.set_setpoint(setpoint)
@@ -298,7 +299,7 @@ def test_on_a_port_that_several_vehicles_send_to_the_right_one_is_answered() -> 
         vehicle = stack.enter_context(MavlinkVehicle(f"udpin:127.0.0.1:{port}", system=1))
         until(vehicle, lambda known: known.missing == "no heartbeat from an autopilot of system 1")
         heard: list[Any] = []
-        ends_s = time.monotonic() + 90.0
+        ends_s = time.monotonic() + PATIENCE_S
         while sum(message.get_type() == "COMMAND_LONG" for message in heard) < 20:
             assert time.monotonic() < ends_s
             for one, codec in zip(sockets, codecs.values(), strict=True):

@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from tests.conftest import PATIENCE_S
 from tests.support.fake_autopilot.streaming import off_beat_ms
 from uav_dc_ros.offboard.mavlink.vehicle import MavlinkVehicle
 from uav_dc_ros.offboard.setpoint_stream import use_realtime_priority
@@ -38,7 +39,7 @@ def test_the_thread_that_streams_runs_when_it_is_due() -> None:
     if not _may():
         pytest.skip("this process may not set it")
     with MavlinkVehicle("tcp:127.0.0.1:1") as vehicle:
-        end_s = time.monotonic() + 90.0
+        end_s = time.monotonic() + PATIENCE_S
         while "refused" not in str(vehicle.telemetry().missing):  # by then it runs
             assert time.monotonic() < end_s
             time.sleep(0.01)

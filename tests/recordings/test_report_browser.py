@@ -26,7 +26,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright drive
 # WebGL without a GPU; the sandbox of a browser does not work for root, as in containers.
 WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 ROOT = ("--no-sandbox",) if os.geteuid() == 0 else ()
-DRAWN_MS = 60_000
+DRAWN_MS = 200_000
 DESKTOP, PHONE = {"width": 1010, "height": 600}, {"width": 360, "height": 640}
 SMALL = {"width": 600, "height": 400}  # without a GPU, the time to draw in 3D grows with the pixels
 # Position of the UAV in the scene, and of the line in a chart, as Plotly holds them.

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros
+from tests.conftest import PATIENCE_S, Ros
 from uav_dc_ros import cli
 from uav_dc_ros.cli import Output
 
@@ -90,7 +90,7 @@ def test_missions_outlive_their_terminal_and_a_full_disk(ros: Ros) -> None:
             cwd=ros.folder,
             stdout=full,
             stderr=full,
-            timeout=120,
+            timeout=PATIENCE_S,
             check=False,
         )
     assert full_disk.returncode == 0

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rclpy.parameter import Parameter
 
-from tests.conftest import Ros, finish
+from tests.conftest import PATIENCE_S, Ros, finish
 from tests.support.fake_autopilot.mavros_flight import node_in
 from uav_dc_ros.nodes.framework.node_table import NODES, WORLD_BESIDE_BRIDGE
 from uav_dc_ros.nodes.framework.parameters import COMMON
@@ -34,7 +34,7 @@ class ServiceClient:
         return answer
 
     def close(self) -> None:
-        self.process.communicate(timeout=90)
+        self.process.communicate(timeout=PATIENCE_S)
 
 
 @pytest.fixture

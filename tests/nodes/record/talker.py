@@ -39,7 +39,7 @@ def talk(node: Any, row: dict[str, Any]) -> None:
     )
     publisher = node.create_publisher(kind, row["topic"], profile)
     if not row.get("latched"):
-        deadline_s = time.monotonic() + row.get("patience_s", 90.0)
+        deadline_s = time.monotonic() + row.get("patience_s", 200.0)
         while not publisher.get_subscription_count() and time.monotonic() < deadline_s:
             time.sleep(0.005)
         time.sleep(0.3)  # a publisher may know of a subscriber before that one knows of it

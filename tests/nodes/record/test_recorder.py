@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from tests.conftest import Ros, finish, wait_for
+from tests.conftest import PATIENCE_S, Ros, finish, wait_for
 from uav_dc_ros.bags.read import BagReader
 from uav_dc_ros.bags.salvage.repair import repair
 
@@ -40,7 +40,7 @@ def published(talker: subprocess.Popen[str], *, leave: bool = True) -> dict[str,
     assert talker.stdout is not None
     counts: dict[str, int] = json.loads(talker.stdout.readline())
     if leave:
-        talker.communicate(timeout=90)
+        talker.communicate(timeout=PATIENCE_S)
     return counts
 
 
@@ -93,7 +93,7 @@ def test_whatever_is_published_is_recorded_also_late_and_with_its_qos(ros: Ros) 
     )
     counts = published(talker, leave=False)
     output = stop(recorder)
-    talker.communicate(timeout=90)
+    talker.communicate(timeout=PATIENCE_S)
     bag = ros.folder / "bag"
     for topic in ("/reliable", "/late", "/map"):
         assert numbers(bag, topic) == list(range(counts[topic])), topic
@@ -203,7 +203,7 @@ def test_every_dropped_message_is_counted(ros: Ros, reliable: bool) -> None:
     recorder.send_signal(signal.SIGCONT)
     counts = published(talker, leave=False)
     output = stop(recorder)
-    talker.communicate(timeout=90)
+    talker.communicate(timeout=PATIENCE_S)
     with BagReader(ros.folder / "bag") as reader:
         recorded = reader.topics["/a"].count
         dropped = reader.dropped
@@ -282,7 +282,7 @@ def test_a_mission_s_bag_has_all_of_its_namespace_and_nothing_of_another_mission
     )
     published(talker, leave=False)
     status, output = finish(flight)
-    talker.communicate(timeout=90)
+    talker.communicate(timeout=PATIENCE_S)
     assert status == 0, output
     assert numbers(ros.folder / "bag", "/camera/info") == list(range(20))
     with BagReader(ros.folder / "bag") as reader:

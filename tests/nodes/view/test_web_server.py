@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros
+from tests.conftest import PATIENCE_S, Ros
 from tests.nodes.view.test_web_feed import Flight
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.nodes.view.web import server
@@ -33,7 +33,7 @@ def serving(token: str = "") -> Iterator[tuple[Flight, ViewServer]]:
 
 def answer(port: int, path: str, host: str | None = None) -> tuple[int, bytes, str]:
     """Status, body and content policy."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     connection.request("GET", path, headers={"Host": host or f"127.0.0.1:{port}"})
     response = connection.getresponse()
     body = response.read() if response.getheader("Content-Length") else response.fp.readline()
@@ -42,7 +42,7 @@ def answer(port: int, path: str, host: str | None = None) -> tuple[int, bytes, s
 
 
 def stream(port: int) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     connection.request("GET", "/news")
     return connection.getresponse()
 

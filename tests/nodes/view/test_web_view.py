@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, finish, wait_for
+from tests.conftest import PATIENCE_S, Ros, finish, wait_for
 from tests.nodes.view.foxglove_client import is_free
 from uav_dc_ros import scenarios
 
@@ -45,7 +45,7 @@ def test_a_page_receives_the_mission_and_ends_with_it(
     ros: Ros, small_scenario: Path, small_policy: Path
 ) -> None:
     flight, port = start(ros, small_scenario, small_policy, "--pace", 100, "--namespace", "uav1", "--seed", 7)
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     connection.request("GET", "/news")
     lines = connection.getresponse().read().decode().split("\n")  # until the end of the run
     status, output = finish(flight)
@@ -75,10 +75,10 @@ class Opened:
         own = re.compile(rf"http://127\.0\.0\.1:{port}/|data:")
         self.page.on("request", lambda asked: own.match(asked.url) or self.wrong.append(asked.url))
         self.page.goto(f"http://127.0.0.1:{port}/")
-        self.page.locator("canvas.scene3d").first.wait_for(timeout=60_000)
+        self.page.locator("canvas.scene3d").first.wait_for(timeout=1000 * PATIENCE_S)
 
     def wait(self, expression: str, argument: Any = None) -> None:
-        self.page.wait_for_function(expression, arg=argument, timeout=60_000)
+        self.page.wait_for_function(expression, arg=argument, timeout=1000 * PATIENCE_S)
 
 
 @pytest.mark.long
@@ -119,7 +119,7 @@ def test_a_browser_sees_two_uavs_move_and_goes_back_in_time(ros: Ros) -> None:
             status, output = finish(flight)
             assert status == 0, output
             for opened in (desktop, phone):
-                opened.page.locator("#link", has_text="The run has ended").wait_for(timeout=60_000)
+                opened.page.locator("#link", has_text="The run has ended").wait_for(timeout=1000 * PATIENCE_S)
             desktop.page.get_by_label("Step", exact=True).focus()
             desktop.page.keyboard.press("Home")
             desktop.wait(f"() => String(({UAV})('/uav1')) === '{begin}'")
@@ -149,7 +149,7 @@ def test_on_a_terminal_the_page_stays_until_ctrl_c(
         shown += os.read(terminal, 4096).decode(errors="replace")
     match = re.search(r"http://127\.0\.0\.1:(\d+)/ until Ctrl-C", shown)
     assert match is not None, shown
-    connection = http.client.HTTPConnection("127.0.0.1", int(match[1]), timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", int(match[1]), timeout=PATIENCE_S)
     connection.request("GET", "/news")
     response = connection.getresponse()
     news = json.loads(response.fp.readline().removeprefix(b"data: "))
