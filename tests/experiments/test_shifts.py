@@ -143,6 +143,63 @@ def test_users_of_a_list_are_changed_all_or_one_by_one():
         shifted(scenario, "users.user.height_m=+1")
 
 
+LISTED = {
+    "user": [
+        {"x_m": 0.0, "y_m": 0.0, "cluster": "a"},
+        {"x_m": 90.0, "y_m": 0.0},
+        {"x_m": 0.0, "y_m": 10.0, "cluster": "a"},
+        {"x_m": 90.0, "y_m": 0.0},
+    ],
+    "v_max_mps": 1.0,
+}
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_each_cluster_is_a_share_of_the_distance_to_the_nearest_one_off_the_map(listed):
+    scenario = scenarios.load("five_clusters_hover")
+    if listed:
+        scenario = from_values(msgspec.to_builtins(tiny()) | {"users": LISTED}, "test")
+    world = shifted(scenario, "users.position_error=20%")
+    before, after = (np.asarray(one.cluster_centres_m) for one in (scenario, world.scenario))
+    apart_m = np.linalg.norm(before[:, None] - before, axis=-1)
+    nearest_m = np.where(np.eye(len(before), dtype=bool), np.inf, apart_m).min(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(after - before, axis=1), 0.2 * nearest_m, atol=1e-9)
+    assert world.known == scenario, "the map is the old one"
+    assert shifted(scenario, "users.position_error=20%") == world, "the same for equal scenarios"
+    (west_m, south_m), (east_m, north_m) = scenario.grid.area_m
+    assert ((after >= (west_m, south_m)) & (after <= (east_m, north_m))).all()
+    ways = np.asarray(world.scenario.user_centres_m) - np.asarray(scenario.user_centres_m)
+    for cluster in range(scenario.n_clusters):
+        assert np.ptp(ways[scenario.user_cluster == cluster], axis=0) == pytest.approx(0.0, abs=1e-9)
+    directions = {tuple(np.sign(way)) for way in (after - before)[nearest_m > 0.0]}
+    assert listed or len(directions) > 1, "not all the same way"
+
+
+def test_a_finer_grid_is_the_same_field_with_the_same_uav():
+    scenario = changed("five_clusters_hover", energy={"battery_j": 3e5, "cruise_mps": 9.0})
+    world = shifted(scenario, "grid.cells=x3").scenario
+    assert world.grid.shape == (31, 31, 7)
+    for cell, finer in (
+        (scenario.grid.last_cell, world.grid.last_cell),
+        (scenario.start_cell, world.start_cell),
+    ):
+        at_m, finer_m = (
+            one.grid.centre_m(np.asarray(at), like=np.zeros(1))
+            for one, at in ((scenario, cell), (world, finer))
+        )
+        np.testing.assert_allclose(finer_m, at_m)
+    assert world.dock_cell == (30, 30)
+    speeds = [one.grid.cell_m / one.mission.step_s for one in (scenario, world)]
+    assert speeds[0] == pytest.approx(speeds[1])
+    times = [one.mission.max_steps * one.mission.step_s for one in (scenario, world)]
+    assert times[0] == pytest.approx(times[1])
+    hover_j = [one.step_energies_j.hover * one.mission.max_steps for one in (scenario, world)]
+    assert hover_j[0] == pytest.approx(hover_j[1])
+    assert world.users == scenario.users
+    missions = roll_out(world, PLANNERS["fixed_tour"](world), range(2), service=False)
+    assert missions.landed.all()
+
+
 def test_a_policy_does_not_know_that_the_users_have_moved(tmp_path):
     five = scenarios.load("five_clusters_hover")
     made = policy.load(saved(tmp_path / "made", five, observation="map"))
@@ -227,6 +284,15 @@ def test_missing_users_are_a_share_of_each_mission_and_are_never_collected():
         ("users.missing=+30%", "'users.missing=+30%'; expected KEY=VALUE"),
         ("users.missing=0%", "users.missing = 0%; expected at least one and at most all of 50 users"),
         ("users.missing=101%", "users.missing = 101%; expected at least one and at most all of 50 users"),
+        ("users.position_error=20", "'users.position_error=20'; expected KEY=VALUE"),
+        ("users.position_error=0%", "users.position_error = 0%; expected above 0% and at most 100%"),
+        ("grid.cells=3", "'grid.cells=3'; expected KEY=VALUE"),
+        ("grid.cells=x1.5", "grid.cells = x1.5; expected x and a whole number from 2 to 999"),
+        ("grid.cells=x200", "grid.n_x = 2001; expected int <= 1000"),
+        (
+            "grid.cells=x2",
+            "--shift grid.cells=x2: policy 'five_clusters_hover_dueling' does not fit scenario",
+        ),
         ("radio.noise_power_dbm=+6%", "'radio.noise_power_dbm=+6%'; expected KEY=VALUE"),
         ("radio.noise_power_dbm", "'radio.noise_power_dbm'; expected KEY=VALUE"),
         ("radio.noise_power_dbm=nan", "'radio.noise_power_dbm=nan'; expected KEY=VALUE"),
@@ -242,6 +308,11 @@ def test_a_mistake_is_one_line_and_status_2(capsys, shift, complaint):
     err = capsys.readouterr().err
     assert complaint in err
     assert len(err.splitlines()) == 1
+
+
+def test_one_cluster_has_no_distance_to_another():
+    with pytest.raises(ScenarioError, match="the scenario has one cluster; expected two or more"):
+        shifted(tiny(), "users.position_error=20%")
 
 
 def test_shifts_are_given_once_and_without_a_picture(capsys):

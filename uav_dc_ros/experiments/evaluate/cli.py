@@ -40,7 +40,7 @@ from uav_dc_ros.experiments.evaluate.evaluation import (
 )
 from uav_dc_ros.experiments.evaluate.fields import evaluate_fields, show_fields
 from uav_dc_ros.experiments.evaluate.shifts import (
-    MISSING,
+    NO_KEYS,
     Shift,
     ShiftedWorld,
     ShiftRequest,
@@ -81,8 +81,9 @@ def main(argv: list[str] | None = None) -> None:
     add("--objective", type=weight, default=DEFAULT_WEIGHT, metavar="W", help=text)
     add("--json", type=Path, metavar="FILE", help="write evaluations and comparisons")
     add("--picture", type=Path, metavar="FILE.png", help="draw the mission with seed 0")
-    text = "fly also with values of the scenario changed: KEY=+DELTA, KEY=-DELTA, KEY=xFACTOR, KEY=VALUE, or "
-    text += "users.missing=SHARE%% for users that send nothing; several with ',' between; may be repeated"
+    text = "fly also with values of the scenario changed: KEY=+DELTA, KEY=-DELTA, KEY=xFACTOR, KEY=VALUE, "
+    text += "users.missing=SHARE%% for users that send nothing, users.position_error=SHARE%% of the distance "
+    text += "between clusters, or grid.cells=xN for a finer grid; several with ',' between; may be repeated"
     add("--shift", type=parse, action="append", default=[], metavar="KEY=CHANGE[,...]", help=text)
 
     def command() -> int:
@@ -281,7 +282,7 @@ def _shifts(worlds: Sequence[Evaluation], effects: Sequence[ShiftEffect]) -> Tab
 def _changes(shift: Shift) -> str:
     """A shift, with the numbers before and after each change."""
     numbers = [
-        "" if value.key == MISSING or isinstance(value.after, list) else f" ({value.before} -> {value.after})"
+        "" if value.key in NO_KEYS or isinstance(value.after, list) else f" ({value.before} -> {value.after})"
         for value in shift.values
     ]
     texts = shift.text.split(",")

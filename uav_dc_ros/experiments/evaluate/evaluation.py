@@ -20,7 +20,7 @@ from uav_dc_ros.core.stats import interval
 from uav_dc_ros.core.world import Act
 from uav_dc_ros.errors import FROM_TRAIN, UavDcError
 from uav_dc_ros.experiments.evaluate.rollout import Missions, roll_out, roll_out_trajectory
-from uav_dc_ros.experiments.evaluate.shifts import Shift, transmitting
+from uav_dc_ros.experiments.evaluate.shifts import Shift, senders
 
 # The missions on every policy card. Nothing is tuned or selected on them.
 TEST_SEEDS = range(100)
@@ -143,8 +143,7 @@ def evaluate_act(
 
     `shift` is that of the scenario, and `weight` that of the objective.
     """
-    sends = transmitting(scenario, seeds, shift.missing) if shift is not UNSET and shift.missing else None
-    missions = roll_out(scenario, act, seeds, transmitting=sends)
+    missions = roll_out(scenario, act, seeds, transmitting=senders(scenario, seeds, shift))
     of_missions = {f.name: getattr(missions, f.name) for f in fields(Missions)}
     values = {name: np.asarray(v, np.float64) for name, v in of_missions.items() if v is not None}
     values["landing_rate"] = values.pop("landed")

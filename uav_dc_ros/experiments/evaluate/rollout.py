@@ -12,7 +12,7 @@ from uav_dc_ros.core.objective import DEFAULT_WEIGHT, objective
 from uav_dc_ros.core.reward import Rewards
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.users.service import ServiceRecord
-from uav_dc_ros.core.world import Act, Layouts, rollout_steps
+from uav_dc_ros.core.world import Act, Layouts, State, rollout_steps
 from uav_dc_ros.env.trajectory import Trajectory
 
 
@@ -62,6 +62,20 @@ def roll_out(
 
     Without `service` the result lacks how users were served.
     """
+    return roll_out_to_end(scenario, act, seeds, layouts, rewards, transmitting, service=service)[0]
+
+
+def roll_out_to_end(
+    scenario: Scenario,
+    act: Act,
+    seeds: Sequence[int],
+    layouts: Layouts = (),
+    rewards: Rewards | None = None,
+    transmitting: Array | None = None,
+    *,
+    service: bool = True,
+) -> tuple[Missions, State]:
+    """As `roll_out`, and the state at the end of each mission."""
     steps = rollout_steps(scenario, act, seeds, layouts, rewards, transmitting)
     final, _ = next(steps)
     over = final.step < 0
@@ -86,7 +100,7 @@ def roll_out(
     if scenario.energy is not None:
         per_mbit_j = energy.per_mbit_j(final.energy_used_j, data_bits)
         battery = {"energy_used_j": final.energy_used_j, "energy_per_mbit_j": per_mbit_j}
-    return Missions(
+    missions = Missions(
         users_collected=np.sum(final.collected, axis=-1),
         landed=landed,
         steps=final.step,
@@ -98,6 +112,7 @@ def roll_out(
         **({} if record is None else record.figures(scenario, final.data_bits)),
         **battery,
     )
+    return missions, final
 
 
 def roll_out_trajectory(scenario: Scenario, act: Act, seed: int, layout: Array | None = None) -> Trajectory:

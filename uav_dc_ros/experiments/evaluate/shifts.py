@@ -2,6 +2,8 @@
 
 A policy knows its own vehicle and mission: it observes with the shifted scenario, as in a flight. It does not
 know that the users have moved: its map, the positions in `users`, is that of the scenario without the shift.
+
+Three changes are of no key of a scenario: `users.missing`, `users.position_error` and `grid.cells`.
 """
 
 import argparse
@@ -18,11 +20,15 @@ from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.keys import leaves
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import ScenarioError
+from uav_dc_ros.experiments.evaluate.field_shifts import misplaced, refined
 
-MISSING = "users.missing"  # the share of the users that sends nothing: no key of a scenario
+MISSING = "users.missing"  # the share of the users that sends nothing
+POSITION_ERROR = "users.position_error"  # see `field_shifts.misplaced`
+CELLS = "grid.cells"  # see `field_shifts.refined`
+NO_KEYS = {MISSING: "%", POSITION_ERROR: "%", CELLS: "x"}  # changes of no key of a scenario: operator of each
 EXPECTED = (
-    "expected KEY=VALUE (KEY==VALUE for a negative one), KEY=+DELTA, KEY=-DELTA, KEY=xFACTOR or "
-    f"{MISSING}=SHARE%, with ',' between"
+    "expected KEY=VALUE (KEY==VALUE for a negative one), KEY=+DELTA, KEY=-DELTA, KEY=xFACTOR, "
+    f"{MISSING}=SHARE%, {POSITION_ERROR}=SHARE% or {CELLS}=xN, with ',' between"
 )
 _KEY = r"\w+(?:\[[0-9]+\])*(?:\.\w+(?:\[[0-9]+\])*)*"
 _NUMBER = r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
@@ -35,7 +41,7 @@ class Change(NamedTuple):
     """A change of one key."""
 
     key: str  # dotted path, with `[i]` for an element of a list
-    operator: Operator  # `=` sets, `+` and `-` add, `x` multiplies, `%` is that of `MISSING`
+    operator: Operator  # `=` sets, `+` and `-` add, `x` multiplies, `%` is that of shares in `NO_KEYS`
     number: float
 
 
@@ -95,14 +101,8 @@ def apply(request: ShiftRequest, scenario: Scenario) -> ShiftedWorld:
     values = msgspec.json.decode(msgspec.json.encode(scenario))
     shifted = []
     for change in request.changes:
-        if change.key == MISSING:
-            share = change.number / 100.0
-            if not n_missing(scenario, share) or share > 1.0:
-                raise ScenarioError(
-                    f"{source}: {MISSING} = {change.number:g}%; expected at least one and at most all of "
-                    f"{scenario.n_users} users"
-                )
-            shifted.append(ShiftedValue(key=MISSING, before=0.0, after=share))
+        if change.key in NO_KEYS:
+            shifted.append(_shifted_field(change, values, scenario, source))
             continue
         holders = _find(values, change.key, source)
         before = [holder[part] for holder, part in holders]
@@ -117,6 +117,27 @@ def apply(request: ShiftRequest, scenario: Scenario) -> ShiftedWorld:
         )
     flown = from_values(values, source)
     return ShiftedWorld(flown, _placed_as(scenario, flown), Shift(text=request.text, values=shifted))
+
+
+def _shifted_field(change: Change, values: dict[str, Any], scenario: Scenario, source: str) -> ShiftedValue:
+    """Apply a change of no key to the plain values of a scenario, which change in place."""
+    key, number = change.key, change.number
+    if key == CELLS:
+        if number not in range(2, 1000):
+            raise ScenarioError(f"{source}: {key} = x{number:g}; expected x and a whole number from 2 to 999")
+        refined(values, int(number))
+        return ShiftedValue(key=key, before=1, after=int(number))
+    share = number / 100.0
+    if key == MISSING and (not n_missing(scenario, share) or share > 1.0):
+        n = scenario.n_users
+        raise ScenarioError(
+            f"{source}: {key} = {number:g}%; expected at least one and at most all of {n} users"
+        )
+    if key == POSITION_ERROR:
+        if not 0.0 < share <= 1.0:
+            raise ScenarioError(f"{source}: {key} = {number:g}%; expected above 0% and at most 100%")
+        misplaced(values, scenario, share, source)
+    return ShiftedValue(key=key, before=0.0, after=share)
 
 
 def _placed_as(before: Scenario, after: Scenario) -> Scenario:
@@ -145,12 +166,20 @@ def transmitting(scenario: Scenario, seeds: Sequence[int], missing: float) -> Ar
     return np.stack(ranks) >= n_missing(scenario, missing)
 
 
+def senders(scenario: Scenario, seeds: Sequence[int], shift: Shift | UnsetType) -> Array | None:
+    """Which users send in the missions of seeds after a shift, as `transmitting`; None: all."""
+    if shift is UNSET or not shift.missing:
+        return None
+    return transmitting(scenario, seeds, shift.missing)
+
+
 def _change(text: str) -> Change:
     match = _CHANGE.fullmatch(text.strip())
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r}; {EXPECTED}")
     key, sets, value, operator, number, percent = match.groups()
-    if (key == MISSING) != bool(percent) or (percent and (sets or operator)):
+    given = f"{sets or ''}{operator or ''}{percent or ''}"
+    if NO_KEYS.get(key, given) != given or (key not in NO_KEYS and percent):
         raise argparse.ArgumentTypeError(f"{text!r}; {EXPECTED}")
     return Change(key, cast(Operator, percent or sets or operator or "="), float(value or number))
 
