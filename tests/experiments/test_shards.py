@@ -16,6 +16,7 @@ from tests.support.worlds import tiny
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Hyperparameters
 from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments import code_hash, processes
 from uav_dc_ros.experiments.paper import shards, workers
 from uav_dc_ros.experiments.paper.shards import Shard
 from uav_dc_ros.experiments.paper.workers import train_locally
@@ -84,7 +85,7 @@ def test_a_shard_resumes_from_its_checkpoint(tmp_path, expected, monkeypatch):
     flown = []
     for stop in (3, 17, 30):
 
-        def interrupt(name, n_flown, stop=stop):
+        def interrupt(n_flown, stop=stop):
             flown.append(n_flown)
             if n_flown == stop:
                 raise KeyboardInterrupt
@@ -106,7 +107,7 @@ def test_a_shard_whose_worker_always_dies_is_given_up(tmp_path, monkeypatch):
     with pytest.raises(TrainingError, match=rf"{one.name} died 3 times.*exit code -9.*--resume"):
         train_locally([one], tmp_path, 1, kill)
     assert not multiprocessing.active_children()
-    assert workers._TRIES == 3
+    assert processes._TRIES == 3
 
 
 def test_ctrl_c_leaves_no_worker(tmp_path):
@@ -134,14 +135,14 @@ def test_names_differ_with_the_content():
 def copy_of_package(tmp_path):
     package = Path(uav_dc_ros.__file__).parent
     shutil.copytree(package, tmp_path / "uav_dc_ros", ignore=shutil.ignore_patterns("__pycache__", "share"))
-    assert shards.code_hash_of(tmp_path) == shards.code_hash()
+    assert code_hash.code_hash_of(tmp_path, shards.ROOTS) == shards.code_hash()
     return tmp_path / "uav_dc_ros"
 
 
 def name_after_a_change(package, *files):
     for path in (package / f"{file}.py" for file in files):
         path.write_text(path.read_text("utf-8") + "# changed\n", "utf-8")
-    return shards.code_hash_of(package.parent)
+    return code_hash.code_hash_of(package.parent, shards.ROOTS)
 
 
 def test_only_code_that_trains_changes_the_name(tmp_path):
@@ -163,8 +164,8 @@ def test_the_closure_has_what_training_really_imports():
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     root = Path(uav_dc_ros.__file__).parent.parent
-    real = {name for name in done.stdout.split() if shards._file(root, name).name != "__init__.py"}
-    assert real <= shards.import_closure(root, shards._ROOTS)
+    real = {name for name in done.stdout.split() if code_hash.file_of(root, name).name != "__init__.py"}
+    assert real <= code_hash.import_closure(root, shards.ROOTS)
 
 
 @pytest.mark.parametrize("damage", [lambda b: b[:-40], lambda b: b"", lambda b: b[:8] + b"[" + b[9:]])

@@ -6,10 +6,9 @@ the result of each shard. A shard whose file exists is not trained again; an int
 checkpoint. The workers need torch.
 """
 
-import ast
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -20,17 +19,17 @@ import safetensors.numpy
 from safetensors import SafetensorError
 
 import uav_dc_ros
-from uav_dc_ros import __version__, files
+from uav_dc_ros import files
 from uav_dc_ros.agents import network
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.errors import TrainingError
+from uav_dc_ros.experiments.code_hash import code_hash_of
 from uav_dc_ros.experiments.evaluate.rollout import Missions
 from uav_dc_ros.experiments.train.population import Population
 
-OnProgress = Callable[[str, int], None]  # gets the name of a shard, and the episodes flown by each run
 _CHECKPOINT_EVERY_S = 30.0
 # The modules that train a shard; everything that they import decides its result.
-_ROOTS = ("uav_dc_ros.experiments.paper.shards", "uav_dc_ros.experiments.train.checkpoint")
+ROOTS = ("uav_dc_ros.experiments.paper.shards", "uav_dc_ros.experiments.train.checkpoint")
 
 
 class Shard(msgspec.Struct, frozen=True, kw_only=True):
@@ -89,9 +88,12 @@ class ShardResult:
 
 
 def train_shard(
-    shard: Shard, checkpoint: Path | None = None, on_progress: OnProgress | None = None
+    shard: Shard, checkpoint: Path | None = None, on_progress: Callable[[int], None] | None = None
 ) -> ShardResult:
-    """Trains a shard on one core; saves its state in `checkpoint`, and resumes from it if it exists."""
+    """Trains a shard on one core; saves its state in `checkpoint`, and resumes from it if it exists.
+
+    `on_progress` gets the episodes flown by each run.
+    """
     import torch  # a process that only plans and collects does not need it
 
     from uav_dc_ros.experiments.train import checkpoint as checkpoints
@@ -105,7 +107,7 @@ def train_shard(
     while training.n_flown < shard.population.n_episodes:
         training.fly_episode()
         if on_progress:
-            on_progress(shard.name, training.n_flown)
+            on_progress(training.n_flown)
         if checkpoint and time.monotonic() - saved > _CHECKPOINT_EVERY_S:
             checkpoints.save(checkpoint, training, {})
             saved = time.monotonic()
@@ -151,54 +153,4 @@ def load_result(folder: Path, shard: Shard) -> ShardResult:
 @cache
 def code_hash() -> str:
     """Hash of the code that a shard's result depends on: a shard trained by other code is not resumed."""
-    return code_hash_of(Path(uav_dc_ros.__file__).parent.parent)
-
-
-def code_hash_of(root: Path) -> str:
-    """The same of the package in another folder."""
-    digest = hashlib.sha256(__version__.encode())
-    for name in sorted(import_closure(root, _ROOTS)):
-        digest.update(name.encode() + _file(root, name).read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def import_closure(root: Path, modules: Sequence[str]) -> set[str]:
-    """Full names of modules and of all modules of this package that they import, directly or not.
-
-    Imports are found in the source in the folder `root`, inside functions too. Those for type checkers are
-    left out, and so is the package's own file, which defines the version and imports nothing.
-    """
-    found: set[str] = set()
-    waiting = list(modules)
-    while waiting:
-        name = waiting.pop()
-        if name in found or name == uav_dc_ros.__name__ or not _file(root, name).is_file():
-            continue
-        found.add(name)
-        waiting += _imports(ast.parse(_file(root, name).read_bytes()))
-    return found
-
-
-def _file(root: Path, module: str) -> Path:
-    path = root.joinpath(*module.split("."))
-    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-
-
-def _imports(tree: ast.AST) -> Iterator[str]:
-    """Full names of what may be modules of this package."""
-    for node in ast.iter_child_nodes(tree):
-        match node:
-            case ast.If(test=ast.Name(id="TYPE_CHECKING")):
-                for other in node.orelse:
-                    yield from _imports(other)
-            case ast.Import():
-                yield from (alias.name for alias in node.names if _is_own(alias.name))
-            case ast.ImportFrom(module=str(module)) if _is_own(module):
-                yield module
-                yield from (f"{module}.{alias.name}" for alias in node.names)
-            case _:
-                yield from _imports(node)
-
-
-def _is_own(module: str) -> bool:
-    return module.partition(".")[0] == uav_dc_ros.__name__
+    return code_hash_of(Path(uav_dc_ros.__file__).parent.parent, ROOTS)

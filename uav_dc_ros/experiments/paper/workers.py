@@ -3,31 +3,18 @@
 Ray is in the extra `cluster`; every node of the cluster needs this package with torch.
 """
 
-import contextlib
 import logging
-import multiprocessing
 import os
-import signal
 import socket
-import sys
-import traceback
-from collections.abc import Sequence
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from uav_dc_ros import __version__
 from uav_dc_ros.errors import TrainingError
-from uav_dc_ros.experiments.paper.shards import (
-    OnProgress,
-    Shard,
-    checkpoint_file,
-    code_hash,
-    save_result,
-    train_shard,
-)
+from uav_dc_ros.experiments.paper.shards import Shard, checkpoint_file, code_hash, save_result, train_shard
+from uav_dc_ros.experiments.processes import OnProgress, run_tasks
 
-_TRIES = 3  # of a shard whose worker dies, on this machine
 _RAY_RETRIES = 5  # of a shard whose worker or node dies, on a cluster
 
 
@@ -37,64 +24,12 @@ def train_locally(shards: Sequence[Shard], folder: Path, n_workers: int, on_prog
     A worker that dies is replaced; the new one resumes from the checkpoint. Raises TrainingError if a shard
     failed, or its worker died three times.
     """
-    context = multiprocessing.get_context("spawn")  # a fork would inherit threads of torch and numpy
-    waiting = [(shard, 1) for shard in shards]
-    working: dict[Connection, tuple[SpawnProcess, Shard, int]] = {}
-    try:
-        while waiting or working:
-            while waiting and len(working) < n_workers:
-                shard, attempt = waiting.pop(0)
-                reader, writer = context.Pipe(duplex=False)
-                worker = context.Process(target=_work, args=(shard, folder, writer), daemon=True)
-                worker.start()
-                writer.close()
-                working[reader] = worker, shard, attempt
-            for ready in wait(list(working)):
-                assert isinstance(ready, Connection)
-                worker, shard, attempt = working[ready]
-                try:
-                    message = ready.recv()
-                except (EOFError, OSError):  # the worker has ended
-                    worker.join()
-                    ready.close()
-                    del working[ready]
-                    if worker.exitcode != 0:
-                        if attempt == _TRIES:
-                            raise TrainingError(
-                                f"the worker of {shard.name} died {_TRIES} times, at last with exit code "
-                                f"{worker.exitcode}; finished shards are saved, and --resume continues"
-                            ) from None
-                        waiting.insert(0, (shard, attempt + 1))
-                    continue
-                if isinstance(message, str):
-                    raise TrainingError(f"{shard.name} failed: {message}")
-                on_progress(shard.name, message)
-    finally:
-        for reader, (worker, _, _) in working.items():
-            worker.kill()  # a checkpoint is complete at any moment
-            worker.join()
-            reader.close()
+    run_tasks(shards, partial(_train, folder), n_workers, on_progress, "--resume continues")
 
 
-def _work(shard: Shard, folder: Path, parent: Connection) -> None:
-    """In a worker: trains a shard; sends episodes flown, or an error message, to the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-
-    def on_progress(_: str, n_flown: int) -> None:
-        try:
-            parent.send(n_flown)
-        except BrokenPipeError:
-            sys.exit("the parent process has ended")
-
-    try:
-        trained = train_shard(shard, checkpoint_file(folder, shard), on_progress)
-        save_result(folder, shard, trained.to_bytes())
-    except Exception as error:
-        if not isinstance(error, TrainingError):
-            traceback.print_exc()
-        with contextlib.suppress(OSError):
-            parent.send(str(error) or repr(error))
-        sys.exit(1)
+def _train(folder: Path, shard: Shard, on_progress: Callable[[int], None]) -> None:
+    trained = train_shard(shard, checkpoint_file(folder, shard), on_progress)
+    save_result(folder, shard, trained.to_bytes())
 
 
 def train_on_ray(shards: Sequence[Shard], folder: Path, address: str, on_progress: OnProgress) -> None:
