@@ -8,26 +8,14 @@ which prepares tables, and the median, the 99th percentile and the maximum of th
 """
 
 import argparse
-import time
 
 import numpy as np
 
 from uav_dc_ros import scenarios
-from uav_dc_ros.core.world import Act, State, rollout_steps
+from uav_dc_ros.core.world import rollout_steps
 from uav_dc_ros.experiments.evaluate.cli import candidates
+from uav_dc_ros.experiments.leaderboard.decision_times import timed
 from uav_dc_ros.planners import PLANNERS
-
-
-def timed(act: Act, times_s: list[float]) -> Act:
-    """The actions of `act`; adds the CPU time of each decision to `times_s`."""
-
-    def measured(state: State) -> np.ndarray:
-        begun_s = time.process_time()
-        action = act(state)
-        times_s.append(time.process_time() - begun_s)
-        return action
-
-    return measured
 
 
 def main() -> None:

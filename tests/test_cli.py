@@ -20,6 +20,7 @@ COMMANDS = (
     ("train", "--help"),
     ("evaluate", "--help"),
     ("optimum", "--help"),
+    ("leaderboard", "--help"),
     ("paper", "--help"),
     ("bag", "--help"),
     ("bag", "info", "--help"),

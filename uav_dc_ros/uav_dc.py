@@ -17,6 +17,10 @@ VERBS = {
         "uav_dc_ros.experiments.optimum.cli",
         "bound what is possible, and how far policies are from it",
     ),
+    "leaderboard": (
+        "uav_dc_ros.experiments.leaderboard.cli",
+        "fly policies and planners in many worlds, and write their standings",
+    ),
     "paper": ("uav_dc_ros.experiments.paper.cli", "reproduce every figure of the paper, and test its claims"),
     "bag": ("uav_dc_ros.bag", "record, play, recover, verify and explain bags"),
     "scenario": ("uav_dc_ros.scenario", "make, check and draw scenarios"),
