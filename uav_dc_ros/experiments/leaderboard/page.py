@@ -84,7 +84,7 @@ def _board(board: Standings, baseline: str, *, titled: bool) -> list[str]:
             "them are proved to be the best."
         )
     elif board.section != "shifts":
-        facts += " No bound is known here."
+        facts += " No mission has a bound."
     shifted = any(row.shift_effect is not UNSET for row in board.rows)
     header = ["", "J", *(["J less unshifted"] if shifted else ["of the bound"])]
     header += ["users", "data", "landed", "arrival / T_cons", f"J less {baseline}", "above, below"]
