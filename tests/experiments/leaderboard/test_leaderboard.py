@@ -156,11 +156,12 @@ def test_other_causes_are_other_files(tmp_path):
     ]
     planner = flights.Contestant(name="a", argument="a")
     policy = msgspec.structs.replace(planner, sha256="0")
+    searching = msgspec.structs.replace(policy, search=8)
     changes = {"weight": 0.5, "n_missions": 2, "worlds": (BoardWorld(scenario="random:1"),)}
     others = [msgspec.structs.replace(block, **{key: value}) for key, value in changes.items()]
     files = [flights.result_file(tmp_path, one, planner) for one in (block, *others)]
-    files += [flights.result_file(tmp_path, block, policy)]
-    assert len(set(files)) == 5
+    files += [flights.result_file(tmp_path, block, one) for one in (searching, policy)]
+    assert len(set(files)) == 6
     moved = msgspec.structs.replace(policy, argument="elsewhere", name="b")
     assert flights.result_file(tmp_path, block, moved) == files[-1], "the same policy in another folder"
     wider = msgspec.structs.replace(block, width=10)
@@ -255,6 +256,11 @@ def test_a_sheet_has_a_tile_for_each_flight(here, tmp_path):
             ["--policy", "elsewhere"],
             "--policy test: it flies in 'tiny' only; expected a policy for any field, or",
         ),
+        (["--search", "8"], "--search 8 without --policy; expected a policy that searches"),
+        (
+            ["--policy", "copy"],
+            "another policy has the name 'five_clusters_dueling'; expected a name of its own",
+        ),
         (["--only", "shift"], "argument --only: invalid choice: 'shift'"),
         (["--fields", "0"], "argument --fields: '0'; expected a whole number of at least 1"),
         (["--objective", "2"], "argument --objective: '2'; expected a weight"),
@@ -263,6 +269,7 @@ def test_a_sheet_has_a_tile_for_each_flight(here, tmp_path):
 )
 def test_a_mistake_is_one_line_and_status_2(here, capsys, options, complaint):
     saved(here / "elsewhere", tiny())
+    saved(here / "copy", scenarios.load("farm"), name="five_clusters_dueling")
     assert command(*options) == 2
     error = capsys.readouterr().err
     assert complaint in error

@@ -25,6 +25,7 @@ from uav_dc_ros.experiments.leaderboard.worlds import SECTIONS, Board, Sizes, bo
 from uav_dc_ros.experiments.processes import run_tasks
 from uav_dc_ros.experiments.train.progress import ProgressBar
 from uav_dc_ros.planners import PLANNERS
+from uav_dc_ros.run_config import SEARCH_MAX
 
 PROG = "python -m uav_dc_ros.leaderboard"
 REPORT_FILE = "leaderboard.json"
@@ -44,6 +45,9 @@ def parser() -> cli.Parser:
     )
     text += "their own. The first one for any field is what all are compared with, without one search"
     add("--policy", nargs="+", default=[], metavar="NAME|DIR", help=text)
+    text = "missions of a search on top of the given policies, which fly also without; see evaluate --search"
+    number = cli.whole_number(1, SEARCH_MAX, f"a whole number from 1 to {SEARCH_MAX}")
+    add("--search", type=number, nargs="+", default=[], metavar="N", help=text)
     add(
         "--planners",
         nargs="+",
@@ -99,9 +103,10 @@ def _leaderboard(options: argparse.Namespace) -> int:
     sizes = Sizes(
         fields=options.fields, missions=options.missions, variants=options.variants, bounds=options.bounds
     )
-    entrants = _entrants(options.planners, options.policy)
+    entrants = _entrants(options.planners, options.policy, options.search)
     contestants = {
-        one.name: Contestant(name=one.name, argument=one.argument, sha256=one.sha256) for one in entrants
+        one.name: Contestant(name=one.name, argument=one.argument, sha256=one.sha256, search=one.search)
+        for one in entrants
     }
     baseline = _baseline(entrants)
     planned = boards(sizes, tuple(options.only))
@@ -147,19 +152,24 @@ def _leaderboard(options: argparse.Namespace) -> int:
     return 0
 
 
-def _entrants(planners: Sequence[str], given: Sequence[str]) -> list[Agent]:
-    """Planners, shipped policies and the given ones."""
-    known = [name for name in policies.names() if name not in given]
-    if known_twice := [name for name in given if name in PLANNERS]:
-        raise UavDcError(f"--policy {known_twice[0]}: a planner; expected --planners {known_twice[0]}")
-    entrants = candidates([*dict.fromkeys(planners), *known, *given])
-    for one in entrants:
-        if one.home is not None and not _for_any_field(one) and one.home.name not in scenarios.names():
+def _entrants(planners: Sequence[str], given: Sequence[str], searches: Sequence[int]) -> list[Agent]:
+    """Planners, shipped policies, and the given ones, these also with each search."""
+    if planner := next((name for name in given if name in PLANNERS), None):
+        raise UavDcError(f"--policy {planner}: a planner; expected --planners {planner}")
+    if searches and not given:
+        raise UavDcError(f"--search {searches[0]} without --policy; expected a policy that searches")
+    shipped = [name for name in policies.names() if name not in given]
+    every = candidates([*dict.fromkeys(planners), *shipped], [0]) + candidates(given, [0, *searches])
+    names = [one.name for one in every]
+    if double := next((name for name in names if names.count(name) > 1), None):
+        raise UavDcError(f"--policy: another policy has the name {double!r}; expected a name of its own")
+    for one in every:
+        if not _for_any_field(one) and one.home is not None and one.home.name not in scenarios.names():
             raise UavDcError(
                 f"--policy {one.name}: it flies in {one.home.name!r} only; expected a policy for any field, "
                 f"or for one of {', '.join(scenarios.names())}"
             )
-    return entrants
+    return every
 
 
 def _baseline(entrants: Sequence[Agent]) -> Agent:

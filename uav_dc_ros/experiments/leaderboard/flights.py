@@ -42,6 +42,7 @@ class Contestant(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     argument: str  # for `agent.load`
     sha256: str | None = None  # of a policy
+    search: int = 0  # see `Agent.search`
 
 
 class Block(msgspec.Struct, frozen=True, kw_only=True):
@@ -109,7 +110,7 @@ def task(board: Board, i: int, block: Block, contestants: Sequence[Contestant], 
 def fly(folder: Path, task: FlightTask, on_progress: Callable[[int], None]) -> None:
     """Fly what is missing of a block, and save it; `on_progress` gets the steps done, see `n_steps`."""
     block = task.block
-    loaded = [(one, agents.load(one.argument)) for one in task.contestants]
+    loaded = [(one, agents.load(one.argument, one.search)) for one in task.contestants]
     flown: dict[Contestant, list[BlockResult]] = {one: [] for one in task.contestants}
     if task.contestants:
         for n, world in enumerate(block.worlds, start=1):
@@ -189,7 +190,8 @@ def load_bounds(folder: Path, block: Block) -> Bounds:
 
 def result_file(folder: Path, block: Block, contestant: Contestant) -> Path:
     """File of a contestant's result in a block."""
-    identity = (contestant.sha256 or contestant.name, block.worlds, block.n_missions, block.weight)
+    who = (contestant.sha256 or contestant.name, contestant.search)
+    identity = (who, block.worlds, block.n_missions, block.weight)
     return folder / f"{_name(identity)}.json"
 
 
