@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from msgspec import UNSET, UnsetType
 
 from uav_dc_ros.experiments.evaluate.evaluation import OBJECTIVE_IN_WORDS, Figure
-from uav_dc_ros.experiments.leaderboard.standings import LeaderboardReport, ListedFlight, Row, Standings
+from uav_dc_ros.experiments.leaderboard.standings import BoardRow, LeaderboardReport, ListedFlight, Standings
 
 PAGE_FILE, FLIGHTS_PICTURE, WORST_PICTURE = "README.md", "flights.png", "worst.png"
 _TITLES = {
@@ -93,7 +93,7 @@ def _board(board: Standings, baseline: str, *, titled: bool) -> list[str]:
     return found + [f"`{name}` does not fly: {_sentence(why)}" for name, why in board.refused.items()]
 
 
-def _row(row: Row, shifted: bool) -> list[str]:
+def _row(row: BoardRow, shifted: bool) -> list[str]:
     compared = row.differences is not UNSET
     return [
         f"`{row.policy}`",

@@ -21,7 +21,7 @@ _SHARE = (0.0, 1.0)  # possible values
 _EQUAL = 1e-12  # of two values of J
 
 
-class Row(msgspec.Struct, frozen=True, kw_only=True):
+class BoardRow(msgspec.Struct, frozen=True, kw_only=True):
     """A contestant on a board. A figure is over the fields, or over the missions of a single world."""
 
     policy: str
@@ -52,7 +52,7 @@ class Standings(msgspec.Struct, frozen=True, kw_only=True):
     bound: float | None  # mean of the bounds
     found: float | None  # mean J of the best missions that were found with the walks known
     n_optimal: int  # of these, missions that are proved to be the best
-    rows: list[Row]  # the highest J first
+    rows: list[BoardRow]  # the highest J first
     refused: dict[str, str]  # why a contestant does not fit, by its name
 
 
@@ -170,12 +170,12 @@ def _row(
     results: BoardResults,
     baseline: BlockResult | None,
     unshifted: BoardResults | None,
-) -> Row:
+) -> BoardRow:
     units = _units(results.board)
     mine = _figures(flown, units)
     bounds = results.bounds.bound
     pairs = [(value, b) for value, b in zip(flown.objective[: len(bounds)], bounds, strict=True) if b]
-    row = Row(
+    row = BoardRow(
         policy=name,
         objective=figure(mine["objective"], _SHARE),
         users=figure(mine["users"], _SHARE),
