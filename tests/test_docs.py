@@ -29,7 +29,7 @@ DOCS, PACKAGE = ROOT / "docs", ROOT / "uav_dc_ros"
 WRITTEN = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(
     DOCS.glob("*.md")
 )
-LINKED = [*WRITTEN, *sorted(DOCS.glob("*/*.md"))]
+LINKED = [*WRITTEN, *sorted(DOCS.glob("paper/*.md"))]
 COMMANDS = [(path.name, words) for path in WRITTEN for words in commands(path.read_text("utf-8"))]
 # The glossary's worst: words that a reader has to interpret.
 REFUSED = re.compile(
@@ -151,7 +151,7 @@ def test_words_are_the_field_s(path: Path) -> None:
 
 def helps() -> Iterator[tuple[str, list[str]]]:
     """Each command's module, and the arguments that show its help."""
-    for module in ("run_all", "train", "evaluate", "optimum", "leaderboard", "paper", "bag"):
+    for module in ("run_all", "train", "evaluate", "optimum", "paper", "bag"):
         yield module, ["--help"]
     for verb in bag.VERBS:
         yield "bag", [verb, "--help"]

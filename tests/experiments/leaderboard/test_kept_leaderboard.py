@@ -5,6 +5,7 @@ import re
 import msgspec
 import pytest
 
+from tests import test_docs
 from tests.conftest import ROOT
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.experiments.leaderboard import cli, page
@@ -35,3 +36,12 @@ def test_each_of_the_worst_flights_is_explained(report):
     explained = re.findall(r"`(random:\d+)`", text)
     assert {one.scenario for one in report.worst} <= set(explained)
     assert f"`{report.baseline}`" in text
+
+
+@pytest.mark.parametrize("name", [page.PAGE_FILE, "decision_times.md"])
+def test_its_links_resolve(name):
+    test_docs.test_every_link_and_anchor_resolves(KEPT / name)
+
+
+def test_words_of_help_are_the_field_s(capsys):
+    test_docs.test_words_of_help_are_the_field_s("leaderboard", ["--help"], capsys)
