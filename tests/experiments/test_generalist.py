@@ -48,6 +48,14 @@ def test_the_rewards_of_a_mission_add_up_to_its_objective(masked):
     np.testing.assert_allclose(total[~landed], -(1.0 - weights.reshape(-1))[~landed], atol=1e-4)
 
 
+def test_layouts_have_all_that_is_drawn():
+    drawn = [layouts.draw(seed) for seed in range(30)]
+    assert sum(bool(one.obstacles) for one in drawn) > 0
+    assert sum(bool(one.users.user) for one in drawn) > 0
+    assert sum(one.energy is not None for one in drawn) > 0
+    assert {one.radio.interference for one in drawn} == {"all", "associated", "none"}
+
+
 def test_lambda_returns_are_those_of_the_definition():
     rng = np.random.default_rng(0)
     reward, best = rng.random((2, 6, 3))

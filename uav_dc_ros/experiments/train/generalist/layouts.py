@@ -141,7 +141,8 @@ def _users(rng: np.random.Generator, size_m: tuple[float, float], cell_m: float)
 
 def _zone(rng: np.random.Generator, wide_m: float, high_m: float, cell_m: float) -> dict[str, Any]:
     """A rectangular no-fly zone, plain values."""
-    (x_m, y_m), (a_m, b_m) = rng.uniform(0.0, 1.0, 2) * (wide_m, high_m), rng.uniform(0.5, 3.0, 2) * cell_m
+    x_m, y_m = (rng.uniform(0.0, 1.0, 2) * (wide_m, high_m)).tolist()
+    a_m, b_m = (rng.uniform(0.5, 3.0, 2) * cell_m).tolist()
     corners_m = [(x_m, y_m), (x_m + a_m, y_m), (x_m + a_m, y_m + b_m), (x_m, y_m + b_m)]
     polygon_m = [(round(x, 1), round(y, 1)) for x, y in corners_m]
     return {"name": "", "kind": "no_fly", "polygon_m": polygon_m, "clearance_m": 0.0}
