@@ -32,6 +32,16 @@ def test_search_is_better_than_tour_and_tour_than_a_fixed_one(name):
     assert search[0] > tour[0] > fixed[0] - 0.01
 
 
+def test_over_the_dock_with_nothing_to_gain_it_hovers():
+    cells = [
+        state.cell[0].tolist()
+        for state, _ in rollout_steps(THREE, PLANNERS["search"](THREE), [0])
+        if state.collected.all() and mission.at_dock(state.cell, THREE.dock_cell).all()
+    ]
+    assert len(cells) > 5
+    assert cells == cells[:1] * len(cells)
+
+
 @pytest.mark.parametrize("planner", ["tour", "search"])
 def test_the_weight_chooses_between_users_and_time(planner):
     way = np.abs(np.subtract(THREE.start_cell[:2], THREE.dock_cell)).sum()

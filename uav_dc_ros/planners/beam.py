@@ -14,6 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array
+from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.world import State
 from uav_dc_ros.planners.missions import ModelMissions, advance, begin, objective_of
@@ -104,6 +105,9 @@ class _Search:
         value = self._objective(n_users, beam.since, lands)
         if len(value) and value.max() > self._best.objective:
             best = int(value.argmax())
+            # Over the dock moves and a hover may be worth the same J: a hover costs the least energy.
+            same = (value == value[best]) & (parent == parent[best]) & (action == Action.HOVER)
+            best = int(same.argmax()) if same.any() else best
             self._best = Plan(
                 actions=self._actions(parent[best], action[best]),
                 objective=float(value[best]),
