@@ -105,7 +105,7 @@ def weight(config: RunConfig, agent: Agent) -> float:
         weighed = ", ".join(planner.name for planner in PLANNERS.values() if planner.weighs)
         raise ParameterError(
             f"--objective {config.objective:g}: the moves of {agent.name!r} do not depend on it; expected it "
-            f"with {weighed}, or a policy that observes 'entities'"
+            f"with {weighed}, --search, or a policy that observes 'entities'"
         )
     return float(config.objective)
 

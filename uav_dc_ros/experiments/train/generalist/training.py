@@ -65,8 +65,8 @@ class GeneralistTraining:
         # Most weights are near those that users want.
         weights = 1.0 - rng.random((settings.layouts, settings.missions)) ** 2
         flown = LayoutMissions(drawn, weights, rng)
-        last, first_share = settings.demonstrations_end, settings.demonstrations
-        share = last + (first_share - last) * max(0.0, 1.0 - done / settings.shown)
+        rest = max(0.0, 1.0 - done / settings.shown)  # of the iterations in which the share falls
+        share = rest * settings.demonstrations + (1.0 - rest) * settings.demonstrations_end
         # Planning the tours of a layout takes as long as flying its missions.
         n_toured = round(share * settings.layouts)
         tours = [planners.PLANNERS[DEMONSTRATOR](layout) for layout in drawn[:n_toured]]
