@@ -8,6 +8,7 @@ from msgspec import UNSET
 
 from uav_dc_ros import messages
 from uav_dc_ros.core import energy, world
+from uav_dc_ros.core import mission as core_mission
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.propagation import stochastic
 from uav_dc_ros.core.propagation.stochastic import Realization, Seeds, Shadowing
@@ -83,6 +84,17 @@ def collection(payload: messages.Rates, scenario: Scenario) -> tuple[Array, Arra
     """`data_bits` and `collected`, `[U]` each; raises MessageError as `check` does."""
     check(payload, scenario)
     return np.asarray(payload.data_bits, dtype=np.float64), np.asarray(payload.collected, dtype=bool)
+
+
+def delivered_bits(payload: messages.Rates, scenario: Scenario) -> Array:
+    """Data that each user delivered in a step, bit, `[U]`; none in the first, which measures the channel.
+
+    Raises MessageError as `check` does.
+    """
+    check(payload, scenario)
+    served, rate_bps = np.asarray(payload.served), np.asarray(payload.rate_bps, dtype=np.float64)
+    delivered = core_mission.delivered(served, rate_bps, scenario.mission.step_s)
+    return delivered if payload.step else np.zeros_like(delivered)
 
 
 def counted_data(payload: messages.Rates, scenario: Scenario) -> Array:

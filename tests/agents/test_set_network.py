@@ -14,10 +14,10 @@ from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.set_network import SetArchitecture
 from uav_dc_ros.agents.set_policy import PqnSettings, SetPolicyConfig
 from uav_dc_ros.core import world
-from uav_dc_ros.core.entities.encoding import CLUSTER, GLOBAL, allowed
+from uav_dc_ros.core.entities.encoding import CLUSTER, GLOBAL, LOSS, PRICE, allowed
 from uav_dc_ros.core.world import initial
 from uav_dc_ros.errors import PolicyError
-from uav_dc_ros.experiments.train.generalist.pqn import _active
+from uav_dc_ros.experiments.train.generalist.set_learner import active
 
 SIZES = SetArchitecture(width=16, hidden=(24, 24), n_actions=7)
 
@@ -26,12 +26,29 @@ def observations(n_clusters, n=5):
     rng = np.random.default_rng(n_clusters)
     rows = rng.uniform(-1.0, 1.0, (n, GLOBAL + CLUSTER * n_clusters))
     rows[:, GLOBAL::CLUSTER] = 1.0  # present
+    rows[:, PRICE] = 0.01
     return rows
 
 
+def trained():
+    """Random parameters, also of the heads, which are zero at first."""
+    rng = np.random.default_rng(0)
+    return {
+        name: rng.uniform(-0.3, 0.3, v.shape).astype(np.float32)
+        for name, v in set_network.initial(SIZES, rng).items()
+    }
+
+
 def q_values(rows, dtype=np.float64):
+    return set_network.q_values(SIZES, {name: v.astype(dtype) for name, v in trained().items()}, rows)
+
+
+def test_an_untrained_network_decides_as_the_plan_does():
+    rows = observations(4)
+    rows[:, LOSS : LOSS + 7] = np.random.default_rng(0).permuted(np.tile(np.arange(7) / 7, (5, 1)), axis=1)
     parameters = set_network.initial(SIZES, np.random.default_rng(0))
-    return set_network.q_values(SIZES, {name: v.astype(dtype) for name, v in parameters.items()}, rows)
+    found = set_network.q_values(SIZES, parameters, rows.astype(np.float32))
+    np.testing.assert_array_equal(found.argsort(axis=-1), (-rows[:, LOSS : LOSS + 7]).argsort(axis=-1))
 
 
 def test_the_order_of_the_clusters_does_not_count():
@@ -50,9 +67,8 @@ def test_padding_does_not_count():
 
 def test_torch_computes_the_same_with_its_own_layer_normalisation():
     rows = observations(5).astype(np.float32)
-    parameters = set_network.initial(SIZES, np.random.default_rng(0))
-    theta = {name: torch.from_numpy(v) for name, v in parameters.items()}
-    found = set_network.q_values(SIZES, theta, torch.from_numpy(rows), _active).numpy()
+    theta = {name: torch.from_numpy(v) for name, v in trained().items()}
+    found = set_network.q_values(SIZES, theta, torch.from_numpy(rows), active).numpy()
     np.testing.assert_allclose(found, q_values(rows.astype(np.float64)), atol=1e-4)
 
 
@@ -68,8 +84,7 @@ def made(folder, **values):
         version="test",
         scenario=msgspec.to_builtins(scenarios.load("five_clusters")),
     )
-    parameters = set_network.initial(SIZES, np.random.default_rng(0))
-    policy.save(folder / "any", msgspec.structs.replace(config, **values), parameters, lambda _: "")
+    policy.save(folder / "any", msgspec.structs.replace(config, **values), trained(), lambda _: "")
     return policy.load(folder / "any")
 
 
@@ -103,10 +118,10 @@ def test_a_field_or_a_file_that_it_cannot_read_is_an_error(tmp_path):
     with pytest.raises(PolicyError, match="policy 'any' needs the observation 'entities' in scenario "):
         own.check(msgspec.structs.replace(small, grid=grid))
     folder = tmp_path / "any"
-    edit_config(folder, features=2)
-    assert "features = 2; expected 1" in refused(folder)
-    edit_config(folder, features=1, width=8)
-    assert "tensor 'cluster.bias' is float32 (16,); expected float32 (8,)" in refused(folder)
+    edit_config(folder, features=1)
+    assert "features = 1; expected 2" in refused(folder)
+    edit_config(folder, features=2, width=8)
+    assert "tensor 'advantage.cluster.bias' is float32 (16,); expected float32 (8,)" in refused(folder)
     edit_config(folder, width=16, format=3)
     assert "$.format" in refused(folder)
 

@@ -1,5 +1,6 @@
 """The observation `entities`: what it shows is so in the world, and its moves always land."""
 
+import dataclasses
 import itertools
 import re
 
@@ -14,7 +15,7 @@ from tests.support.worlds import changed, tiny
 from uav_dc_ros import scenarios
 from uav_dc_ros.core import entities, observations, world
 from uav_dc_ros.core.entities import encoding
-from uav_dc_ros.core.entities.encoding import CLUSTER, CLUSTER_NAMES, GLOBAL, allowed
+from uav_dc_ros.core.entities.encoding import CLUSTER, CLUSTER_NAMES, GLOBAL, LOSS, WORTH, allowed
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.world import initial, observe, step
 from uav_dc_ros.experiments.train.generalist import layouts
@@ -55,7 +56,8 @@ def test_one_mission_and_another_library_see_the_same(name):
     for state, seen, _, _ in itertools.islice(flown(scenario, 3), 0, 9, 4):
         np.testing.assert_array_equal(observe("entities", scenario, state, 10 / 11), seen)
         one = {
-            key: getattr(state, key)[1] for key in ("cell", "step", "data_bits", "collected", "energy_used_j")
+            key: getattr(state, key)[1]
+            for key in ("cell", "step", "data_bits", "collected", "delivered_bits", "energy_used_j")
         }
         np.testing.assert_array_equal(observations.encode("entities", scenario, **one), seen[1])
         in_torch = {key: torch.from_numpy(np.asarray(value)) for key, value in one.items()}
@@ -108,6 +110,84 @@ def test_the_shortest_tour_is_that_of_every_order(scenario, seed):
             for order in itertools.permutations(rest)
         ]
         assert tables.tours[number, first] == min(ways)
+
+
+def worth_of_plans(scenario, row, left, data, weight):
+    """J from now on of every plan after a step to a cell, by the definition, with users as expected."""
+    tables, n = scenario.entity_tables, scenario.n_clusters
+    per_user = weight / scenario.n_users
+    price = max((1 - weight) / scenario.mission.max_steps, 0.01 * per_user)
+    data = data + tables.of_cell[row, n + 1 : 2 * n + 1][tables.cluster_of]
+    is_open = data < 1.0 - 1e-4
+    for n_stops in range(n + 1):
+        for stops in itertools.permutations(range(n), n_stops):
+            way = [row, *tables.places[list(stops)]]
+            moves = sum(tables.of_cell[at, to] for at, to in zip(way, [*stops, n], strict=True))
+            users = hovers = 0.0
+            for stop in stops:
+                needs = np.sort(
+                    (1 - data)[is_open & (tables.cluster_of == stop)] / max(tables.best[stop], 0.01)
+                )
+                gains = per_user * np.arange(1, len(needs) + 1) - price * needs
+                if len(needs) and gains.max() > 0:
+                    users, hovers = users + gains.argmax() + 1, hovers + needs[gains.argmax()]
+            if 1 + moves <= left:
+                part = min(1.0, (left - 1 - moves) / max(hovers, 1e-3))
+                n_users = (~is_open).sum() + part**2 * users
+                yield per_user * n_users - price * min(1 + moves + hovers, left)
+
+
+def test_the_plan_is_the_best_of_all_orders_of_all_sets():
+    rng, n, weight = np.random.default_rng(0), 4, 0.7
+    drawn = [one for one in map(layouts.draw, range(30)) if one.n_clusters <= 4 and one.energy is None]
+    for scenario in drawn[:5]:
+        tables, r_min_bits = scenario.entity_tables, scenario.user_r_min_bits(np.ones(1))
+        begun = initial(scenario, rng.random((n, *scenario.draws_shape)))
+        rows = rng.choice(np.flatnonzero(tables.of_cell[:, scenario.n_clusters] < 1000), n)
+        data = rng.random((n, scenario.n_users)) * 0.9
+        expected = tables.of_cell[rows][:, scenario.n_clusters + 1 : 2 * scenario.n_clusters + 1]
+        state = dataclasses.replace(
+            begun,
+            cell=np.stack(np.unravel_index(rows, scenario.grid.shape), axis=-1),
+            step=rng.integers(0, scenario.mission.max_steps - 2, n),
+            data_bits=data * r_min_bits,
+            delivered_bits=expected[:, tables.cluster_of] * r_min_bits,  # as expected
+        )
+        seen = observe("entities", scenario, state, weight)
+        for i in range(n):
+            left = scenario.mission.max_steps - int(state.step[i])
+            worth = {
+                action: max(worth_of_plans(scenario, tables.after[rows[i], action], left, data[i], weight))
+                for action in np.flatnonzero(allowed(seen[i]))
+                if tables.of_cell[tables.after[rows[i], action], scenario.n_clusters] <= left - 1
+            }
+            if not worth:
+                continue  # too late for a landing
+            assert seen[i, WORTH] == pytest.approx(max(worth.values()), abs=1e-3)
+            for action, one in worth.items():
+                assert seen[i, LOSS + action] == pytest.approx(max(worth.values()) - one, abs=1e-3)
+
+
+def test_a_user_that_delivers_nothing_over_its_cluster_is_not_waited_for():
+    scenario = scenarios.load("five_clusters_hover")
+    state = initial(scenario, np.random.default_rng(0).random((2, *scenario.draws_shape)))
+    tables, r_min_bits = scenario.entity_tables, scenario.user_r_min_bits(np.ones(1))
+    first = np.flatnonzero(tables.cluster_of == 2)
+    collected = np.ones((2, scenario.n_users), bool)
+    collected[:, first[0]] = False
+    delivered = np.zeros((2, scenario.n_users))
+    delivered[0, first[0]] = tables.best[2] * r_min_bits  # as expected in the first mission only
+    state = dataclasses.replace(
+        state,
+        cell=np.tile(np.stack(np.unravel_index(tables.places[2], scenario.grid.shape)), (2, 1)),
+        step=np.full(2, 10),
+        collected=collected,
+        delivered_bits=delivered,
+    )
+    seen = observe("entities", scenario, state)
+    planned = seen[:, GLOBAL + CLUSTER_NAMES.index("planned") :: CLUSTER]
+    np.testing.assert_array_equal(planned, [[0, 0, 1, 0, 0], [0, 0, 0, 0, 0]])
+    assert seen[0, LOSS + Action.HOVER] == 0.0 < seen[1, LOSS + Action.HOVER]
 
 
 def test_obstacles_and_moves_count():

@@ -286,6 +286,7 @@ def test_shapes_and_types(three, array, batch, dtype):
         "users_m": ((users, 2), real),
         "data_bits": ((users,), real),
         "collected": ((users,), truth),
+        "delivered_bits": ((users,), real),
         "total_reward": ((), real),
         "mission_reward": ((), real),
         "energy_used_j": ((), real),

@@ -8,19 +8,33 @@ import pytest
 from tests.experiments.test_train_cli import field, refused  # noqa: F401
 from uav_dc_ros.agents import policy, set_network
 from uav_dc_ros.agents.set_network import SetArchitecture
-from uav_dc_ros.agents.set_policy import PqnSettings
-from uav_dc_ros.core.entities.encoding import ALLOWED, GLOBAL, allowed
+from uav_dc_ros.agents.set_policy import PpoSettings, PqnSettings
+from uav_dc_ros.core.entities.encoding import ALLOWED, GLOBAL, LOSS, PRICE, allowed
 from uav_dc_ros.experiments.evaluate.evaluation import evaluate
 from uav_dc_ros.experiments.train.cli import main
 from uav_dc_ros.experiments.train.generalist import card, layouts
 from uav_dc_ros.experiments.train.generalist import training as training_module
 from uav_dc_ros.experiments.train.generalist.missions import LayoutMissions
-from uav_dc_ros.experiments.train.generalist.pqn import Batch, PqnLearner, lambda_returns
-from uav_dc_ros.experiments.train.generalist.training import GeneralistTraining
+from uav_dc_ros.experiments.train.generalist.ppo import (
+    ADVANTAGE,
+    VALUE,
+    PpoBatch,
+    PpoLearner,
+    PpoTraining,
+    generalised_advantages,
+)
+from uav_dc_ros.experiments.train.generalist.pqn import Batch, PqnLearner, PqnTraining, lambda_returns
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = SetArchitecture(width=8, hidden=(16,), n_actions=7)
-SETTINGS = PqnSettings(iterations=4, layouts=2, missions=4, batch_size=64)
+SMALL_RUN = {"iterations": 4, "layouts": 2, "missions": 4, "batch_size": 64}
+
+
+def begun(algorithm):
+    """A training before its first iteration."""
+    if algorithm == "ppo":
+        return PpoTraining(PpoSettings(**SMALL_RUN), SMALL, 3)
+    return PqnTraining(PqnSettings(**SMALL_RUN), SMALL, 3)
 
 
 @pytest.mark.parametrize("masked", [True, False])
@@ -49,7 +63,8 @@ def test_the_rewards_of_a_mission_add_up_to_its_objective(masked):
 
 
 def test_layouts_have_all_that_is_drawn():
-    drawn = [layouts.draw(seed) for seed in range(30)]
+    drawn = [layouts.draw(seed) for seed in (*range(20), 63, 137)]
+    assert sum(one.name.startswith("random_") for one in drawn) > 5
     assert sum(bool(one.obstacles) for one in drawn) > 0
     assert sum(bool(one.users.user) for one in drawn) > 0
     assert sum(one.energy is not None for one in drawn) > 0
@@ -79,24 +94,66 @@ def test_lambda_returns_are_those_of_the_definition():
             assert found[t, mission] == pytest.approx(expected)
 
 
-def test_the_learner_fits_targets_of_taken_actions():
+def test_generalised_advantages_are_sums_of_the_errors_of_v():
     rng = np.random.default_rng(0)
-    rows = rng.uniform(-1, 1, (256, SMALL.n_global + 3 * SMALL.n_cluster)).astype(np.float32)
+    reward, value = rng.random((2, 6, 3))
+    over = np.zeros((6, 3), bool)
+    over[3:, 0] = over[5:] = True
+    for trace in (0.0, 0.9, 1.0):
+        found = generalised_advantages(reward, over, value, trace)
+        for mission, t in itertools.product(range(3), range(6)):
+            last = int(over[:, mission].argmax())
+            if t > last:
+                continue
+            after = np.append(value[t + 1 : last + 1, mission], 0.0)
+            errors = reward[t : last + 1, mission] + after - value[t : last + 1, mission]
+            assert found[t, mission] == pytest.approx(errors @ trace ** np.arange(len(errors)))
+
+
+def rows_of(n):
+    rng = np.random.default_rng(0)
+    rows = rng.uniform(-1, 1, (n, SMALL.n_global + 3 * SMALL.n_cluster)).astype(np.float32)
     rows[:, GLOBAL :: SMALL.n_cluster] = 1.0
+    rows[:, PRICE] = 0.1
+    rows[:, ALLOWED : ALLOWED + 7] = 1.0
+    rows[:, LOSS : LOSS + 7] = 0.0
+    return rows, rng
+
+
+def test_pqn_fits_targets_of_taken_actions():
+    rows, rng = rows_of(256)
     action = rng.integers(0, 7, 256)
-    target = (rows[:, 3] + 0.2 * action).astype(np.float32)
+    target = (rows[:, 3] + 2.0 * action).astype(np.float32)
     learner = PqnLearner(SMALL, set_network.initial(SMALL, rng))
     batch = Batch(rows, action, target, np.zeros(256, bool))
-    losses = [learner.fit(batch, rng.permutation(256), 64, 3e-3) for _ in range(40)]
+    losses = [learner.fit(batch, rng.permutation(256), 64, 1e-2) for _ in range(100)]
     assert losses[-1] < 0.1 * losses[0]
-    rows[:, ALLOWED : ALLOWED + 7] = 1.0
-    best = 0.2 * learner.q_values(rows).argmax(axis=-1).mean()
-    shown = Batch(rows, np.zeros_like(action), target - 0.2 * action, np.ones(256, bool))
+    best = learner.preferences(rows).argmax(axis=-1).mean()
+    shown = Batch(rows, np.zeros_like(action), target - 2.0 * action, np.ones(256, bool))
     for _ in range(40):
         learner.fit(shown, rng.permutation(256), 64, 3e-3)
-    assert best > 1.0  # the last action is the best one
-    assert (learner.q_values(rows).argmax(axis=-1) == 0).mean() > 0.9, "preferred as demonstrated"
-    assert learner.q_values(rows).shape == (256, 7)
+    assert best > 4.5  # mostly the last action, which is the best one
+    assert (learner.preferences(rows).argmax(axis=-1) == 0).mean() > 0.9, "preferred as demonstrated"
+
+
+def test_ppo_learns_v_and_prefers_actions_with_an_advantage():
+    rows, rng = rows_of(512)
+    learner = PpoLearner(SMALL, set_network.initial(SMALL, rng), PpoSettings(batch_size=64))
+    learner.set_rate(3e-3, VALUE)
+    learner.set_rate(3e-3, ADVANTAGE)
+    good = np.where(rows[:, 3] > 0, 2, 5)
+    losses = []
+    for _ in range(40):
+        preferences = 2.0 * learner.preferences(rows)
+        powers = np.exp(preferences - preferences.max(axis=-1, keepdims=True))
+        chances = 0.98 * powers / powers.sum(axis=-1, keepdims=True) + 0.02 / 7
+        action = (chances.cumsum(axis=-1) > rng.random((512, 1)) * chances.sum(-1, keepdims=True)).argmax(-1)
+        log_chance = np.log(np.take_along_axis(chances, action[:, None], axis=-1)[:, 0]).astype(np.float32)
+        gained = np.where(action == good, 0.1, -0.02).astype(np.float32)
+        of_ppo = PpoBatch(rows, action, log_chance, rows[:, 4] * np.float32(0.1), gained)
+        losses.append(learner.fit(of_ppo, rng.permutation(512), True))
+    assert losses[-1] < 0.1 * losses[0]
+    assert (learner.preferences(rows).argmax(axis=-1) == good).mean() > 0.9
 
 
 def test_layouts_repeat_and_differ_and_share_no_seed():
@@ -107,16 +164,15 @@ def test_layouts_repeat_and_differ_and_share_no_seed():
     assert layouts.SELECTION_SEEDS.start > 10**5  # above those of `random:SEED` that test
 
 
-def run(n, training=None):
-    training = training or GeneralistTraining(SETTINGS, SMALL, 3)
-    for _ in range(n):
-        training.iterate()
-    return training
+@pytest.mark.parametrize("algorithm", ["ppo", "pqn"])
+def test_a_run_repeats_and_continues_to_the_last_bit(algorithm):
+    def run(n, training):
+        for _ in range(n):
+            training.iterate()
+        return training
 
-
-def test_a_run_repeats_and_continues_to_the_last_bit():
-    whole, part = run(3), run(1)
-    resumed = GeneralistTraining(SETTINGS, SMALL, 3)
+    whole, part = run(3, begun(algorithm)), run(1, begun(algorithm))
+    resumed = begun(algorithm)
     arrays, values = part.state()
     resumed.restore({name: v.clone() for name, v in arrays.items()}, values)
     run(2, resumed)
@@ -124,6 +180,7 @@ def test_a_run_repeats_and_continues_to_the_last_bit():
         np.testing.assert_array_equal(resumed.learner.parameters()[name], expected, err_msg=name)
     assert resumed.curve == whole.curve
     assert all(one.landed == 1.0 for one in whole.curve)
+    assert np.abs(whole.learner.parameters()["advantage.head.weight"]).max() > 0, "it has learnt something"
 
 
 @pytest.fixture
@@ -136,7 +193,7 @@ def quick(monkeypatch):
 
 
 def command(folder, *more):
-    options = "--scenario random --algo pqn --iterations 3 --layouts 2 --missions 3 --width 8 --hidden 16"
+    options = "--scenario random --algo ppo --iterations 3 --layouts 2 --missions 3 --width 8 --hidden 16"
     return [*options.split(), "--checkpoint-every", "2", "--out", str(folder), *more]
 
 
@@ -152,19 +209,19 @@ def test_the_command_writes_a_policy_and_resumes_with_the_same_bytes(tmp_path, m
     assert "seeds 10000000 to 10000005" in text
     assert "| `three_clusters` |" in text
 
-    iterate = GeneralistTraining.iterate
+    iterate = PpoTraining.iterate
 
     def stopped(self):
         if self.n_done == 2:
             raise KeyboardInterrupt
         return iterate(self)
 
-    monkeypatch.setattr(GeneralistTraining, "iterate", stopped)
+    monkeypatch.setattr(PpoTraining, "iterate", stopped)
     with pytest.raises(SystemExit) as exit:
         main(command(tmp_path / "again" / "whole"))
     assert exit.value.code == 130
     assert "--resume continues" in capsys.readouterr().err
-    monkeypatch.setattr(GeneralistTraining, "iterate", iterate)
+    monkeypatch.setattr(PpoTraining, "iterate", iterate)
     other = [*command(tmp_path / "again" / "whole"), "--resume", "--seed", "1"]
     assert "with seed = 0; expected 1" in refused(capsys, *other)
     with pytest.raises(SystemExit) as exit:

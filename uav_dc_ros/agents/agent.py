@@ -116,6 +116,7 @@ def greedy_act(policy: Policy, scenario: Scenario, weight: float = DEFAULT_WEIGH
             step=state.step,
             data_bits=state.data_bits,
             collected=state.collected,
+            delivered_bits=state.delivered_bits,
             energy_used_j=state.energy_used_j,
             weight=weight,
         )
@@ -131,12 +132,14 @@ def state_of(
     step: Array,
     data_bits: Array,
     collected: Array,
+    delivered_bits: Array,
     energy_used_j: Array,
     users_m: Array | None = None,
 ) -> State:
     """The state of one mission as an agent knows it; positions and rewards that it does not know are NaN.
 
-    `cell` is `[3]`, `step` and `energy_used_j` `[]`, `data_bits` and `collected` `[U]`, `users_m` `[U, 2]`.
+    `cell` is `[3]`, `step` and `energy_used_j` `[]`, `data_bits`, `collected` and `delivered_bits` `[U]`,
+    `users_m` `[U, 2]`.
     """
     unknown = np.asarray(np.nan)
     return State(
@@ -145,6 +148,7 @@ def state_of(
         users_m=np.full((scenario.n_users, 2), np.nan) if users_m is None else users_m,
         data_bits=data_bits,
         collected=collected,
+        delivered_bits=delivered_bits,
         total_reward=unknown,
         mission_reward=unknown,
         energy_used_j=energy_used_j,

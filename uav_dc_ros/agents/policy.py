@@ -111,6 +111,7 @@ class Policy:
         step: Array,
         data_bits: Array,
         collected: Array,
+        delivered_bits: Array | None = None,
         energy_used_j: Array | None = None,
         weight: Array | float | None = None,
     ) -> Array:
@@ -122,6 +123,7 @@ class Policy:
             step=step,
             data_bits=data_bits,
             collected=collected,
+            delivered_bits=delivered_bits,
             energy_used_j=energy_used_j,
             weight=weight,
         )

@@ -68,7 +68,7 @@ class PolicySearch:
 
     def own(self, state: State) -> int:
         """The policy's own action for one mission: its best one after which the UAV can still land."""
-        return int(self._greedy(begin(self._model, state), int(state.step))[0])
+        return int(self._greedy(begin(self._model, state), int(state.step), state.delivered_bits[None])[0])
 
     def decide(self, state: State, time_limit_s: float | None = None) -> SearchedMove:
         """The action for one mission, whose state has no batch dimensions; `time_limit_s`: seconds."""
@@ -104,13 +104,15 @@ class PolicySearch:
     ) -> bool:
         """Whether the mission of the policy's actions, of which `own` is the next, is worth a J of `goal`."""
         model, scenario, n_flown, action = self._model, self._scenario, int(state.step), np.asarray([own])
+        delivered_bits = state.delivered_bits[None]
         r_min_bits = scenario.user_r_min_bits(state.data_bits)
         for step in range(model.n_steps):
             check_time()
             if step:
-                action = self._greedy(mission, n_flown)
+                action = self._greedy(mission, n_flown, delivered_bits)
             n_flown += 1
             cell = model.after[mission.cell, action]
+            delivered_bits = model.delivered(step, cell, mission.collected)
             mission, over, lands = advance(model, mission, cell, step, n_flown, r_min_bits)
             soonest = np.where(mission.since > 0, mission.since, n_flown + model.steps_home[cell])
             goes_on = ~over & (soonest <= scenario.mission.max_steps) & mission.lasts_home(model)
@@ -122,7 +124,7 @@ class PolicySearch:
                 return False
         return False
 
-    def _greedy(self, missions: ModelMissions, n_flown: int) -> Array:
+    def _greedy(self, missions: ModelMissions, n_flown: int, delivered_bits: Array) -> Array:
         """The policy's best actions after which the UAV can land, integers `[B]`."""
         policy, scenario, cell = self._policy, self._scenario, self._model.cells[missions.cell]
         step, used_j = np.full(len(cell), n_flown), missions.energy_used_j
@@ -132,6 +134,7 @@ class PolicySearch:
             step=step,
             data_bits=missions.data_bits,
             collected=missions.collected,
+            delivered_bits=delivered_bits,
             energy_used_j=used_j,
             weight=self._weight,
         )

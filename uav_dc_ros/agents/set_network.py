@@ -1,15 +1,24 @@
-"""The Q-network for observations `entities`: layers shared by all clusters, pooled, and dueling heads.
+"""The Q-network for observations `entities`: two networks for sets, of the value and of the advantages.
+
+Each of them has layers shared by all clusters, pooled:
 
     h_i = relu(x_i W_x + g W_g)                    each cluster i beside the mission's numbers g
     k_i = relu(h_i W_h + mean(h) W_m + max(h) W_n) each cluster among the others (Zaheer et al., "Deep Sets",
                                                    NeurIPS 2017)
     z   = relu(LN([mean(k), max(k), g] W))         and further layers
-    Q   = V(z) + A(z) - mean(A(z))                 eq. 30 of the paper
 
-LN is layer normalisation without parameters (Ba et al., 2016): it keeps Q-learning without a target network
-stable (Gallici et al., "Simplifying Deep Temporal Difference Learning", ICLR 2025). Clusters that pad a batch
-have zeros only and count nowhere. As functions over a dict of arrays it runs on numpy and on torch, as
-`network` does.
+The duel (eq. 30 of the paper) is between them, and begins with the plan of the observation (see
+`core.entities.encoding`): what it is worth, and what each action loses of that:
+
+    V   = worth + z w_v / 10
+    A_a = z w_a - loss_a / price                   in steps: `price` is what a step costs in J
+    Q_a = V + price (A_a - mean(A))
+
+An untrained network (w = 0) decides as the plan does. V and A share no layer: errors of V, which are many
+times what a step costs, would change decisions.
+
+LN is layer normalisation without parameters (Ba et al., 2016). Clusters that pad a batch have zeros only and
+count nowhere. As functions over a dict of arrays it runs on numpy and on torch, as `network` does.
 """
 
 import math
@@ -21,9 +30,10 @@ import numpy as np
 
 from uav_dc_ros.agents.network import Parameters, Width
 from uav_dc_ros.core.arrays import Array, array_namespace
-from uav_dc_ros.core.entities.encoding import CLUSTER, GLOBAL
+from uav_dc_ros.core.entities.encoding import CLUSTER, GLOBAL, LOSS, PRICE, WORTH
 
 _EPSILON = 1e-5  # of the variance
+VALUE_SCALE = 10.0  # V lies in [-1, 1], and its errors of a tenth of that are large
 
 
 class SetArchitecture(msgspec.Struct, frozen=True, kw_only=True):
@@ -40,27 +50,29 @@ def shapes(architecture: SetArchitecture) -> dict[str, tuple[int, ...]]:
     """Name and shape of every parameter."""
     width, n_global = architecture.width, architecture.n_global
     sizes = (2 * width + n_global, *architecture.hidden)
-    layers = {
-        "cluster.weight": (architecture.n_cluster, width),
-        "mission.weight": (n_global, width),
-        "cluster.bias": (width,),
-        "own.weight": (width, width),
-        "mean.weight": (width, width),
-        "max.weight": (width, width),
-        "own.bias": (width,),
-    }
-    for i, (n_in, n_out) in enumerate(pairwise(sizes)):
-        layers |= {f"hidden_{i}.weight": (n_in, n_out), f"hidden_{i}.bias": (n_out,)}
-    for head, n in (("value", 1), ("advantage", architecture.n_actions)):
-        layers |= {f"{head}.weight": (sizes[-1], n), f"{head}.bias": (n,)}
+    layers: dict[str, tuple[int, ...]] = {}
+    for stream, n in (("value", 1), ("advantage", architecture.n_actions)):
+        own: dict[str, tuple[int, ...]] = {
+            "cluster.weight": (architecture.n_cluster, width),
+            "mission.weight": (n_global, width),
+            "cluster.bias": (width,),
+            "own.weight": (width, width),
+            "mean.weight": (width, width),
+            "max.weight": (width, width),
+            "own.bias": (width,),
+        }
+        for i, (n_in, n_out) in enumerate(pairwise(sizes)):
+            own |= {f"hidden_{i}.weight": (n_in, n_out), f"hidden_{i}.bias": (n_out,)}
+        own |= {"head.weight": (sizes[-1], n), "head.bias": (n,)}
+        layers |= {f"{stream}.{name}": shape for name, shape in own.items()}
     return layers
 
 
 def initial(architecture: SetArchitecture, rng: np.random.Generator) -> Parameters:
-    """Random parameters, float32: uniform within `1 / sqrt(fan in)`, biases zero."""
+    """Random parameters, float32: uniform within `1 / sqrt(fan in)`, biases and heads zero."""
     return {
         name: np.zeros(shape, np.float32)
-        if len(shape) == 1
+        if len(shape) == 1 or ".head." in name
         else (rng.uniform(-1.0, 1.0, shape) / math.sqrt(shape[0])).astype(np.float32)
         for name, shape in shapes(architecture).items()
     }
@@ -81,35 +93,76 @@ def q_values(
     observation: Array,
     active: Callable[[Array], Array] = activation,
 ) -> Array:
-    """Q(s, a) of every action, `[B, A]`, for observations `[B, D]` of any number of clusters.
+    """Q(s, a) of every action in J, `[B, A]`, for observations `[B, D]` of any number of clusters.
 
     The parameters are named as by `shapes`, and have the observation's dtype. `active` is a faster
     `activation`.
     """
+    advantage = advantages(architecture, parameters, observation, active)
+    advantage = advantage - advantage.sum(axis=-1, keepdims=True) / architecture.n_actions
+    value = values(architecture, parameters, observation, active)
+    return value[:, None] + observation[:, PRICE, None] * advantage
+
+
+def values(
+    architecture: SetArchitecture,
+    parameters: Parameters,
+    observation: Array,
+    active: Callable[[Array], Array] = activation,
+) -> Array:
+    """V(s) in J, `[B]`; arguments as of `q_values`."""
+    learnt = stream("value", architecture, parameters, observation, active)[:, 0]
+    return observation[:, WORTH] + learnt / VALUE_SCALE
+
+
+def advantages(
+    architecture: SetArchitecture,
+    parameters: Parameters,
+    observation: Array,
+    active: Callable[[Array], Array] = activation,
+) -> Array:
+    """A(s, a) of every action in steps, plus a number of the state, `[B, A]`; arguments as of `q_values`."""
+    learnt = stream("advantage", architecture, parameters, observation, active)
+    return learnt - plan_loss(architecture, observation)
+
+
+def plan_loss(architecture: SetArchitecture, observation: Array) -> Array:
+    """Steps that the plan loses with each action, `[B, A]`."""
+    return observation[:, LOSS : LOSS + architecture.n_actions] / observation[:, PRICE, None]
+
+
+def stream(
+    name: str,
+    architecture: SetArchitecture,
+    parameters: Parameters,
+    observation: Array,
+    active: Callable[[Array], Array],
+) -> Array:
+    """What the network "value", `[B, 1]`, or "advantage", `[B, A]`, adds to the plan; as in `q_values`."""
     xp = array_namespace(observation)
     mission = observation[:, : architecture.n_global]
     clusters = observation[:, architecture.n_global :].reshape((len(mission), -1, architecture.n_cluster))
     present = clusters[..., :1]  # its first number: 1, or 0 of padding
     share = present / present.sum(axis=1, keepdims=True)
 
-    def layer(name: str, inputs: Array) -> Array:
-        return inputs @ parameters[name + ".weight"] + parameters[name + ".bias"]
+    def weight(layer: str) -> Array:
+        return parameters[f"{name}.{layer}.weight"]
 
-    def positive(values: Array) -> Array:
-        return values.clip(0.0)  # ReLU
+    def dense(layer: str, inputs: Array) -> Array:
+        return inputs @ weight(layer) + parameters[f"{name}.{layer}.bias"]
 
-    def pooled(values: Array) -> tuple[Array, Array]:
+    def positive(numbers: Array) -> Array:
+        return numbers.clip(0.0)  # ReLU
+
+    def pooled(numbers: Array) -> tuple[Array, Array]:
         # Outputs of ReLU are not negative: zeros of padding are no maximum.
-        return (values * share).sum(axis=1), xp.max(values * present, axis=1)
+        return (numbers * share).sum(axis=1), xp.max(numbers * present, axis=1)
 
-    beside = mission @ parameters["mission.weight"]
-    features = positive(layer("cluster", clusters) + beside[:, None])
+    features = positive(dense("cluster", clusters) + (mission @ weight("mission"))[:, None])
     mean, largest = pooled(features)
-    among = mean @ parameters["mean.weight"] + largest @ parameters["max.weight"]
-    mean, largest = pooled(positive(layer("own", features) + among[:, None]))
+    among = mean @ weight("mean") + largest @ weight("max")
+    mean, largest = pooled(positive(dense("own", features) + among[:, None]))
     features = xp.concat([mean, largest, mission], axis=-1)
     for i in range(len(architecture.hidden)):
-        features = active(layer(f"hidden_{i}", features))
-    advantage = layer("advantage", features)
-    mean_advantage = advantage.sum(axis=-1, keepdims=True) / architecture.n_actions
-    return layer("value", features) + (advantage - mean_advantage)
+        features = active(dense(f"hidden_{i}", features))
+    return dense("head", features)

@@ -16,15 +16,38 @@ Count: TypeAlias = Annotated[int, Meta(ge=1)]
 Probability: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
 
 
-class PqnSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Hyperparameters of parallelised Q-learning on random layouts."""
+LearningRate: TypeAlias = Annotated[float, Meta(gt=0, le=1)]
 
-    iterations: Count = 450  # rounds of flying and fitting
+
+class FlyingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the algorithms for random layouts have in common."""
+
+    iterations: Count = 400  # rounds of flying and fitting
     layouts: Count = 12  # new ones of an iteration
     missions: Count = 40  # in each layout
-    epochs: Count = 1  # passes over the decisions of an iteration
     batch_size: Count = 512  # decisions in a mini-batch
-    learning_rate: Annotated[float, Meta(gt=0, le=1)] = 7e-4  # of Adam; it falls to a fiftieth
+
+
+class PpoSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="ppo"):
+    """Hyperparameters of proximal policy optimisation on random layouts."""
+
+    value_rate: LearningRate = 7e-4  # learning rate of Adam for V; it falls to a fiftieth
+    advantage_rate: LearningRate = 2e-4  # for A, likewise, after the iterations in which V alone learns
+    value_only: Annotated[float, Meta(ge=0, lt=1)] = 0.02  # share of the iterations in which V alone learns
+    trace: Probability = 0.95  # lambda of the returns
+    # A difference of one step between actions counts so much in the logarithm of their probabilities.
+    sharpness: Annotated[float, Meta(gt=0, le=1000)] = 2.0
+    random_moves: Annotated[float, Meta(gt=0, lt=1)] = 0.02  # share of the moves that are random
+    clip: Annotated[float, Meta(gt=0, lt=1)] = 0.2  # of the ratio of probabilities
+    # Weight of the squared difference between A and the plan's, in steps, in the loss.
+    restraint: Annotated[float, Meta(ge=0)] = 0.01
+
+
+class PqnSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="pqn"):
+    """Hyperparameters of parallelised Q-learning on random layouts."""
+
+    epochs: Count = 1  # passes over the decisions of an iteration
+    learning_rate: LearningRate = 7e-4  # of Adam; it falls to a fiftieth
     trace: Probability = 0.95  # lambda of the returns
     # Of a step. J alone makes a step that is lost cost (1 - w) / T_cons, which is less than what a network
     # resolves: with a discount of 1 it hovers between two cells until time presses.
@@ -44,7 +67,6 @@ class SetPolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     format: Literal[2] = 2
     name: Annotated[str, Meta(pattern=NAME)]  # the policy's name
-    algorithm: Literal["pqn"] = "pqn"
     observation: Literal["entities"] = "entities"  # see `core.entities`
     features: int = FEATURES  # version of that encoding
     width: network.Width  # units of the layers of a cluster
@@ -52,7 +74,7 @@ class SetPolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         tuple[network.Width, ...], Meta(min_length=1, max_length=16)
     ]  # units behind the pooling
     actions: tuple[str, ...] = ACTION_LABELS  # labels of the actions, in the order of the network's outputs
-    hyperparameters: PqnSettings  # of training
+    hyperparameters: PpoSettings | PqnSettings  # of training; `type` names the algorithm
     seed: Annotated[int, Meta(ge=0)]  # of its run
     iteration: Annotated[int, Meta(ge=0)]  # after which these parameters were taken
     version: str  # version of the package that made it

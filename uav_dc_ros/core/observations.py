@@ -68,14 +68,16 @@ def encode(
     step: Array,
     data_bits: Array,
     collected: Array,
+    delivered_bits: Array | None = None,
     energy_used_j: Array | None = None,
     weight: Array | float | None = None,
 ) -> Array:
     """The observation of a mission, float32 `[..., D]` with D = `size(kind, scenario)`.
 
-    `cell` `[..., 3]`, `step` `[...]`, `data_bits` and `collected` `[..., U]` are those of `world.State`, as
-    is `energy_used_j` `[...]`, which `energy` needs, and `entities` in a scenario with a battery. `weight` is
-    w of the objective, a number or `[...]`, which only `entities` reads; None: `objective.DEFAULT_WEIGHT`.
+    `cell` `[..., 3]`, `step` `[...]`, `data_bits` and `collected` `[..., U]` are those of `world.State`. So
+    are `delivered_bits` `[..., U]`, which `entities` reads (None: the mission begins), and `energy_used_j`
+    `[...]`, which `energy` needs, and `entities` in a scenario with a battery. `weight` is w of the
+    objective, a number or `[...]`, which only `entities` reads; None: `objective.DEFAULT_WEIGHT`.
     """
     if kind == "entities":
         return entities.encode(
@@ -84,6 +86,7 @@ def encode(
             step=step,
             data_bits=data_bits,
             collected=collected,
+            delivered_bits=delivered_bits,
             energy_used_j=energy_used_j,
             weight=weight,
         )

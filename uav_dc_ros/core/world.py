@@ -39,6 +39,7 @@ class State:
     users_m: Array  # users' positions, metres, `[..., U, 2]`
     data_bits: Array  # data collected from each user, bit, `[..., U]`
     collected: Array  # bool `[..., U]`
+    delivered_bits: Array  # data that each user delivered in the last step, bit, `[..., U]`; 0 at the start
     total_reward: Array  # r^t (eq. 7), `[...]`
     mission_reward: Array  # reward of the mission so far, see `reward.mission_reward`, `[...]`
     energy_used_j: Array  # energy of the steps flown, joules, `[...]`; 0 in a scenario without `energy`
@@ -82,6 +83,7 @@ def initial(scenario: Scenario, draws: Array) -> State:
         users_m=users_m,
         data_bits=zeros,
         collected=zeros > 0.0,
+        delivered_bits=zeros,
         total_reward=zero,
         mission_reward=zero,
         energy_used_j=zero,
@@ -226,6 +228,7 @@ def step(
         users_m=users_m,
         data_bits=data_bits,
         collected=collected,
+        delivered_bits=delivered_bits,
         total_reward=total,
         mission_reward=reward.mission_reward(state.mission_reward, total, n_rewards, values.data),
         energy_used_j=used_j,
@@ -249,6 +252,7 @@ def observe(
         step=state.step,
         data_bits=state.data_bits,
         collected=state.collected,
+        delivered_bits=state.delivered_bits,
         energy_used_j=state.energy_used_j,
         weight=weight,
     )

@@ -45,6 +45,7 @@ class PolicyNode(MissionNode):
             step=np.asarray(0),
             data_bits=zeros,
             collected=zeros > 0,
+            delivered_bits=zeros,
             energy_used_j=np.asarray(0.0),
             users_m=np.asarray(self.scenario.user_centres_m),
         )
@@ -81,6 +82,7 @@ class PolicyNode(MissionNode):
             step=np.asarray(self.scenario.mission.max_steps - mission.remaining_steps),
             data_bits=data_bits,
             collected=collected,
+            delivered_bits=payloads.delivered_bits(rates, self.scenario),
             energy_used_j=payloads.energy_used_j(mission),
             users_m=payloads.users_m(users[0], self.scenario) if users else None,
         )

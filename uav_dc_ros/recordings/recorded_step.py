@@ -102,7 +102,11 @@ class RecordedStep:
         cell, left = np.asarray(self.status.cell), self.status.remaining_steps
         step = np.asarray(scenario.mission.max_steps - left)
         observed = {"cell": cell, "step": step, "data_bits": data_bits, "collected": collected}
-        return observed | {"energy_used_j": payloads.energy_used_j(self.status)}
+        delivered_bits = payloads.delivered_bits(self.rates, scenario)
+        return observed | {
+            "delivered_bits": delivered_bits,
+            "energy_used_j": payloads.energy_used_j(self.status),
+        }
 
     @property
     def phase_changes(self) -> list[PhaseReport]:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.entities.numbers import rows, squashed
+from uav_dc_ros.core.entities.plan import best_plan
 from uav_dc_ros.core.entities.tables import FAR, EntityTables
 from uav_dc_ros.core.grid import MOVES, Action
 from uav_dc_ros.core.mobility import GaussMarkov, RandomWaypoint
@@ -22,7 +24,7 @@ from uav_dc_ros.core.users.clusters import cluster_means
 if TYPE_CHECKING:  # a scenario holds its `EntityTables`
     from uav_dc_ros.core.scenario import Scenario
 
-FEATURES = 1  # version of the encoding, which a policy's config holds
+FEATURES = 2  # version of the encoding, which a policy's config holds
 CLUSTERS_MAX = 100
 SHAPE_MAX = (40, 40, 8)  # cells east, north, up
 N_ACTIONS = len(Action)
@@ -31,9 +33,9 @@ N_ACTIONS = len(Action)
 GLOBAL_NAMES = (
     *("steps_left_share", "steps_left", "slack", "home_share", "dock_east", "dock_north", "dock_cells_east"),
     *("dock_cells_north", "at_dock", "weight", "step_cost", "collected", "data", "altitude", "height"),
-    *("layer", "cell", "speed", "clusters", "users", "tour_share", "tour_clusters", "has_battery", "charge"),
-    "steps_max",
-    *("allowed_a", "gain_a", "tour_a", "home_a"),
+    *("layer", "cell", "speed", "clusters", "users", "plan_share", "plan_clusters", "has_battery", "charge"),
+    *("steps_max", "shared", "plan_worth", "price"),
+    *("allowed_a", "gain_a", "home_a", "loss_a", "lost_steps_a", "lost_users_a"),
 )
 _GLOBALS = tuple(
     name if not n else f"{name}{n - 1}"
@@ -42,14 +44,16 @@ _GLOBALS = tuple(
 )
 CLUSTER_NAMES = (
     *("present", "east", "north", "moves", "moves_share", "detour", "visit_share", "fits", "users"),
-    *("collected", "open", "data", "hovers", "worth", "regret", "in_tour", "radius", "closeness", "nearly"),
+    *("collected", "open", "data", "hovers", "worth", "planned", "radius", "closeness", "nearly"),
+    *("delivered", "reached"),
     "progress_a",
 )
 GLOBAL = len(_GLOBALS)  # numbers of the mission
 CLUSTER = len(CLUSTER_NAMES) - 1 + N_ACTIONS  # numbers of a cluster
 ALLOWED = _GLOBALS.index("allowed_a0")  # the first of the actions from which the UAV can still land
+WORTH, PRICE, LOSS = (_GLOBALS.index(name) for name in ("plan_worth", "price", "loss_a0"))
 MIN, MAX = -1.0, 2.0  # of every number
-SERVED = 0.9  # share of its users after which a cluster is in no tour, as in `planners`
+_LEAST_STEP = 0.01  # of what a user is worth in J: what a step costs at least
 
 
 def problem(scenario: "Scenario") -> str | None:
@@ -80,6 +84,7 @@ def encode(
     step: Array,
     data_bits: Array,
     collected: Array,
+    delivered_bits: Array | None = None,
     energy_used_j: Array | None = None,
     weight: Array | float | None = None,
 ) -> Array:
@@ -93,7 +98,8 @@ def encode(
     data_bits, collected = (values.reshape((-1, scenario.n_users)) for values in (data_bits, collected))
     tables = scenario.entity_tables.on(cell)
     grid, limits, n_clusters = scenario.grid, scenario.mission, scenario.n_clusters
-    after = _after(xp, scenario, tables, cell)
+    rows_after = _rows_after(xp, scenario, tables, cell)
+    after = rows(xp, tables.of_cell, rows_after)
     ways_after, progress_after = after[..., :n_clusters], after[..., n_clusters + 1 : 2 * n_clusters + 1]
     home_after, valid = after[..., n_clusters], after[:, Action.HOVER, 2 * n_clusters + 1 :] > 0.5  # [N, 7]
     ways, home = ways_after[:, Action.HOVER], home_after[:, Action.HOVER]  # [N, M], [N]
@@ -105,92 +111,120 @@ def encode(
 
     share = xp.astype(collected, xp.float32)
     user_data = xp.astype(data_bits, xp.float32) / scenario.user_r_min_bits(one)
-    user_data = _clipped(xp, user_data, 0.0, 1.0)
-    done, data_of_all = (cluster_means(scenario, values) for values in (share, user_data))  # [N, M]
-    open_share = 1.0 - done
-    data_of_open = (data_of_all - done) / _at_least(xp, open_share, 1e-3)  # those collected have all of it
-    data_of_open = _clipped(xp, data_of_open, 0.0, 1.0)
-    # Steps over the cluster that its users still need.
-    hovers = _clipped(xp, (1.0 - data_of_open) / _at_least(xp, tables.best, 1e-2), 0.0, 100.0)
+    user_data = user_data.clip(0.0, 1.0)
+    given = data_bits * 0.0 if delivered_bits is None else delivered_bits.reshape((-1, scenario.n_users))
+    given = xp.astype(given, xp.float32) / scenario.user_r_min_bits(one)  # in the last step
     # Users for which one more step here is enough.
     spread = xp.take(progress_after[:, Action.HOVER], tables.cluster_of, axis=-1)
     last = (user_data + spread >= 1.0) & (spread > 0.0) & ~collected
-    nearly = cluster_means(scenario, xp.astype(last, xp.float32))
+    of_users = [
+        share,
+        user_data,
+        given,
+        xp.astype((given > 0.0) & ~collected, xp.float32),
+        xp.astype(last, xp.float32),
+    ]
+    means = cluster_means(scenario, xp.stack(of_users))  # [5, N, M]
+    done, data_of_all, given_mean, reached, nearly = (means[i] for i in range(5))
+    open_share = 1.0 - done
+    data_of_open = (data_of_all - done) / open_share.clip(1e-3)  # those collected have all of it
+    data_of_open = data_of_open.clip(0.0, 1.0)
+    # Steps over the cluster that its users still need.
+    hovers = ((1.0 - data_of_open) / tables.best.clip(1e-2)).clip(0.0, 100.0)
+    reached = reached / open_share.clip(1e-3)  # share of the open users
     open_users = tables.sizes * open_share / scenario.n_users  # share of all users
     detour = ways + tables.home - home[:, None]
     fits = detour <= slack[:, None]
-    in_tour = fits & (done < SERVED)
-    tour = _tour(xp, tables, in_tour, ways, ways_after, home, home_after)
-    tour_steps = tour.moves + (xp.ceil(hovers) * in_tour).sum(axis=-1)
-
     cell_f = xp.astype(cell, xp.float32)
     to_goals = tables.goals_cells - cell_f[:, None, :2]  # cells, [N, M + 1, 2]
     to_clusters, to_dock = to_goals[:, :-1], to_goals[:, -1]
     reach = limits.d_cons_m / grid.cell_m  # cells
-    given = DEFAULT_WEIGHT if weight is None else weight
-    w = one * given if isinstance(given, float) else xp.astype(given.reshape((-1,)), xp.float32)
+    weight = DEFAULT_WEIGHT if weight is None else weight
+    w = one * weight if isinstance(weight, float) else xp.astype(weight.reshape((-1,)), xp.float32)
     per_user, per_step = w / scenario.n_users, (1.0 - w) / limits.max_steps  # of the objective
+    # Without a price for steps any detour would do.
+    price = xp.maximum(per_step, _LEAST_STEP * per_user).clip(1e-6)
+    plan = best_plan(
+        tables,
+        rows_after=rows_after,
+        after=after,
+        left=budget.left,
+        allowed=budget.allowed,
+        data=user_data,
+        collected=collected,
+        delivered=given,
+        done=done,
+        begins=step == 0,
+        per_user=per_user,
+        price=price,
+    )
     value = open_users * w[:, None]
-    cost = (_at_least(xp, detour, 0.0) + hovers) * per_step[:, None]
-    gain = (open_users[:, None] * _clipped(xp, progress_after, 0.0, 1.0)).sum(axis=-1)
+    cost = (detour.clip(0.0) + hovers) * per_step[:, None]
+    gain = (open_users[:, None] * progress_after.clip(0.0, 1.0)).sum(axis=-1)
     limited = scenario.energy is not None and scenario.energy.ends != "steps"
 
     of_mission = [
         budget.left / budget.most,
-        _squashed(budget.left / 16.0),
-        _squashed(slack / 8.0),
-        _clipped(xp, home / _at_least(xp, budget.left, 1.0), 0.0, MAX),
-        _squashed(to_dock[:, 0] / reach),
-        _squashed(to_dock[:, 1] / reach),
-        _squashed(to_dock[:, 0] / 4.0),
-        _squashed(to_dock[:, 1] / 4.0),
+        squashed(budget.left / 16.0),
+        squashed(slack / 8.0),
+        (home / budget.left.clip(1.0)).clip(0.0, MAX),
+        squashed(to_dock[:, 0] / reach),
+        squashed(to_dock[:, 1] / reach),
+        squashed(to_dock[:, 0] / 4.0),
+        squashed(to_dock[:, 1] / 4.0),
         xp.astype(home < 0.5, xp.float32),
         w,
         per_step / (per_step + per_user),
         share.sum(axis=-1) / scenario.n_users,
         user_data.sum(axis=-1) / scenario.n_users,
         cell_f[:, 2] / max(grid.n_z - 1, 1),
-        _squashed((grid.altitude_min_m + cell_f[:, 2] * grid.altitude_step_m) / limits.d_cons_m),
-        one * _squashed(grid.altitude_step_m / limits.d_cons_m),
-        one * _squashed(1.0 / reach),
-        one * _squashed(4.0 * _speed_mps(scenario) * limits.step_s / limits.d_cons_m),
-        one * _squashed(n_clusters / 4.0),
-        one * _squashed(scenario.n_users / 32.0),
-        _clipped(xp, tour_steps / _at_least(xp, budget.left, 1.0), 0.0, MAX),
-        xp.astype(in_tour, xp.float32).sum(axis=-1) / n_clusters,
+        squashed((grid.altitude_min_m + cell_f[:, 2] * grid.altitude_step_m) / limits.d_cons_m),
+        one * squashed(grid.altitude_step_m / limits.d_cons_m),
+        one * squashed(1.0 / reach),
+        one * squashed(4.0 * _speed_mps(scenario) * limits.step_s / limits.d_cons_m),
+        one * squashed(n_clusters / 4.0),
+        one * squashed(scenario.n_users / 32.0),
+        (plan.steps / budget.left.clip(1.0)).clip(0.0, MAX),
+        plan.clusters.sum(axis=-1) / n_clusters,
         one * float(limited),
         budget.charge,
-        one * _squashed(budget.most / 32.0),
+        one * squashed(budget.most / 32.0),
+        one * float(tables.shared),
+        plan.worth.clip(MIN, 1.0),
+        price,
     ]
     of_actions = [
         xp.astype(budget.allowed, xp.float32),
-        _squashed(4.0 * gain),
-        _clipped(xp, tour.moves_after - tour.moves[:, None], MIN, 1.0),
-        _clipped(xp, home_after - home[:, None], MIN, 1.0),
+        squashed(4.0 * gain),
+        (home_after - home[:, None]).clip(MIN, 1.0),
+        plan.loss,
+        squashed(plan.loss / (2.0 * price)[:, None]),
+        squashed(plan.loss / per_user.clip(1e-6)[:, None]),
     ]
     ones = xp.ones_like(ways)
     of_clusters = [
         ones,
-        _squashed(to_clusters[..., 0] / reach),
-        _squashed(to_clusters[..., 1] / reach),
-        _squashed(ways / 8.0),
-        _clipped(xp, ways / _at_least(xp, budget.left, 1.0)[:, None], 0.0, MAX),
-        _squashed(detour / 8.0),
-        _clipped(xp, (detour + hovers) / _at_least(xp, slack, 1.0)[:, None], 0.0, MAX),
+        squashed(to_clusters[..., 0] / reach),
+        squashed(to_clusters[..., 1] / reach),
+        squashed(ways / 8.0),
+        (ways / budget.left.clip(1.0)[:, None]).clip(0.0, MAX),
+        squashed(detour / 8.0),
+        ((detour + hovers) / slack.clip(1.0)[:, None]).clip(0.0, MAX),
         xp.astype(fits, xp.float32),
         ones * (tables.sizes / scenario.n_users),
         done,
         open_users,
         data_of_open,
-        _squashed(hovers / 4.0),
-        value / _at_least(xp, value + cost, 1e-9),
-        tour.regret,
-        xp.astype(in_tour, xp.float32),
-        ones * _squashed(tables.radii),
+        squashed(hovers / 4.0),
+        value / (value + cost).clip(1e-9),
+        plan.clusters,
+        ones * squashed(tables.radii),
         xp.exp(-0.5 * (to_clusters * to_clusters).sum(axis=-1) / (reach * reach)),
         nearly,
+        given_mean.clip(0.0, 1.5),
+        reached,
     ]
-    by_action = _clipped(xp, xp.moveaxis(progress_after, -2, -1), 0.0, 1.5)  # [N, M, 7]
+    by_action = xp.moveaxis(progress_after, -2, -1).clip(0.0, 1.5)  # [N, M, 7]
     clusters = xp.concat([xp.stack(of_clusters, axis=-1), by_action], axis=-1)
     parts = [xp.stack(of_mission, axis=-1), *of_actions, clusters.reshape((clusters.shape[0], -1))]
     return xp.concat(parts, axis=-1).reshape((*leading, size(scenario)))
@@ -211,15 +245,16 @@ def can_land(scenario: "Scenario", *, cell: Array, step: Array, energy_used_j: A
     `cell` is `[N, 3]`, `step` and `energy_used_j` are `[N]`, as those of `observations.encode`.
     """
     xp, n_clusters = array_namespace(cell), scenario.n_clusters
-    after = _after(xp, scenario, scenario.entity_tables.on(cell), cell)
+    tables = scenario.entity_tables.on(cell)
+    after = rows(xp, tables.of_cell, _rows_after(xp, scenario, tables, cell))
     home_after, valid = after[..., n_clusters], after[:, Action.HOVER, 2 * n_clusters + 1 :] > 0.5
     return _budget(xp, scenario, step, energy_used_j, home_after, valid).safe
 
 
-def _after(xp: Any, scenario: "Scenario", tables: EntityTables, cell: Array) -> Array:
-    """`EntityTables.of_cell` of the cells after each action, `[N, 7, 2 M + 8]`."""
+def _rows_after(xp: Any, scenario: "Scenario", tables: EntityTables, cell: Array) -> Array:
+    """Rows in the tables of the cells after each action, `[N, 7]`."""
     here = (cell[:, 0] * scenario.grid.n_y + cell[:, 1]) * scenario.grid.n_z + cell[:, 2]
-    return _rows(xp, tables.of_cell, _rows(xp, tables.after, here))
+    return rows(xp, tables.after, here)
 
 
 class _Budget(NamedTuple):
@@ -240,7 +275,7 @@ def _budget(
     if settings is not None:
         assert energy_used_j is not None, "needed in a scenario with a battery"
         left_j = xp.astype(settings.battery_j - energy_used_j, xp.float32)
-        charge = _clipped(xp, left_j / settings.battery_j, 0.0, 1.0)
+        charge = (left_j / settings.battery_j).clip(0.0, 1.0)
         if settings.ends != "steps":
             energies_j = scenario.step_energies_j
             vertical_j = {0: energies_j.hover, 1: energies_j.climb, -1: energies_j.descent}
@@ -254,58 +289,6 @@ def _budget(
     nearest = xp.min(xp.where(valid, home_after, 0.0 * home_after + 2.0 * FAR), axis=-1, keepdims=True)
     any_safe = xp.any(safe, axis=-1, keepdims=True)
     return _Budget(left, most, charge, safe, xp.where(any_safe, safe, valid & (home_after <= nearest)))
-
-
-class _Tour(NamedTuple):
-    """The shortest tour of the clusters that are open and can still be visited, then to the dock."""
-
-    moves: Array  # `[N]`
-    moves_after: Array  # of that tour after each action, `[N, 7]`
-    regret: Array  # how much longer it is when it begins with a cluster, squashed; 1 for others; `[N, M]`
-
-
-def _tour(
-    xp: Any,
-    tables: EntityTables,
-    in_tour: Array,
-    ways: Array,
-    ways_after: Array,
-    home: Array,
-    home_after: Array,
-) -> _Tour:
-    shared = tables.members.shape[0] > tables.members.shape[1]  # stops, by several clusters
-    in_stop = (xp.astype(in_tour, xp.float32) @ tables.members) > 0.5 if shared else in_tour
-    bits = constant(tuple(1 << i for i in range(tables.members.shape[1])), tables.after)
-    rest = _rows(xp, tables.tours, (in_stop * bits).sum(axis=-1))  # [N, S]
-    if shared:
-        ways, ways_after = (xp.take(values, tables.first, axis=-1) for values in (ways, ways_after))
-    by_first, any_stop = ways + rest, xp.any(in_stop, axis=-1)
-    moves = xp.where(any_stop, xp.min(by_first, axis=-1), home)
-    moves_after = xp.min(ways_after + rest[:, None], axis=-1)
-    regret = by_first - moves[:, None]
-    if shared:
-        regret = xp.take(regret, tables.stop_of, axis=-1)
-    return _Tour(
-        moves=moves,
-        moves_after=xp.where(any_stop[:, None], moves_after, home_after),
-        regret=xp.where(in_tour, _squashed(regret / 4.0), xp.ones_like(regret)),
-    )
-
-
-def _rows(xp: Any, table: Array, rows: Array) -> Array:
-    return xp.take(table, rows.reshape((-1,)), axis=0).reshape((*rows.shape, *table.shape[1:]))
-
-
-def _squashed(values: Any) -> Any:
-    return values / (1.0 + abs(values))
-
-
-def _clipped(xp: Any, values: Array, low: float, high: float) -> Array:
-    return xp.minimum(xp.maximum(values, constant((low,), values)), constant((high,), values))
-
-
-def _at_least(xp: Any, values: Array, low: float) -> Array:
-    return xp.maximum(values, constant((low,), values))
 
 
 def _speed_mps(scenario: "Scenario") -> float:

@@ -5,6 +5,7 @@ those of a disc evenly spread, see `expected_users_m`.
 """
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from typing import TYPE_CHECKING, Any
 
@@ -48,31 +49,45 @@ class EntityTables:
         best = np.where(free[:, None], progress, 0.0).max(axis=0)
         self.best: Array = best.astype(np.float32)  # progress of each cluster in its best cell, [M]
         good = free[:, None] & (served >= GOOD * np.where(free[:, None], served, 0.0).max(axis=0))
-        columns = [_moves_to(scenario, mask.reshape(grid.shape)) for mask in good.T]
-        dock = np.zeros(grid.shape, bool)
-        dock[scenario.dock_cell] = True
-        columns.append(_moves_to(scenario, dock))
-        ways = np.stack(columns, axis=-1)  # [C, M + 1]
+        centres_m = np.asarray(scenario.cluster_centres_m)
+        away_m = np.linalg.norm((cells[:, :2] * grid.cell_m)[:, None] - centres_m, axis=-1)
+        # Rows of the cells where the clusters are served: the nearest good one, the lowest of them, [M]. One
+        # cell each: if any good one would do, a way could end at one cell and go on from another.
+        places = self.places = np.where(good, away_m + 1e-3 * cells[:, 2:], np.inf).argmin(axis=0)
+        ways = _moves_to_each(scenario, cells, [*cells[places], (*scenario.dock_cell, -1)])  # [C, M + 1]
         # Moves to each cluster and to the dock, then the progress of each cluster, then whether each action
         # has an effect, float32 [C, 2 M + 8].
         self.of_cell: Array = np.concatenate([ways, progress, valid], axis=-1).astype(np.float32)
 
-        centres_m = np.asarray(scenario.cluster_centres_m)
-        away_m = np.linalg.norm((cells[:, :2] * grid.cell_m)[:, None] - centres_m, axis=-1)
-        # Rows of the cells that stand for the clusters: the nearest good one, the lowest of them, [M].
-        places = np.where(good, away_m + 1e-3 * cells[:, 2:], np.inf).argmin(axis=0)
         self.home: Array = ways[places, n_clusters].astype(np.float32)  # moves from there to the dock, [M]
         self.stop_of = _stops(centres_m, np.asarray(scenario.users.sizes))  # of each cluster, [M]
         # The cluster that stands for each stop, [S].
         self.first: Array = np.unique(self.stop_of, return_index=True)[1]
+        n_stops = len(self.first)
         legs = ways[places[self.first]][:, [*self.first, n_clusters]]
         # Moves of the shortest way from each stop past all others of a set to the dock, by the number of the
         # set (bit i: stop i), float32 [2^S, S]; FAR for a stop that is not in the set.
         self.tours: Array = _tours(legs).astype(np.float32)
         # Stop of each cluster one-hot, float32 [M, S].
-        self.members: Array = (self.stop_of[:, None] == np.arange(len(self.first))).astype(np.float32)
+        self.members: Array = (self.stop_of[:, None] == np.arange(n_stops)).astype(np.float32)
+        # Stops of each set, numbers 0 and 1, float32 [S, 2^S].
+        self.sets: Array = ((np.arange(2**n_stops) >> np.arange(n_stops)[:, None]) & 1).astype(np.float32)
+        self.none: Array = np.where(self.sets.any(axis=0), FAR, 0.0).astype(
+            np.float32
+        )  # FAR: not the empty set
+        # Clusters of each set of stops, numbers 0 and 1, float32 [2^S, M].
+        self.clusters: Array = np.ascontiguousarray((self.members @ self.sets).T)
+        self.shared = n_stops < n_clusters  # whether clusters share stops
+        self.of_stop: Array = _padded(np.bincount(self.stop_of), np.argsort(self.stop_of, kind="stable"))
+        # Moves from each cell past the stops of each set to the dock, float32 [C, 2^S]; none if stops are
+        # shared: then they begin at different clusters.
+        self.rounds: Array | None = None if self.shared else _rounds(ways, self.tours).astype(np.float32)
+        # Moves to each cluster from the nearest other one of its stop, float32 [M].
+        self.apart: Array = _apart(ways[places][:, :n_clusters], self.stop_of).astype(np.float32)
         self.cluster_of = np.asarray(scenario.user_cluster)  # of each user, [U]
         self.sizes: Array = np.asarray(scenario.users.sizes, np.float32)  # users of each cluster, [M]
+        # Users of each cluster, [M, largest size]; the number of all users where a cluster has fewer.
+        self.users: Array = _padded(np.asarray(scenario.users.sizes), np.arange(scenario.n_users))
         radii_m = np.asarray([disc.radius_m for disc in scenario.users.clusters])
         self.radii: Array = (radii_m / scenario.mission.d_cons_m).astype(
             np.float32
@@ -119,20 +134,43 @@ def _progress(scenario: "Scenario", cells: Array) -> Array:
     return np.concatenate(blocks)
 
 
-def _moves_to(scenario: "Scenario", goal: Array) -> Array:
-    """Moves from each cell to the nearest one in `goal`, bool `[n_x, n_y, n_z]`; `[C]`."""
-    if scenario.moves is not None:
-        steps = scenario.moves.steps_from(np.argwhere(goal)).reshape(-1)
-        return np.where(steps == UNREACHABLE, FAR, steps)
-    # Without obstacles it is the distance along the axes: one pass in each direction of each axis.
-    steps = np.where(goal, 0.0, FAR)
-    for axis in range(3):
-        line = np.moveaxis(steps, axis, 0)
-        for i in range(1, len(line)):
-            line[i] = np.minimum(line[i], line[i - 1] + 1.0)
-        for i in reversed(range(len(line) - 1)):
-            line[i] = np.minimum(line[i], line[i + 1] + 1.0)
-    return steps.reshape(-1)
+def _moves_to_each(scenario: "Scenario", cells: Array, goals: Sequence[Array | tuple[int, ...]]) -> Array:
+    """Moves from each cell to each goal, `[C, N]`; a goal is a cell, of which layer -1 is all layers."""
+    columns = []
+    for goal in np.asarray(goals):
+        if scenario.moves is None:
+            n = 3 if goal[2] >= 0 else 2
+            columns.append(abs(cells[:, :n] - goal[:n]).sum(axis=-1))
+        else:
+            to = goal[None] if goal[2] >= 0 else cells[(cells[:, :2] == goal[:2]).all(axis=-1)]
+            steps = scenario.moves.steps_from(to).reshape(-1)
+            columns.append(np.where(steps == UNREACHABLE, FAR, steps))
+    return np.stack(columns, axis=-1)
+
+
+def _rounds(ways: Array, tours: Array) -> Array:
+    """Shortest ways from each cell past sets of S stops to the dock, `[C, 2^S]`; `ways` is `[C, S + 1]`."""
+    n, numbers = tours.shape[1], np.arange(len(tours))
+    rounds = np.full((len(ways), len(tours)), FAR)
+    rounds[:, 0] = ways[:, n]
+    for i in range(n):
+        sets = numbers[numbers >> i & 1 == 1]
+        rounds[:, sets] = np.minimum(rounds[:, sets], ways[:, i, None] + tours[sets, i])
+    return rounds
+
+
+def _apart(legs: Array, stop_of: Array) -> Array:
+    """Moves to each cluster from the nearest other one of its stop, `[M]`; 0 for one that is alone there."""
+    others = (stop_of[:, None] == stop_of) & ~np.eye(len(stop_of), dtype=bool)
+    nearest = np.where(others, legs, np.inf).min(axis=0)
+    return np.where(np.isfinite(nearest), nearest, 0.0)
+
+
+def _padded(sizes: Array, members: Array) -> Array:
+    """Members of sets of given sizes one after another, `[N, largest size]`, padded with their number."""
+    turn, firsts = np.arange(sizes.max()), np.cumsum(sizes) - sizes
+    padded = np.append(members, len(members))
+    return padded[np.where(turn < sizes[:, None], firsts[:, None] + turn, len(members))]
 
 
 def _stops(centres_m: Array, sizes: Array) -> Array:

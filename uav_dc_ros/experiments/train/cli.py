@@ -76,11 +76,11 @@ def main(argv: list[str] | None = None) -> None:
     algorithm = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     algorithm.add_argument("--algo")
     try:
-        of_pqn = algorithm.parse_known_args(argv)[0].algo == "pqn"
+        algo = algorithm.parse_known_args(argv)[0].algo
     except argparse.ArgumentError:
-        of_pqn = False
-    if of_pqn:
-        parser = generalist.options_parser(PROG)
+        algo = None
+    if algo in generalist.SETTINGS:
+        parser = generalist.options_parser(PROG, algo)
         cli.run(lambda: generalist.train(parser.parse_args(argv), command, PROG), PROG)
     cli.run(lambda: _train(options_parser().parse_args(argv), command), PROG)
 
@@ -94,10 +94,10 @@ def options_parser() -> cli.Parser:
     )
     add = parser.add_argument
     algorithms = "the paper's algorithms 1 and 2, each with a double target, too; "
-    algorithms += "--algo pqn --help lists the options for a policy for any field"
+    algorithms += "--algo ppo --help lists the options for a policy for any field"
     text = f"shipped: {', '.join(scenarios.names())}"
     add("--scenario", required=True, metavar="NAME|FILE|random:SEED", help=text)
-    add("--algo", required=True, choices=[*get_args(Algorithm), "pqn"], help=algorithms)
+    add("--algo", required=True, choices=[*get_args(Algorithm), *generalist.SETTINGS], help=algorithms)
     add("--out", required=True, type=Path, metavar="DIR", help="folder to make, such as policies/NAME")
     add("--observation", default="mission", choices=get_args(Observation), help="what the agent sees")
     add("--aggregation", default="mean", choices=get_args(network.Aggregation), help="of the dueling streams")

@@ -187,6 +187,9 @@ class Training:
         state = in_worlds("world")
         # Checkpoints of version 0.1.0 lack it. Their data is that so far.
         state.setdefault("mission_reward", state["total_reward"])
+        state.setdefault(
+            "delivered_bits", 0.0 * state["data_bits"]
+        )  # nor that: no observation of theirs has it
         state.setdefault("energy_used_j", 0.0 * state["total_reward"])  # nor that: they have no battery
         state.setdefault("motion", state["users_m"][..., :0])  # nor that: their users walk at random
         state.setdefault("waves", state["data_bits"][..., None, :0])  # nor shadowing

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
-from uav_dc_ros.agents.set_policy import SetPolicyConfig
+from uav_dc_ros.agents.set_policy import PpoSettings, PqnSettings, SetPolicyConfig
 from uav_dc_ros.core.entities.encoding import CLUSTERS_MAX, SHAPE_MAX
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, evaluate, mean_and_interval
@@ -43,9 +43,10 @@ def card(
     last = used + values.iterations * values.layouts - 1
     return f"""# {config.name}
 
-One policy for fields that it has not seen, with the `entities` observation: shared layers of {config.width}
-units for each cluster, hidden layers of {hidden} units, dueling heads, {len(config.actions)} actions. The
-weight w of the objective J is an input: it is chosen when the policy flies.
+One policy for fields that it has not seen, with the `entities` observation: two networks, of V and of the
+advantages, each with shared layers of {config.width} units for each cluster and hidden layers of {hidden}
+units; {len(config.actions)} actions. They begin with the plan of the observation. The weight w of the
+objective J is an input: it is chosen when the policy flies.
 
 ## How it was made
 
@@ -54,17 +55,12 @@ weight w of the objective J is an input: it is chosen when the policy flies.
 ```
 
 - uav_dc_ros {__version__}; {seconds / 60:.1f} minutes on one core, {decisions / 1e6:.1f} million decisions
-- PQN (Gallici et al., 2025) on random layouts, seeds {used} to {last}, each flown in one iteration only; the
-  reward is J, with w drawn for each mission
+- {_how(values)}
+- random layouts, seeds {used} to {last}, {values.layouts} of {values.missions} missions an iteration, each
+  flown in one iteration only; the reward is J, with w drawn for each mission
 - chosen among all checkpoints by J in {SELECTION_LAYOUTS} layouts, seeds from {SELECTION_SEEDS.start}, with
   {SELECTION_MISSIONS} missions each and w from 0 to 1: iteration {config.iteration} with {score:.4f}; there
   {others}
-- {values.layouts} layouts of {values.missions} missions an iteration, {values.epochs} pass(es), batches of
-  {values.batch_size}, learning rate {values.learning_rate:g} falling to a fiftieth, lambda {values.trace:g},
-  discount {values.discount:g}, advantage learning with alpha {values.advantage:g}, probability of the greedy
-  action (epsilon) {values.epsilon:g} to {values.epsilon_end:g}
-- the planner `fixed_tour` flies {values.demonstrations:.0%} of the layouts as demonstrations at first, and
-  {values.demonstrations_end:.0%} after {values.shown:.0%} of the iterations
 
 ## How it does
 
@@ -79,6 +75,22 @@ It takes grids up to {shape} cells and up to {CLUSTERS_MAX} clusters or single u
 clusters are, but not where single users walk, and expects each where it starts. It has met a line-of-sight
 channel in simulation only: no wind, no fading, no lost packets.
 """
+
+
+def _how(values: PpoSettings | PqnSettings) -> str:
+    """The algorithm and its hyperparameters."""
+    if isinstance(values, PpoSettings):
+        return f"""PPO (Schulman et al., 2017) of the plan's decisions: {values.iterations} iterations,
+  batches of {values.batch_size}, learning rates {values.value_rate:g} of V and
+  {values.advantage_rate:g} of A, which fall to a fiftieth, lambda {values.trace:g}, sharpness
+  {values.sharpness:g}, clip {values.clip:g}, restraint {values.restraint:g}, {values.random_moves:.0%} random
+  moves; V alone learns in the first {values.value_only:.0%} of the iterations"""
+    return f"""PQN (Gallici et al., 2025): {values.iterations} iterations, {values.epochs} pass(es), batches
+  of {values.batch_size}, learning rate {values.learning_rate:g}, which falls to a fiftieth, lambda
+  {values.trace:g}, discount {values.discount:g}, advantage learning with alpha {values.advantage:g},
+  probability of the greedy action (epsilon) {values.epsilon:g} to {values.epsilon_end:g}; the planner
+  `fixed_tour` flies {values.demonstrations:.0%} of the layouts as demonstrations at first, and
+  {values.demonstrations_end:.0%} after {values.shown:.0%} of the iterations"""
 
 
 def row(policy: Policy, scenario: Scenario) -> str:

@@ -1,4 +1,4 @@
-"""The command line of `python -m uav_dc_ros.train --algo pqn`: a policy for fields that it has not seen."""
+"""The command line of `python -m uav_dc_ros.train --algo ppo` (or `pqn`): a policy for unseen fields."""
 
 import argparse
 import shutil
@@ -14,7 +14,7 @@ from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Policy
-from uav_dc_ros.agents.set_policy import PqnSettings, SetPolicyConfig
+from uav_dc_ros.agents.set_policy import PpoSettings, PqnSettings, SetPolicyConfig
 from uav_dc_ros.core.keys import leaves
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture
 from uav_dc_ros.experiments.train.generalist.card import card, checkpoint_card
@@ -25,12 +25,23 @@ if TYPE_CHECKING:
 
 RANDOM = "random"  # the value of `--scenario`: random layouts
 HOME = "five_clusters"  # the world in which a generalist flies where no other is given
-_OPTIONS = {
+SETTINGS: dict[str, type[PpoSettings | PqnSettings]] = {
+    "ppo": PpoSettings,
+    "pqn": PqnSettings,
+}  # by algorithm
+_TEXTS = {
     "iterations": "rounds of flying and fitting",
     "layouts": "new layouts of an iteration",
     "missions": "missions in each layout",
-    "epochs": "passes over the decisions of an iteration",
     "batch_size": "decisions in a mini-batch",
+    "value_rate": "learning rate of V at the start; it falls to a fiftieth",
+    "advantage_rate": "learning rate of A at the start; it falls to a fiftieth",
+    "value_only": "share of the iterations in which V alone learns, at first",
+    "sharpness": "what a difference of one step counts in the logarithm of a probability",
+    "random_moves": "share of the moves that are random",
+    "clip": "of the ratio of probabilities",
+    "restraint": "weight of the squared difference between A and the plan's, in steps",
+    "epochs": "passes over the decisions of an iteration",
     "learning_rate": "of Adam at the start; it falls to a fiftieth",
     "trace": "lambda of the returns",
     "discount": "of a step",
@@ -54,15 +65,15 @@ class _SavedProgress(msgspec.Struct):
     seconds: float = 0.0  # wall time
 
 
-def options_parser(prog: str) -> cli.Parser:
-    """The parser of the options."""
+def options_parser(prog: str, algorithm: str) -> cli.Parser:
+    """The parser of the options of an algorithm, a key of `SETTINGS`."""
     parser = cli.Parser(
         prog=prog,
-        description="Train a policy for any field: on random layouts, by parallelised Q-learning (PQN).",
+        description="Train a policy for any field, on random layouts.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    add("--algo", required=True, choices=["pqn"], help="others have other options")
+    add("--algo", required=True, choices=[algorithm], help="others have other options")
     add("--scenario", required=True, choices=[RANDOM], help="random layouts, new ones in each iteration")
     add("--observation", default="entities", choices=["entities"], help="what the agent sees")
     add("--out", required=True, type=Path, metavar="DIR", help="folder to make, such as policies/NAME")
@@ -74,9 +85,9 @@ def options_parser(prog: str) -> cli.Parser:
     add("--resume", action="store_true", help="resume from the last checkpoint of the same command, if any")
     add("--threads", default=1, help="of torch: equal numbers give equal results", **count)
     learning = parser.add_argument_group("learning")
-    for name, text in _OPTIONS.items():
-        default = getattr(PqnSettings(), name)
-        option = f"--{name.replace('_', '-')}"
+    for name in SETTINGS[algorithm].__struct_fields__:
+        default = getattr(SETTINGS[algorithm](), name)
+        option, text = f"--{name.replace('_', '-')}", _TEXTS[name]
         learning.add_argument(option, metavar="X", default=default, type=type(default), help=text)
     return parser
 
@@ -88,13 +99,19 @@ def train(options: argparse.Namespace, command: str, prog: str) -> int:
     torch_device("cpu", options.threads)
     # These need torch.
     from uav_dc_ros.experiments.train import checkpoint
-    from uav_dc_ros.experiments.train.generalist.training import BASELINES, GeneralistTraining
+    from uav_dc_ros.experiments.train.generalist.ppo import PpoTraining
+    from uav_dc_ros.experiments.train.generalist.pqn import PqnTraining
+    from uav_dc_ros.experiments.train.generalist.training import BASELINES
 
     folder = options.out.with_name(f"{options.out.name}.checkpoints")
     saved, every = folder / "training.safetensors", options.checkpoint_every
     policy.check_new(options.out)
     architecture = config.architecture(scenarios.load(HOME))
-    training = GeneralistTraining(config.hyperparameters, architecture, config.seed)
+    training: GeneralistTraining
+    if isinstance(config.hyperparameters, PpoSettings):
+        training = PpoTraining(config.hyperparameters, architecture, config.seed)
+    else:
+        training = PqnTraining(config.hyperparameters, architecture, config.seed)
     progress = _SavedProgress(every)
     if options.resume and saved.is_file():
         with checkpoint.reading(saved) as (arrays, values):
@@ -111,6 +128,7 @@ def train(options: argparse.Namespace, command: str, prog: str) -> int:
     try:
         if not progress.baselines:
             progress.baselines = {name: training.baseline(name) for name in BASELINES}
+            progress.baselines["the plan alone"] = training.validate()
             others = ", ".join(f"{name} {value:.4f}" for name, value in progress.baselines.items())
             print(f"J in the layouts that select: {others}", flush=True)
         while training.n_done < total:
@@ -176,7 +194,8 @@ def _config(options: argparse.Namespace) -> SetPolicyConfig:
                 "name": options.out.name,
                 "width": options.width,
                 "hidden": options.hidden,
-                "hyperparameters": {name: getattr(options, name) for name in _OPTIONS},
+                "hyperparameters": {"type": options.algo}
+                | {name: getattr(options, name) for name in SETTINGS[options.algo].__struct_fields__},
                 "seed": options.seed,
                 "iteration": 0,
                 "version": __version__,

@@ -1,5 +1,6 @@
-"""Random layouts to train on: wider than the fields of `scenario random`, and drawn in milliseconds.
+"""Random layouts to train on.
 
+Half of them are fields of `scenario random`, of other seeds. The others are wider, and drawn in milliseconds.
 What a layout leaves open to skill is drawn, too: the budget is a multiple, from too little to plenty, of the
 shortest tour with the hovers that its users need. Everything else is drawn over the ranges below. A few
 layouts have single users instead of clusters, no-fly zones, or a battery that ends missions.
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from uav_dc_ros import scenarios
 from uav_dc_ros.core.scenario import Scenario, from_values
 from uav_dc_ros.errors import ScenarioError
 
@@ -20,14 +22,17 @@ SELECTION_SEEDS = range(1_000_000, 2_000_000)
 SELECTION_LAYOUTS, SELECTION_MISSIONS = 64, 8  # the first of these seeds, and missions of each
 TRIES = 100  # drafts of a layout
 
-_SINGLES, _ZONES, _BATTERY, _ON_ARRIVAL = 0.2, 0.08, 0.06, 0.15  # shares of the layouts
+_RANDOM_FIELDS = 0.5  # share of the layouts
+_SINGLES, _ZONES, _BATTERY, _ON_ARRIVAL = 0.2, 0.08, 0.06, 0.15  # shares of the others
 _APART = 0.6  # share of those with clusters in which discs do not touch, where there is room
 _HOVERS_MAX = 8  # steps over a cluster that the budget counts at most
 
 
 def draw(seed: int) -> Scenario:
-    """The layout of a seed, named `layout_SEED`."""
+    """The layout of a seed, named `layout_SEED` or `random_SEED`."""
     rng = np.random.default_rng(seed)
+    if rng.random() < _RANDOM_FIELDS:
+        return scenarios.load(f"{scenarios.RANDOM}{seed}")
     for _ in range(TRIES):
         try:
             return _draft(rng, seed)

@@ -17,15 +17,19 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
+from uav_dc_ros import planners
 from uav_dc_ros.agents import set_network
-from uav_dc_ros.agents.network import Parameters
 from uav_dc_ros.agents.set_network import SetArchitecture
+from uav_dc_ros.agents.set_policy import PqnSettings
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.entities.encoding import allowed
+from uav_dc_ros.experiments.train.generalist.set_learner import FALL, SetLearner, active
+from uav_dc_ros.experiments.train.generalist.training import GeneralistTraining, Iteration
 
-GRADIENT_MAX = 10.0  # norm
+DEMONSTRATOR = "fixed_tour"
+PREFERRED_FROM = 0.5  # weight of the objective from which a tour of all clusters is to be preferred
+REWARD_SCALE = 10.0  # J lies in [0, 1]; errors of a tenth of that are large
 MARGIN = 0.1  # of a demonstrated action over others, in units of the returns
 
 
@@ -38,25 +42,20 @@ class Batch(NamedTuple):
     demonstrated: Array  # the action is a planner's, which is to be preferred, bool `[R]`
 
 
-class PqnLearner:
+class PqnLearner(SetLearner):
     """One Q-network for sets and its optimiser."""
 
-    def __init__(self, architecture: SetArchitecture, parameters: Parameters) -> None:
-        self.architecture = architecture
-        self._theta = {name: torch.from_numpy(v.copy()).requires_grad_() for name, v in parameters.items()}
-        self._optimiser = torch.optim.Adam(self._theta.values(), lr=0.0, eps=1e-5, fused=True)
-
-    def q_values(self, observation: Array) -> Array:
-        """Q(s, a), `[B, D]` to `[B, A]`, float32."""
+    def preferences(self, observation: Array) -> Array:
+        """Q(s, a) in tenths of J, `[B, D]` to `[B, A]`, float32."""
         with torch.inference_mode():
             return self._q(torch.from_numpy(observation)).numpy()
 
     def _q(self, observation: Tensor) -> Tensor:
-        return set_network.q_values(self.architecture, self._theta, observation, _active)
+        return REWARD_SCALE * set_network.q_values(self.architecture, self.theta, observation, active)
 
     def fit(self, batch: Batch, order: Array, rows: int, learning_rate: float) -> float:
         """Gradient steps on mini-batches of `rows` rows in an order `[R]`; their mean squared error."""
-        self._optimiser.param_groups[0]["lr"] = learning_rate
+        self.set_rate(learning_rate)
         losses = []
         for part in np.array_split(order, max(1, round(len(order) / rows))):
             observation, action, target, shown = (torch.from_numpy(values[part]) for values in batch)
@@ -69,36 +68,64 @@ class PqnLearner:
                 others = (q_values + MARGIN).scatter(1, action[:, None], taken)
                 best = others.masked_fill(~allowed(observation), -torch.inf).amax(dim=1)
                 loss = loss + ((best - taken[:, 0]) * shown).mean()
-            self._optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(self._theta.values(), GRADIENT_MAX)
-            self._optimiser.step()
+            self.descend(loss)
             losses.append(float(squares.detach()))
         return sum(losses) / len(losses)
 
-    def parameters(self) -> Parameters:
-        """A copy of the parameters, numpy, as `set_network.shapes` names them."""
-        return {name: values.detach().numpy().copy() for name, values in self._theta.items()}
 
-    def state(self) -> dict[str, Tensor]:
-        """Everything that later updates depend on."""
-        state = {f"theta.{name}": values.detach() for name, values in self._theta.items()}
-        for i, moments in self._optimiser.state_dict()["state"].items():
-            state |= {f"adam.{i}.{key}": values for key, values in moments.items()}
-        return state
+class PqnTraining(GeneralistTraining):
+    """A run between two iterations."""
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore the `state` of a learner of the same architecture."""
-        moments: dict[int, dict[str, Tensor]] = {}
-        with torch.no_grad():
-            for name, values in state.items():
-                kind, _, key = name.partition(".")
-                if kind == "theta":
-                    self._theta[key].copy_(values)
-                else:
-                    index, _, key = key.partition(".")
-                    moments.setdefault(int(index), {})[key] = values
-        self._optimiser.load_state_dict(self._optimiser.state_dict() | {"state": moments})
+    def __init__(self, settings: PqnSettings, architecture: SetArchitecture, seed: int) -> None:
+        super().__init__(settings, seed)
+        self.settings = settings
+        self.learner: PqnLearner = PqnLearner(
+            architecture, set_network.initial(architecture, self.generator())
+        )
+
+    def iterate(self) -> Iteration:
+        """See `GeneralistTraining`."""
+        settings = self.settings
+        drawn, weights, flown, rng, done = self.begin()
+        rest = max(0.0, 1.0 - done / settings.shown)  # of the iterations in which the share falls
+        share = rest * settings.demonstrations + (1.0 - rest) * settings.demonstrations_end
+        # Planning the tours of a layout takes as long as flying its missions.
+        n_toured = round(share * settings.layouts)
+        tours = [planners.PLANNERS[DEMONSTRATOR](layout) for layout in drawn[:n_toured]]
+        n_shown = n_toured * settings.missions
+        epsilon = settings.epsilon + done * (settings.epsilon_end - settings.epsilon)
+        steps: list[tuple[Array, ...]] = []
+        while not flown.all_over:
+            observed = flown.observe()
+            mask, q_values = self.choices(*observed)
+            drawn_action = (rng.random(mask.shape, np.float32) * mask).argmax(axis=-1)
+            explore = rng.random(len(mask), np.float32) >= epsilon
+            action = np.where(explore, drawn_action, q_values.argmax(axis=-1))
+            follows = np.zeros(len(mask), bool)
+            if n_toured:
+                states = flown.states[:n_toured]
+                toured = np.concatenate([act(one) for act, one in zip(tours, states, strict=True)])
+                lands = np.take_along_axis(mask[:n_shown], toured[:, None], axis=-1)[:, 0]
+                follows[:n_shown] = ~explore[:n_shown] & lands
+                action[:n_shown] = np.where(follows[:n_shown], toured, action[:n_shown])
+            best = q_values.max(axis=-1)
+            gap = best - np.take_along_axis(q_values, action[:, None], axis=-1)[:, 0]
+            stepped = flown.step(action)
+            follows &= weights.reshape(-1) >= PREFERRED_FROM
+            steps.append((*observed, action, follows, best, gap, *stepped))
+        observation, flying, action, shows, best, gap, reward, over = map(np.stack, zip(*steps, strict=True))
+        returns = lambda_returns(
+            np.float32(REWARD_SCALE) * reward, over, best, settings.trace, settings.discount
+        )
+        target = returns - np.float32(settings.advantage) * gap
+        batch = Batch(*(values[flying] for values in (observation, action, target, shows)))
+        rate = settings.learning_rate * max(1.0 - done, FALL)
+        losses = [
+            self.learner.fit(batch, rng.permutation(len(batch.action)), settings.batch_size, rate)
+            for _ in range(settings.epochs)
+        ]
+        loss = sum(losses) / len(losses) / REWARD_SCALE**2
+        return self.end(flown, loss, len(batch.action))
 
 
 def lambda_returns(reward: Array, over: Array, best_q: Array, trace: float, discount: float) -> Array:
@@ -113,8 +140,3 @@ def lambda_returns(reward: Array, over: Array, best_q: Array, trace: float, disc
             after = (1.0 - trace) * best_q[t + 1] + trace * targets[t + 1]
         targets[t] = reward[t] + np.where(over[t], 0.0, discount * after)
     return targets
-
-
-def _active(values: Tensor) -> Tensor:
-    """As in `set_network`, fused."""
-    return functional.relu(functional.layer_norm(values, values.shape[-1:]))
