@@ -505,6 +505,18 @@ def test_users_around_which_there_is_no_field(
     assert not (tmp_path / "own.toml").exists()
 
 
+def test_users_of_one_place_are_asked_for_the_same_whether_they_are_a_cluster_or_not() -> None:
+    """They interfere all the same."""
+    at_m = [(x, y) for x in (300.0, 320.0, 340.0) for y in (500.0, 530.0)] + [(900.0, 900.0)]
+    users = [{"x_m": x, "y_m": y} for x, y in at_m]
+    together = [user | {"cluster": "yard"} for user in users[:-1]] + users[-1:]
+    alone, clustered = (field.around("own", some, None) for some in (users, together))
+    assert (alone.n_clusters, clustered.n_clusters) == (7, 2)
+    assert alone.mission.r_min_bits == clustered.mission.r_min_bits
+    spread = [{"x_m": 400.0 * i, "y_m": 400.0 * i} for i in range(3)]
+    assert field.around("own", spread, None).mission.r_min_bits > alone.mission.r_min_bits
+
+
 def test_a_check_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys, "check", "three_clusters_hover", "--json")
     found = json.loads(out)
