@@ -139,6 +139,32 @@ def test_order_names_and_values_are_in_the_fingerprint():
     assert from_values(msgspec.to_builtins(field()), "again").fingerprint == field().fingerprint
 
 
+STILL = {"user": [{"x_m": 300.0, "y_m": 300.0}], "mobility": {"model": "static"}}
+WALK = {"mobility": None, "v_max_mps": 0.0}
+WAYPOINTS = {"model": "random_waypoint", "v_min_mps": 1.0, "v_max_mps": 2.0, "pause_s": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("users", "radio", "is_random"),
+    [
+        ({}, {}, False),
+        (WALK, {}, False),
+        (WALK | {"v_max_mps": 1.0}, {}, True),
+        ({"mobility": WAYPOINTS}, {}, True),
+        ({"user": [{**STILL["user"][0], "radius_m": 5.0}]}, {}, True),
+        ({}, {"fading": {"model": "rayleigh"}}, True),
+        ({}, {"shadowing": {"sigma_db": 6.0, "correlation_m": 50.0}}, True),
+    ],
+)
+def test_where_nothing_is_drawn_every_seed_gives_the_same_mission(users, radio, is_random):
+    table = {key: value for key, value in (STILL | users).items() if value is not None}
+    scenario = from_values(VALUES | {"users": table, "radio": VALUES["radio"] | radio}, "test")
+    assert scenario.is_random is is_random
+    missions = roll_out(scenario, PLANNERS["fixed_tour"](scenario), [1, 2])
+    one, other = missions.data_bits
+    assert bool(one != other) is is_random
+
+
 def test_policies_fit_by_their_number_of_clusters():
     """A single user is a cluster."""
     made = policies.load("five_clusters_hover_dueling")

@@ -198,6 +198,20 @@ def test_every_policy_flies_in_every_scenario_and_is_compared_with_the_first(tmp
         assert f"{mean:.1f}" in out
 
 
+@pytest.mark.parametrize(("n", "note"), [(2, True), (1, False)])
+def test_equal_missions_are_named(n, note, capsys):
+    """In the farm nothing is drawn: its users and its channel are the same with each seed."""
+    with pytest.raises(SystemExit) as exit:
+        main(["--policy", "fixed_tour", "--scenario", "farm", "--seeds", str(n)])
+    assert exit.value.code == 0
+    out, err = capsys.readouterr()
+    expected = (
+        "farm: nothing is drawn in this world, so every seed gives the same mission; --seeds 1 is enough\n"
+    )
+    assert err.endswith(expected) if note else not err
+    assert f"farm, 16 users, {'2 missions, seeds 0 to 1' if note else '1 mission, seed 0'}\n" in out
+
+
 def test_policies_of_one_name_are_distinguished_by_their_folders(tmp_path, capsys):
     three = scenarios.load("three_clusters_hover")
     folders = [str(saved(tmp_path / name, three, name="same")) for name in ("a", "b")]

@@ -417,6 +417,68 @@ def test_a_field_among_zones_of_a_file(tmp_path: Path, capsys: pytest.CaptureFix
     assert f"{path}:{line_of(text, 'zones = ')}: " in err
 
 
+ZONES = {
+    "type": "FeatureCollection",
+    "features": [
+        {
+            "type": "Feature",
+            "properties": {"name": "school"},
+            "geometry": {"type": "Polygon", "coordinates": [ring(47.392, 8.534, 0.0008)]},
+        }
+    ],
+}
+METRES = "x_m,y_m\n60,90\n700,80\n650,600\n"
+DEGREES = "latitude,longitude\n47.391,8.531\n47.391,8.539\n47.395,8.538\n"
+
+
+@pytest.mark.parametrize("content", [METRES, DEGREES], ids=["metres", "degrees"])
+def test_a_datum_puts_the_grid_on_the_earth(
+    content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    users, zones, path = tmp_path / "users.csv", tmp_path / "zones.geojson", tmp_path / "own.toml"
+    users.write_text(content, "utf-8")
+    zones.write_text(json.dumps(ZONES), "utf-8")
+    arguments = ("import", users, "--datum", "47.3901,8.53", "--zones", zones, "--out", path)
+    assert run(capsys, *arguments)[::2] == (0, "")
+    scenario = scenarios.load(path)
+    assert scenario.datum_deg == (47.3901, 8.53)
+    assert f"{users} --datum 47.3901,8.53 --zones {zones}\n" in path.read_text("utf-8")
+    east_m, north_m = scenario.obstacles[0].polygon_m[0]
+    a_degree_m = 111_200.0  # of latitude; within a part in 200
+    assert north_m == pytest.approx(0.0019 * a_degree_m, rel=5e-3)
+    assert east_m == pytest.approx(0.004 * a_degree_m * math.cos(math.radians(47.39)), rel=5e-3)
+    if content == METRES:
+        assert scenario.user_centres_m[0] == (60.0, 90.0)
+    assert flyable.examine(scenario).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("content", "datum", "expected"),
+    [
+        (METRES, None, "positions in degrees beside users in metres; expected --datum LAT,LON"),
+        (METRES, "8.53,47.39", "zones.geojson: own: obstacles[0] 'school': its polygon lies outside"),
+        (METRES, "-8.53,47.39", "with the grid at --datum -8.53,47.39"),
+        (METRES, "here", "--datum: 'here'; expected LAT,LON: latitude from -90 to 90"),
+        (METRES, "47.39", "--datum: '47.39'; expected LAT,LON"),
+        (METRES, "47.39,8.53,488", "--datum: '47.39,8.53,488'; expected LAT,LON"),
+        (METRES, "nan,8.53", "--datum: 'nan,8.53'; expected LAT,LON"),
+        (METRES, "47.39,190", "--datum: '47.39,190'; expected LAT,LON"),
+        (DEGREES, "47.392,8.53", "south edge, with the grid at --datum 47.392,8.53"),
+    ],
+)
+def test_a_datum_that_does_not_fit(
+    content: str, datum: str | None, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    users, zones = tmp_path / "users.csv", tmp_path / "zones.geojson"
+    users.write_text(content, "utf-8")
+    zones.write_text(json.dumps(ZONES), "utf-8")
+    given = ("--datum", datum) if datum else ()
+    status, out, err = run(capsys, "import", users, *given, "--zones", zones, "--out", tmp_path / "own.toml")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert expected in err
+    assert not (tmp_path / "own.toml").exists()
+
+
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
@@ -441,6 +503,18 @@ def test_users_around_which_there_is_no_field(
     assert f"{users}" in err
     assert expected in err
     assert not (tmp_path / "own.toml").exists()
+
+
+def test_users_of_one_place_are_asked_for_the_same_whether_they_are_a_cluster_or_not() -> None:
+    """They interfere all the same."""
+    at_m = [(x, y) for x in (300.0, 320.0, 340.0) for y in (500.0, 530.0)] + [(900.0, 900.0)]
+    users = [{"x_m": x, "y_m": y} for x, y in at_m]
+    together = [user | {"cluster": "yard"} for user in users[:-1]] + users[-1:]
+    alone, clustered = (field.around("own", some, None) for some in (users, together))
+    assert (alone.n_clusters, clustered.n_clusters) == (7, 2)
+    assert alone.mission.r_min_bits == clustered.mission.r_min_bits
+    spread = [{"x_m": 400.0 * i, "y_m": 400.0 * i} for i in range(3)]
+    assert field.around("own", spread, None).mission.r_min_bits > alone.mission.r_min_bits
 
 
 def test_a_check_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -134,6 +134,11 @@ class Scenario(_Table, frozen=True, dict=True, omit_defaults=True):
         return None if self.users.weights is None else constant(self.users.weights, like)
 
     @property
+    def is_random(self) -> bool:
+        """Whether anything is drawn; otherwise every seed gives the same mission."""
+        return self.users.is_random or self.radio.is_random
+
+    @property
     def draws_shape(self) -> tuple[int, int]:
         """Users U, and uniform draws D of each for the start of a mission and again for each step."""
         return self.n_users, self.users.moves.n_draws

@@ -14,6 +14,7 @@ from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.core import pace
 from uav_dc_ros.messages import PAYLOADS
 from uav_dc_ros.nodes.framework import node_main
+from uav_dc_ros.nodes.record.last_step import LastStep
 from uav_dc_ros.nodes.record.recorder_base import RecorderBase
 from uav_dc_ros.topics import JSON, SIMULATED, TOPICS
 
@@ -26,10 +27,16 @@ class RecorderNode(RecorderBase):
     def __init__(self) -> None:
         super().__init__("recorder")
 
+    def configure(self) -> None:
+        """Load the scenario, and create the bag."""
+        self.scenario = scenarios.load(self.values["scenario"])
+        super().configure()
+        lockstep = self.values["pace"] is None
+        self._last_step = LastStep(self.scenario, self.newest, lockstep=lockstep)
+
     def about(self) -> Mapping[str, str]:
         """Metadata of the bag: scenario, policy, seed, missions, pace, vehicle."""
-        values = self.values
-        scenario = scenarios.load(values["scenario"])
+        values, scenario = self.values, self.scenario
         about = {
             "version": __version__,
             "scenario": scenario.name,
@@ -51,6 +58,16 @@ class RecorderNode(RecorderBase):
             if agent.search:
                 about["search"] = str(agent.search)
         return about
+
+    def missing(self) -> Mapping[str, str]:
+        """What the last step lacks; of a real vehicle it is not known."""
+        if self.values["vehicle"] != SIMULATED:
+            return {}
+        missing = self._last_step.missing()
+        return {
+            self.resolve_topic_name(topic): f"of step {step} of mission {mission}"
+            for topic, (mission, step) in missing.items()
+        }
 
     def on_peers(self) -> None:
         """Add the topics of the row to the bag, also those without a message, before `ready`."""

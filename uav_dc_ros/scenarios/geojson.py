@@ -25,6 +25,17 @@ class _Collection(msgspec.Struct, tag="FeatureCollection"):
     crs: dict[str, Any] | None = None
 
 
+class NoDatumError(ScenarioError):
+    """A file (`file`) with positions in degrees, and no datum."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(
+            f"{path}: positions in degrees; expected datum_deg in the scenario, latitude and longitude of "
+            "x = 0, y = 0"
+        )
+        self.file = path
+
+
 def features(text: str, path: Path, what: str) -> Iterator[tuple[str, msgspec.Raw]]:
     """The features of a collection, each with its place in the file.
 
@@ -51,10 +62,7 @@ def to_metres(datum: Datum | None, path: Path) -> ToMetres:
         ScenarioError: no datum, no pymap3d, or (when converting) degrees out of range.
     """
     if datum is None:
-        raise ScenarioError(
-            f"{path}: positions in degrees; expected datum_deg in the scenario, latitude and longitude of "
-            "x = 0, y = 0"
-        )
+        raise NoDatumError(path)
     try:
         pymap3d = importlib.import_module("pymap3d")
     except ImportError:

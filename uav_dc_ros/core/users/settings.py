@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from uav_dc_ros.core.grid import Grid
-from uav_dc_ros.core.mobility import GaussMarkov, Mobility, RandomWalk, RandomWaypoint
+from uav_dc_ros.core.mobility import GaussMarkov, Mobility, RandomWalk, RandomWaypoint, Static
 
 CLUSTERS_MAX = 1000
 USERS_MAX = 100_000
@@ -111,6 +111,14 @@ class UserSettings(
         return tuple(
             chain(*((disc.centre_m,) * n for disc, n in zip(self.clusters, self.sizes, strict=True)))
         )
+
+    @property
+    def is_random(self) -> bool:
+        """Whether the users' positions are drawn, at the start or later."""
+        radii_m = self.radii_m
+        starts_m = max(radii_m) if isinstance(radii_m, tuple) else radii_m
+        moves, walks = self.moves, isinstance(self.moves, RandomWalk)
+        return starts_m > 0.0 or not (isinstance(moves, Static) or (walks and not self.v_max_mps))
 
     @cached_property
     def radii_m(self) -> float | tuple[float, ...]:

@@ -24,6 +24,7 @@ from uav_dc_ros.core.world import Act
 from uav_dc_ros.errors import PolicyError, UavDcError
 from uav_dc_ros.experiments.evaluate.evaluation import (
     COLUMNS,
+    ONE_MISSION,
     TITLES,
     Comparison,
     EvaluatedMissions,
@@ -104,6 +105,9 @@ def main(argv: list[str] | None = None) -> None:
             save_mission_picture(candidate.act_in(scenario, options.objective), scenario, 0, options.picture)
 
         seeds = range(options.seeds or 100)
+        for name in dict.fromkeys(scenario.name for _, scenario in pairs if not scenario.is_random):
+            if len(seeds) > 1:
+                cli.print_error(f"{PROG}: {name}: {ONE_MISSION}; --seeds 1 is enough")
         evaluated = [
             evaluate_act(one.name, one.sha256, act, world.scenario, seeds, world.shift, options.objective)
             for one, world, act in flights
@@ -330,4 +334,4 @@ def _where(evaluation: Evaluation) -> str:
 
 def _missions(evaluation: Evaluation) -> str:
     first, n = evaluation.seeds
-    return f"{n} missions, seeds {first} to {first + n - 1}"
+    return f"{n} missions, seeds {first} to {first + n - 1}" if n > 1 else f"1 mission, seed {first}"

@@ -24,6 +24,7 @@ from uav_dc_ros.experiments.evaluate.shifts import Shift, senders
 
 # The missions on every policy card. Nothing is tuned or selected on them.
 TEST_SEEDS = range(100)
+ONE_MISSION = "nothing is drawn in this world, so every seed gives the same mission"
 
 
 class Figure(msgspec.Struct, frozen=True, kw_only=True):
@@ -123,6 +124,11 @@ class EvaluatedMissions:
 
     evaluation: Evaluation
     values: dict[str, Array]
+
+
+def card_seeds(scenario: Scenario) -> range:
+    """The missions on the card of a policy for a scenario: one where nothing is drawn."""
+    return TEST_SEEDS if scenario.is_random else TEST_SEEDS[:1]
 
 
 def evaluate(policy: Policy, scenario: Scenario, seeds: Sequence[int] = TEST_SEEDS) -> Evaluation:

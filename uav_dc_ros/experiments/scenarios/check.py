@@ -12,6 +12,7 @@ from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.core.keys import path_of
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import PolicyError
+from uav_dc_ros.experiments.evaluate.evaluation import ONE_MISSION
 from uav_dc_ros.experiments.scenarios import listing
 from uav_dc_ros.scenarios.generation import flyable
 from uav_dc_ros.scenarios.generation.flyable import Flyable
@@ -73,7 +74,8 @@ def fitting(scenario: Scenario) -> list[str]:
 def words(scenario: Scenario, examined: Flyable) -> list[str]:
     """The facts of a check, one line each."""
     tour, limits = examined.tour, scenario.mission
-    lines = [
+    lines = [] if scenario.is_random else [f"missions: {ONE_MISSION}"]
+    lines += [
         f"way: {examined.moves_to_dock} of {limits.max_steps} steps from start to dock, "
         f"a move takes {examined.speed_mps:.1f} m/s",
         f"tour: lands in {tour.landed} of {tour.missions} missions, collects {tour.collected:.1f} of "

@@ -12,9 +12,9 @@ import msgspec
 
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.core.scenario import Scenario
-from uav_dc_ros.errors import ParameterError
+from uav_dc_ros.errors import ParameterError, ScenarioError
 from uav_dc_ros.experiments.scenarios import listing
-from uav_dc_ros.scenarios import user_files, zone_files
+from uav_dc_ros.scenarios import geojson, user_files, zone_files
 from uav_dc_ros.scenarios.generation import document, field
 
 CLUSTERS, USERS, SIZE_M = 5, 10, (1000.0, 1000.0)  # those of the shipped field
@@ -40,6 +40,9 @@ def add_import(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("users", type=Path, metavar="USERS", help=users)
     zones = "a GeoJSON file of buildings and no-fly zones, see docs/obstacles.md"
     parser.add_argument("--zones", type=Path, metavar="ZONES", help=zones)
+    datum = "position of x = 0, y = 0 on WGS 84, degrees (default: the south-west corner "
+    datum += "of users in degrees; users in metres need it with --zones)"
+    parser.add_argument("--datum", type=_datum, metavar="LAT,LON", help=datum)
     out = "the new file, which names the other files relative to itself"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", dest="file", help=out)
     parser.set_defaults(run=import_users)
@@ -78,20 +81,28 @@ def import_users(options: argparse.Namespace) -> int:
     """Write a field around the users of a file; the exit status."""
     users: Path = options.users
     zones: Path | None = options.zones
-    given = f" {users} --zones {zones}" if zones else f" {users}"
+    origin: geojson.Datum | None = options.datum
+    at = f" --datum {origin[0]!r},{origin[1]!r}" if origin else ""
+    given = f" {users}{at} --zones {zones}" if zones else f" {users}{at}"
     if not given.isprintable():  # it becomes text of the file
         raise ParameterError(f"{given.strip()!r}; expected names of printable characters")
 
     def make() -> Scenario:
-        corner = user_files.corner_deg(users)
-        # Rounded down by a metre at most, so that no user is west or south of it.
-        datum = corner and (math.floor(corner[0] * 1e5) / 1e5, math.floor(corner[1] * 1e5) / 1e5)
-        obstacles = zone_files.read(zones, datum) if zones else ()
+        datum = origin or _corner(users)
         try:
-            listed = user_files.read(users, datum)
+            obstacles = zone_files.read(zones, datum) if zones else ()
+        except geojson.NoDatumError as error:
+            raise ParameterError(
+                f"{error.file}: positions in degrees beside users in metres; expected --datum LAT,LON, the "
+                "position of x = 0, y = 0"
+            ) from None
+        listed = user_files.read(users, datum)
+        try:
             return field.around(_name(options.file) or "my_field", listed, datum, obstacles)
-        except ParameterError as error:
-            raise ParameterError(f"{users}: {error}") from None
+        except (ParameterError, ScenarioError) as error:
+            is_zone = isinstance(error, ScenarioError) and error.path[:1] == ("obstacles",)
+            file = zones if is_zone else users
+            raise ParameterError(f"{file}: {error}{at and f', with the grid at{at}'}") from None
 
     folder = options.file.absolute().parent
     names = {
@@ -125,9 +136,25 @@ def _given(options: argparse.Namespace) -> str:
     return "".join(f" --{option} {value}" for option, value in values.items() if value)
 
 
+def _corner(users: Path) -> geojson.Datum | None:
+    """South-west corner of users in degrees, rounded down by a metre at most: none is west or south of it."""
+    corner = user_files.corner_deg(users)
+    return corner and (math.floor(corner[0] * 1e5) / 1e5, math.floor(corner[1] * 1e5) / 1e5)
+
+
 def _name(path: Path | None) -> str:
     """The file's name as that of a scenario; empty where it has no letter."""
     return re.sub(r"[^a-z0-9]+", "_", path.stem.lower()).lstrip("_0123456789")[:64] if path else ""
+
+
+def _datum(text: str) -> geojson.Datum:
+    """The type of `--datum`: two numbers with a comma between."""
+    expected = "LAT,LON: latitude from -90 to 90 and longitude from -180 to 180, degrees on WGS 84"
+    latitude, _, longitude = text.partition(",")
+    try:
+        return cli.number(-90.0, 90.0, expected)(latitude), cli.number(-180.0, 180.0, expected)(longitude)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected {expected}") from None
 
 
 def _size(text: str) -> tuple[float, float]:

@@ -90,7 +90,8 @@ def _draw_field(axes: Axes, scenario: Scenario, rates: RateMap, layer: Layer) ->
     for disc, hover_m in zip(scenario.users.clusters, hovers_m, strict=True):
         axes.add_patch(Circle(disc.centre_m, disc.radius_m, fill=False, ec=INK, lw=1.2, zorder=3))
         axes.add_patch(Circle(hover_m, layer.reach_m, fill=False, ec=INK, lw=0.9, ls=DASHES, zorder=3))
-    axes.plot([], [], "o", markersize=9, mfc="none", mec=INK, mew=1.2, label="cluster")
+    if any(disc.radius_m for disc in scenario.users.clusters):
+        axes.plot([], [], "o", markersize=9, mfc="none", mec=INK, mew=1.2, label="cluster")
     reach = f"in reach from above a cluster ({scenario.mission.d_cons_m:g} m)"
     axes.plot([], [], color=INK, lw=0.9, ls=DASHES, label=reach)
     axes.scatter(

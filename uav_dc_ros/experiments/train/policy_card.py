@@ -2,14 +2,15 @@
 
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy, PolicyConfig
-from uav_dc_ros.core import reward
+from uav_dc_ros.core import channel, reward
 from uav_dc_ros.core.mobility import GaussMarkov, RandomWalk, RandomWaypoint, Static
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate.evaluation import (
     COLUMNS,
     OBJECTIVE_IN_WORDS,
-    TEST_SEEDS,
+    ONE_MISSION,
+    card_seeds,
     evaluate,
     rows,
 )
@@ -56,10 +57,15 @@ def card(
     assert isinstance(config, PolicyConfig), "made by this trainer"
     values = config.hyperparameters
     hidden = " and ".join(map(str, config.hidden))
-    first, last = TEST_SEEDS[0], TEST_SEEDS[-1]
+    seeds, radio = card_seeds(scenario), channel.title(scenario.radio)
+    missions = f"One mission, flown greedily: {ONE_MISSION}."
+    if scenario.is_random:
+        missions = f"{len(seeds)} missions, seeds {seeds[0]} to {seeds[-1]}, flown greedily, each drawn anew."
+    met = "a line-of-sight channel" if radio == "free_space" else f"the channel {radio}"
+    calm = "no wind, no fading" if scenario.radio.fading is None else "no wind"
     users = _USERS[type(scenario.users.moves)]
     algorithm, n_users = _ALGORITHMS[config.algorithm], scenario.n_users
-    lines = (COLUMNS, ["---"] * len(COLUMNS), *rows(evaluate(policy, scenario)))
+    lines = (COLUMNS, ["---"] * len(COLUMNS), *rows(evaluate(policy, scenario, seeds)))
     began = "" if prefilled is None else f"\n- the replay buffer began with {prefilled}"
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"""# {config.name}
@@ -84,7 +90,7 @@ hidden layers of {hidden} units and {len(config.actions)} actions.
 
 ## How it does
 
-{len(TEST_SEEDS)} missions, seeds {first} to {last}, flown greedily, each with a fresh layout of its users.
+{missions}
 Rewards are those of the scenario as it is shipped: {_reward(scenario)}.
 The arrival step is over missions that landed. Intervals of the mean are by the bootstrap.
 {OBJECTIVE_IN_WORDS}
@@ -95,7 +101,7 @@ The arrival step is over missions that landed. Intervals of the mean are by the 
 
 {_LIMITS[config.observation]}
 It knows one field: another layout of clusters on the same grid would be flown as if it were this one. It has
-met {users} and a line-of-sight channel, in simulation only: no wind, no fading, no lost packets.
+met {users} and {met}, in simulation only: {calm}, no lost packets.
 """
 
 

@@ -129,6 +129,10 @@ class MissionNode(ManagedNode):
             self.get_logger().warning(f"service {name}: refused: {response.message}")
         return response
 
+    def is_awaiting(self) -> bool:
+        """Whether messages are still expected after `drain_quiet_s`: the node then stops later."""
+        return False
+
     # Topics.
 
     def timer(self, period_s: float, callback: Callable[[], None], clock: Clock | None = None) -> Any:

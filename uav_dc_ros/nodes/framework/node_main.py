@@ -31,6 +31,11 @@ from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 
 ROS_ARGUMENTS = "--ros-args"
 DRAIN_S = 2.0
+# From the stop request on, for messages that a node expects. Over a link that loses a fifth of its packets
+# two of a thousand messages took longer than a second; each further tenth of a second nearly halves them. It
+# outlasts publishers on another host, too: they leave `mission_node.ACKNOWLEDGE_S` after their own stop.
+AWAIT_S = 3.0
+AWAIT_POLL_S = 0.02  # between two checks
 EXIT_TIMEOUT_S = 3.0  # for the middleware to close
 BACKGROUND_NICENESS = 5  # of a node that no other waits for
 # Exit statuses. Python's own 1 remains for unexpected errors: only after those a restart may help.
@@ -233,8 +238,10 @@ def _spin(
             while stop.commands and not stop.requested:
                 reporter.execute(stop.commands.popleft())
         if quiet_s := max(node.drain_quiet_s if node.state == "active" else 0.0 for node in nodes):
-            deadline_s = time.monotonic() + DRAIN_S
-            executor.spin(lambda: time.monotonic() > deadline_s, quiet_s)
+            began_s = time.monotonic()
+            executor.spin(lambda: time.monotonic() > began_s + DRAIN_S, quiet_s)
+            while any(node.is_awaiting() for node in nodes) and time.monotonic() < began_s + AWAIT_S:
+                executor.spin_once(AWAIT_POLL_S)
     finally:
         for node in reversed(nodes):
             if node.state != "finalized":

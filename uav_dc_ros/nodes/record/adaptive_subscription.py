@@ -99,6 +99,12 @@ class AdaptiveSubscription:
         second.callback = self.callback
         self._received.clear()
 
+    @property
+    def may_receive(self) -> bool:
+        """Whether a message that was lost may be sent again: a publisher is there, and it is reliable."""
+        is_reliable = self._profile.reliability == ReliabilityPolicy.RELIABLE
+        return is_reliable and any(one.get_publisher_count() for one in self._losses)
+
     def lost(self) -> int:
         """Number of published messages that did not arrive; 0 with a middleware that does not count."""
         return self._lost + sum(map(_count, self._losses.values()))

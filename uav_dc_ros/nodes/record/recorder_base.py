@@ -47,10 +47,19 @@ class RecorderBase(MissionNode):
         self._not_recorded: dict[str, str] = {}  # reasons
         self._scanned: Set[str] = set()  # topics at the last scan
         self._undrained: dict[str, int] = {}
+        self.newest: dict[str, bytes] = {}  # last message by topic of the row
 
     def about(self) -> Mapping[str, str]:
         """Custom data of the bag."""
         raise NotImplementedError
+
+    def missing(self) -> Mapping[str, str]:
+        """Messages that are expected and have not arrived, described, by full name of their topic."""
+        return {}
+
+    def is_awaiting(self) -> bool:
+        """Whether an expected message may still arrive."""
+        return any(self._recorded[name].may_receive for name in self.missing())
 
     # Life cycle.
 
@@ -108,6 +117,10 @@ class RecorderBase(MissionNode):
                 self.get_logger().info(f"{self.gate.kept} messages in memory are not written: {why}")
             dropped = self.dropped()
             self.writer.set_dropped(dropped)
+            if missing := self.missing():
+                self.writer.add_about({"not_received": json.dumps(missing, sort_keys=True)})
+                lacks = ", ".join(f"{name} {which}" for name, which in sorted(missing.items()))
+                self.get_logger().warning(f"the bag lacks messages that did not arrive: {lacks}")
             for name in self.selected - self._recorded.keys() - self._not_recorded.keys():
                 self._not_recorded[name] = "it has no publisher"
             if self._not_recorded:
@@ -127,6 +140,7 @@ class RecorderBase(MissionNode):
         for topic in self._recorded.values():
             topic.close()
         self._recorded.clear()
+        self.newest.clear()
         super()._undo_activation()
 
     # Messages.
@@ -156,6 +170,7 @@ class RecorderBase(MissionNode):
         already_ns = writer.already_written.get(name, -1)
         label = name if topic is None else topic.name
         count, write, announced = self.statistics.count_received, self.gate.write, self._announced
+        newest = self.newest
 
         def handle(data: bytes, info: Any) -> None:
             if topic is not None:
@@ -163,6 +178,7 @@ class RecorderBase(MissionNode):
                     return
                 if name not in announced:
                     self.announce(name, topic)
+                newest[label] = data
             published_ns, received_ns = info["source_timestamp"], info["received_timestamp"]
             if published_ns > already_ns:
                 write(name, data, log_time_ns=received_ns, publish_time_ns=published_ns)

@@ -83,6 +83,26 @@ function layout(more = {}) {
   };
 }
 
+// An entry of a legend: a mark, as SVG of our own, and words.
+function legendItem(mark, words) {
+  const drawn = make("span", { "aria-hidden": "true" });
+  drawn.innerHTML = `<svg width="16" height="14">${mark}</svg>`;
+  return make("li", {}, drawn, words);
+}
+
+const GROUND_DISC = '<circle cx="7" cy="7" r="6.2" fill="var(--ground)" fill-opacity="0.35" stroke="var(--ground)" stroke-width="0.8"/>';
+
+// Entries for what of a world is in the scene: the discs of its clusters, buildings, no-fly zones.
+function worldLegend(world, disc) {
+  const has = (kind) => world.obstacles.some((one) => one.kind === kind);
+  const block = (name, words) => legendItem(`<path d="M2 2h10v10h-10Z" fill="var(--${name})" fill-opacity="0.5" stroke="var(--${name})"/>`, words);
+  return [
+    world.cluster_radii_m.some((radius_m) => radius_m > 0) ? legendItem(disc, "cluster") : null,
+    has("building") ? block("ground", "building") : null,
+    has("no_fly") ? block("warm", "no-fly zone") : null,
+  ];
+}
+
 // A table. A column: {name, text(row), value(row) to sort by, cls, help}.
 function table(columns, rows, { caption, sorted = null, label, onmake = () => {} } = {}) {
   const body = make("tbody");

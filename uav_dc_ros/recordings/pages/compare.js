@@ -31,7 +31,7 @@ open(async (page, data) => {
     return drawn;
   };
   const name = (i) => make("span", {}, key(i), groups[i].label);
-  const legend = () => make("ul", { class: "legend" }, ...groups.map((_, i) => make("li", {}, name(i))));
+  const legend = (...more) => make("ul", { class: "legend" }, ...groups.map((_, i) => make("li", {}, name(i))), ...more);
 
   // A mean, and below it its interval in the same unit.
   function range(interval, unit, digits, sign = "") {
@@ -73,7 +73,7 @@ open(async (page, data) => {
       make("div", { class: "grid wide-left" },
         make("div", { class: "card flight" },
           make("div", { class: "card-head" }, make("h3", {}, "Trajectories"), viewSwitch(drawScene)),
-          make("div", { class: "scene", id: "scene", role: "img", "aria-label": "Paths of the missions in space" }), legend()),
+          make("div", { class: "scene", id: "scene", role: "img", "aria-label": "Paths of the missions in space" }), legend(...worldLegend(world, GROUND_DISC))),
         make("div", { class: "stack" },
           card("Users collected", make("div", { class: "chart", id: "n_collected" })),
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum_rate_bps" })),

@@ -53,20 +53,13 @@ open(async (page, data) => {
   }
 
   function legend() {
-    const item = (mark, text) => {
-      const drawn = make("span", { "aria-hidden": "true" });
-      drawn.innerHTML = `<svg width="16" height="14">${mark}</svg>`; // our own text only
-      return make("li", {}, drawn, text);
-    };
     return [
-      item('<circle cx="7" cy="7" r="3.4" fill="var(--waiting)"/>', `users at the start of mission 0`),
-      item('<circle cx="7" cy="7" r="6" fill="none" stroke="var(--ink)"/>', "cluster"),
-      item('<circle cx="7" cy="7" r="6" fill="none" stroke="var(--ink)" stroke-dasharray="3 2"/>', "in reach from above the cluster"),
-      item('<circle cx="7" cy="7" r="5" fill="var(--card)" stroke="var(--ink)" stroke-width="2"/>', "start"),
-      item('<path d="M2 2h10v10h-10Z" fill="var(--dock)"/>', "dock"),
-      ...[["building", "ground", "building"], ["no_fly", "warm", "no-fly zone"]].filter(([kind]) => world.obstacles.some((one) => one.kind === kind)).map(
-        ([, name, words]) => item(`<path d="M2 2h10v10h-10Z" fill="var(--${name})" fill-opacity="0.5" stroke="var(--${name})"/>`, words)),
-      ...(data.out_of_reach_m[0].length ? [item('<path d="M3 3 11 11M11 3 3 11" stroke="var(--bad)" stroke-width="2"/>', "out of reach of every cell")] : []),
+      legendItem('<circle cx="7" cy="7" r="3.4" fill="var(--waiting)"/>', `users at the start of mission 0`),
+      legendItem('<circle cx="7" cy="7" r="6" fill="none" stroke="var(--ink)" stroke-dasharray="3 2"/>', "in reach from above the cluster"),
+      legendItem('<circle cx="7" cy="7" r="5" fill="var(--card)" stroke="var(--ink)" stroke-width="2"/>', "start"),
+      legendItem('<path d="M2 2h10v10h-10Z" fill="var(--dock)"/>', "dock"),
+      ...worldLegend(world, '<circle cx="7" cy="7" r="6" fill="none" stroke="var(--ink)"/>'),
+      ...(data.out_of_reach_m[0].length ? [legendItem('<path d="M3 3 11 11M11 3 3 11" stroke="var(--bad)" stroke-width="2"/>', "out of reach of every cell")] : []),
     ];
   }
 

@@ -37,7 +37,7 @@ open(async (page, data) => {
           make("ul", { class: "legend" }, ...STATES.map(([name, words, shape], i) => make("li", {}, symbol(shape, name), `${words} `, counts[i])),
             make("li", {}, symbol("cross", "uav"), "UAV"), make("li", {}, symbol("square", "dock"), "dock"),
             make("li", {}, symbol("disc", "served"), `within ${fixed(world.d_cons_m)} m of the UAV`),
-            make("li", {}, symbol("disc", "ground"), "cluster"))),
+            ...worldLegend(world, GROUND_DISC))),
         make("div", { class: "stack" },
           card("Users collected", make("div", { class: "chart", id: "collected" })),
           card("Sum-rate of the users served", make("div", { class: "chart", id: "sum-rate" })),
@@ -70,7 +70,7 @@ open(async (page, data) => {
     const shapes = { circle: '<circle cx="7" cy="7" r="4.2"/>', diamond: '<path d="M7 0.8 13.2 7 7 13.2 0.8 7Z"/>', square: '<path d="M2.5 2.5h9v9h-9Z"/>', cross: '<path d="M5 1h4v4h4v4h-4v4h-4v-4h-4v-4h4Z"/>', disc: '<circle cx="7" cy="7" r="6.2"/>' };
     const drawn = make("span", { "aria-hidden": "true" });
     const faint = shape === "disc" ? 0.35 : 1;
-    drawn.innerHTML = `<svg width="14" height="14" fill="var(--${name})" fill-opacity="${faint}" stroke="var(--${name === "ground" ? "ground" : "ink"})" stroke-width="0.8">${shapes[shape]}</svg>`; // our own text only
+    drawn.innerHTML = `<svg width="14" height="14" fill="var(--${name})" fill-opacity="${faint}" stroke="var(--ink)" stroke-width="0.8">${shapes[shape]}</svg>`; // our own text only
     return drawn;
   }
 

@@ -6,7 +6,8 @@ The rest follows by rule:
 
 - A cell is about a tenth of the longer side, and the sides are whole cells.
 - `r_min_bits` takes a user of a cluster of K about as many steps as there: with K - 1 others as near as the
-  user, its SINR is 1 / (K - 1). Where a tour cannot collect so much, it is halved until one can.
+  user, its SINR is 1 / (K - 1). K of listed users is the number that share a cell's reach, if that is more.
+  Where a tour cannot collect so much, it is halved until one can.
 - `d_cons_m` has whole discs in reach of a cell, and of the UAV above their centres in every layer, with room
   for the way that a user walks.
 - `max_steps` is a fifth more than a tour without a limit takes (`flyable.steps_of_tour`).
@@ -239,16 +240,19 @@ def _complete(
     limits |= {"max_steps": 1_000_000, "d_cons_m": 1e6}
     if any(one.get("kind", "building") == "building" for one in values.get("obstacles", ())):
         radio["obstruction_loss_db"] = OBSTRUCTION_LOSS_DB
-    placed = from_values(values, name).users
-    step_bits = step_s * radio["bandwidth_hz"] * math.log2(1.0 + 1.0 / max(max(placed.sizes) - 1, 1))
-    r_min_bits = float(f"{COLLECT_STEPS * step_bits:.1e}")
-    limits["r_min_bits"] = values["reward"]["data_scale_bits"] = r_min_bits
     draft = from_values(values, name)
+    placed = draft.users
     discs = list(placed.start_discs())
     farthest_m = max(flyable.reach(draft, disc.centre_m, disc.radius_m)[1] for disc in discs)
     ground_m = math.sqrt(farthest_m**2 - low_m**2) + DRIFT_STEPS * (placed.v_max_mps or 0.0) * step_s
     above_m = math.hypot(max(disc.radius_m for disc in discs), top_m)
     limits["d_cons_m"] = 10.0 * math.ceil(max(math.hypot(ground_m, low_m), above_m) / 10.0)
+    together = max(placed.sizes)
+    if placed.user:
+        together = max(together, _in_reach(draft, limits["d_cons_m"]))
+    step_bits = step_s * radio["bandwidth_hz"] * math.log2(1.0 + 1.0 / max(together - 1, 1))
+    r_min_bits = float(f"{COLLECT_STEPS * step_bits:.1e}")
+    limits["r_min_bits"] = values["reward"]["data_scale_bits"] = r_min_bits
     for _ in range(HALVINGS):
         steps = flyable.steps_of_tour(from_values(values, name))
         if steps is not None:
@@ -257,6 +261,14 @@ def _complete(
         r_min_bits = float(f"{r_min_bits / 2.0:.1e}")
         limits["r_min_bits"] = values["reward"]["data_scale_bits"] = r_min_bits
     return None
+
+
+def _in_reach(scenario: Scenario, d_cons_m: float) -> int:
+    """Users within a distance of the cell nearest to a user, itself among them: the median over the users."""
+    users_m = np.asarray(scenario.user_centres_m)
+    cells_m = flyable.nearest_cells_m(scenario, users_m)
+    away_m = np.linalg.norm(cells_m[:, None, :2] - users_m, axis=-1)
+    return int(np.median((np.hypot(away_m, cells_m[:, 2:]) <= d_cons_m).sum(axis=1)))
 
 
 def _cells(size_m: Point) -> tuple[float, tuple[int, int]]:
