@@ -130,7 +130,7 @@ def test_pqn_fits_targets_of_taken_actions():
     assert losses[-1] < 0.1 * losses[0]
     best = learner.preferences(rows).argmax(axis=-1).mean()
     shown = Batch(rows, np.zeros_like(action), target - 2.0 * action, np.ones(256, bool))
-    for _ in range(40):
+    for _ in range(100):
         learner.fit(shown, rng.permutation(256), 64, 3e-3)
     assert best > 4.5  # mostly the last action, which is the best one
     assert (learner.preferences(rows).argmax(axis=-1) == 0).mean() > 0.9, "preferred as demonstrated"
