@@ -31,8 +31,8 @@ class RecorderNode(RecorderBase):
         """Load the scenario, and create the bag."""
         self.scenario = scenarios.load(self.values["scenario"])
         super().configure()
-        lockstep = self.values["pace"] is None
-        self._last_step = LastStep(self.scenario, self.newest, lockstep=lockstep)
+        missions, lockstep = self.values["missions"], self.values["pace"] is None
+        self._last_step = LastStep(self.scenario, self.newest, missions=missions, lockstep=lockstep)
 
     def about(self) -> Mapping[str, str]:
         """Metadata of the bag: scenario, policy, seed, missions, pace, vehicle."""

@@ -14,6 +14,7 @@ from uav_dc_ros.core.world import Act
 from uav_dc_ros.planners import baselines
 from uav_dc_ros.planners.cluster_tour import tour
 from uav_dc_ros.planners.lookahead import search
+from uav_dc_ros.planners.plan import plan
 
 # What a planner knows of the users beside the scenario's numbers and the data collected so far: nothing, the
 # clusters' centres (of listed users: their places), or where each user is at present. None knows how users
@@ -50,6 +51,7 @@ PLANNERS: dict[str, Planner] = {
         Planner("nearest", "centres", _unweighted(baselines.nearest), weighs=False),
         Planner("fixed_tour", "centres", _unweighted(baselines.fixed_tour), weighs=False),
         Planner("tour", "centres", tour),
+        Planner("plan", "centres", plan),
         Planner("search", "positions", search),
     )
 }

@@ -48,9 +48,11 @@ def test_the_last_step_lacks_what_its_topics_have_not_reached(alone: Alone) -> N
     scenario, end = scenarios.load(alone.scenario), end_of(alone)
     complete = {topic: two[-1] for topic, two in end.items()}
 
-    def missing(lockstep: bool = True, **changed: bytes | None) -> dict[str, tuple[int, int]]:
+    def missing(
+        missions: int = 4, lockstep: bool = True, **changed: bytes | None
+    ) -> dict[str, tuple[int, int]]:
         newest = {topic: data for topic, data in (complete | changed).items() if data is not None}
-        return LastStep(scenario, newest, lockstep=lockstep).missing()
+        return LastStep(scenario, newest, missions=missions, lockstep=lockstep).missing()
 
     assert missing() == {}
     for topic in ALL:
@@ -58,6 +60,7 @@ def test_the_last_step_lacks_what_its_topics_have_not_reached(alone: Alone) -> N
         assert missing(**{topic: end[topic][0]}) == {topic: expected}
         assert missing(**{topic: None}) == {}, "not recorded, or nothing was published"
         assert missing(**{topic: b"\0\1\0\0garbage"}) == {}
+    assert missing(missions=5, rates=end["rates"][0]) == {}, "stopped between two missions"
     assert missing(lockstep=False, move=end["move"][0]) == {}, "hovered"
     assert missing(users=without(end["users"][0], run="0" * 16)) == {}, "of another run"
     assert missing(users=without(complete["users"], mission=4, step=0)) == {"mission": (4, 0)}
@@ -68,7 +71,7 @@ def test_the_last_step_lacks_what_its_topics_have_not_reached(alone: Alone) -> N
 
     # What was decoded is kept until a newer message replaces it.
     newest = complete | {"pose": end["pose"][0]}
-    last_step = LastStep(scenario, newest, lockstep=True)
+    last_step = LastStep(scenario, newest, missions=4, lockstep=True)
     assert last_step.missing() == last_step.missing() == {"pose": LAST}
     newest["pose"] = complete["pose"]
     assert last_step.missing() == {}

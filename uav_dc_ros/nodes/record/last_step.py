@@ -31,11 +31,14 @@ class LastStep:
     Args:
         scenario: of the mission.
         newest: the newest message of each topic of the table; its owner sets them.
+        missions: that are flown one after another.
         lockstep: whether every step that was flown had a move; at a pace the vehicle may have hovered.
     """
 
-    def __init__(self, scenario: Scenario, newest: Mapping[str, bytes], *, lockstep: bool) -> None:
-        self._scenario, self._newest, self._lockstep = scenario, newest, lockstep
+    def __init__(
+        self, scenario: Scenario, newest: Mapping[str, bytes], *, missions: int, lockstep: bool
+    ) -> None:
+        self._scenario, self._newest, self._missions, self._lockstep = scenario, newest, missions, lockstep
         self._decoded: dict[str, tuple[bytes, _Header | int | None]] = {}
 
     def missing(self) -> dict[str, Step]:
@@ -44,7 +47,8 @@ class LastStep:
         A mission that is over has `users`, `rates`, `pose` and `target` of the step of its last `mission`,
         and in lockstep the `move` of the step before. `users` or `rates` of a later step show that `mission`
         itself is missing. Only a topic that was received before can lack a message: of the others nothing
-        was published, they are not recorded, or the recorder was restarted after their last message.
+        was published, they are not recorded, or the recorder was restarted after their last message. Before
+        the last mission is over, the nodes were stopped, and one of them perhaps before it published.
         """
         mission = self._header("mission")
         if mission is None:
@@ -55,6 +59,8 @@ class LastStep:
             if header is not None and header.run == mission.run:
                 reached[topic] = header.mission, header.step
         last = max(reached[topic] for topic in ("mission", "users", "rates") if topic in reached)
+        if last[0] + 1 < self._missions:
+            return {}
         if reached["mission"] < last:
             return {"mission": last}
         if mission.phase is None or not mission.phase.is_over:
