@@ -20,9 +20,9 @@ from uav_dc_ros.core.grid import Action
 _NONE = -10.0  # worth of a plan that there is not
 _DONE = 1e-4  # share of its data that a user may lack
 _PARTS = 1024.0  # of a step: sums of such parts are exact, in any order and with any number of missions
-_OVER = 0.6  # share of the progress in a cluster's best cell from which the UAV is over it
 _LEFT = 0.7  # share of a cluster's users after which, away from it, the others are expected out of reach
 _SLOW, _FAST = 0.05, 2.0  # least and most that a user delivers, as a share of what is expected
+_ANSWERS = 0.5  # least of one that delivers at all: its rate grows once others are collected
 
 
 class BestPlan(NamedTuple):
@@ -68,7 +68,8 @@ def best_plan(
     xp, n_clusters = array_namespace(after), len(tables.sizes)
     ways, home = after[..., :n_clusters], after[..., n_clusters]
     progress = after[..., n_clusters + 1 : 2 * n_clusters + 1]
-    pace = _pace(xp, tables, progress[:, Action.HOVER], delivered, done, begins)
+    over = rows(xp, tables.over, rows_after[:, Action.HOVER]) & ~begins[:, None]
+    pace = _pace(xp, tables, progress[:, Action.HOVER], over, delivered, done)
     # What each user still needs after each action, as a share of its data, `[N, 7, U]`.
     data = data[:, None] + pace[:, None] * xp.take(progress, tables.cluster_of, axis=-1)
     missing = (1.0 - data).clip(0.0, 1.0) * ~collected[:, None]
@@ -118,15 +119,15 @@ def best_plan(
     )
 
 
-def _pace(xp: Any, tables: EntityTables, here: Array, delivered: Array, done: Array, begins: Array) -> Array:
+def _pace(xp: Any, tables: EntityTables, here: Array, over: Array, delivered: Array, done: Array) -> Array:
     """What each user delivers over its cluster, as a share of what is expected, `[N, U]`.
 
     Over its cluster the last step has shown that. Elsewhere those that are left of a cluster are expected out
-    of reach. `here` is the progress of each cluster in the UAV's cell, `[N, M]`.
+    of reach. `here` is the progress of each cluster in the UAV's cell, `[N, M]`, and `over` is bool `[N, M]`.
     """
     of_users = tables.cluster_of
-    over = xp.take(here >= _OVER * tables.best, of_users, axis=-1) & ~begins[:, None]
-    shown = (delivered / xp.take(here.clip(1e-2), of_users, axis=-1)).clip(_SLOW, _FAST)
+    shown = (delivered / xp.take(here.clip(1e-2), of_users, axis=-1)).clip(_ANSWERS, _FAST)
+    shown = xp.where(delivered > 0.0, shown, constant((_SLOW,), shown))
     left_behind = xp.take(done >= _LEFT, of_users, axis=-1)
     expected = xp.where(left_behind, constant((_SLOW,), shown), constant((1.0,), shown))
-    return xp.where(over, shown, expected)
+    return xp.where(xp.take(over, of_users, axis=-1), shown, expected)

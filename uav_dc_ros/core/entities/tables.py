@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # a scenario holds its `EntityTables`
 STOPS_MAX = 8  # of which every order is known; more clusters share stops
 FAR = 10_000.0  # moves to where no way leads, and the way of an order that visits what it need not
 GOOD = 0.8  # share of the progress in a cluster's best cell that a cell has in which the cluster is served
+OVER = 0.9  # share of the users in reach from the best cell from which the UAV is over a cluster
 _BLOCK = 200_000  # links of users that are measured at a time
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
@@ -44,7 +45,10 @@ class EntityTables:
         valid = self.after != np.arange(len(cells))[:, None]
         valid[:, Action.HOVER] = True
 
-        progress = _progress(scenario, cells)  # [C, M]
+        progress, reached = _progress(scenario, cells)  # [C, M] each
+        # Whether the UAV is over each cluster: about as many of its users are in reach as from any cell, bool
+        # [C, M].
+        self.over: Array = reached >= OVER * np.where(free[:, None], reached, 0.0).max(axis=0)
         served = np.minimum(progress, 1.0)
         best = np.where(free[:, None], progress, 0.0).max(axis=0)
         self.best: Array = best.astype(np.float32)  # progress of each cluster in its best cell, [M]
@@ -118,20 +122,24 @@ def expected_users_m(scenario: "Scenario") -> Array:
     return mobility.scatter(centres_m, scenario.user_radii_m(draws), draws)
 
 
-def _progress(scenario: "Scenario", cells: Array) -> Array:
-    """Share of what a user needs that it delivers in a step, mean over each cluster's users, `[C, M]`."""
+def _progress(scenario: "Scenario", cells: Array) -> tuple[Array, Array]:
+    """Share of what a user needs that it delivers in a step, and share in reach, of each cluster, `[C, M]`.
+
+    A user counts up to 1: one that delivers many times as much does not make up for others out of reach.
+    """
     from uav_dc_ros.core.world import measure  # which imports this package
 
     users_m, step_s = expected_users_m(scenario), scenario.mission.step_s
     uav_m = scenario.grid.centre_m(cells, like=users_m)
     collected = np.zeros(scenario.n_users, bool)
-    blocks = []
+    blocks, reached = [], []
     for block_m in np.array_split(uav_m, max(1, len(cells) * scenario.n_users // _BLOCK)):
         all_m = np.broadcast_to(users_m, (len(block_m), *users_m.shape))
         link = measure(scenario, block_m, all_m, collected)
         share = link.rate_bps * link.served * step_s / scenario.user_r_min_bits(users_m)
-        blocks.append(cluster_means(scenario, share))
-    return np.concatenate(blocks)
+        blocks.append(cluster_means(scenario, np.minimum(share, 1.0)))
+        reached.append(cluster_means(scenario, link.served.astype(np.float64)))
+    return np.concatenate(blocks), np.concatenate(reached)
 
 
 def _moves_to_each(scenario: "Scenario", cells: Array, goals: Sequence[Array | tuple[int, ...]]) -> Array:

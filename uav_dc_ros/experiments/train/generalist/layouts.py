@@ -25,6 +25,7 @@ TRIES = 100  # drafts of a layout
 _RANDOM_FIELDS = 0.5  # share of the layouts
 _SINGLES, _ZONES, _BATTERY, _ON_ARRIVAL = 0.2, 0.08, 0.06, 0.15  # shares of the others
 _APART = 0.6  # share of those with clusters in which discs do not touch, where there is room
+_MANY_BITS = 1e15  # more than any user delivers in a step
 _HOVERS_MAX = 8  # steps over a cluster that the budget counts at most
 
 
@@ -75,7 +76,7 @@ def _draft(rng: np.random.Generator, seed: int) -> Scenario:
             "step_s": step_s,
             "max_steps": 10_000,
             "d_cons_m": d_cons_m,
-            "r_min_bits": 1.0,
+            "r_min_bits": _MANY_BITS,
             "episode_end": "on_arrival" if rng.random() < _ON_ARRIVAL and start != dock else "at_time_limit",
         },
         "radio": {
@@ -102,8 +103,8 @@ def _draft(rng: np.random.Generator, seed: int) -> Scenario:
     factor = between(0.7, 1.6)
     battery = between(0.7, 1.2) if rng.random() < _BATTERY else None
     draft = from_values(values, values["name"])
-    # What a user of a usual cluster delivers in a step over it, bit: the progress with `r_min_bits` = 1.
-    step_bits = float(np.median(draft.entity_tables.best))
+    # What a user of a usual cluster delivers in a step over it, bit.
+    step_bits = _MANY_BITS * float(np.median(draft.entity_tables.best))
     if step_bits <= 0.0:
         raise ScenarioError("no user is in reach")
     values["mission"]["r_min_bits"] = float(f"{needed_steps * step_bits:.3g}")
@@ -111,7 +112,8 @@ def _draft(rng: np.random.Generator, seed: int) -> Scenario:
     ways = tables.of_cell[start_row, : draft.n_clusters]
     tour = float((ways[tables.first] + tables.tours[-1]).min())
     home = float(tables.of_cell[start_row, draft.n_clusters])
-    hovers = np.minimum(np.ceil(values["mission"]["r_min_bits"] / np.maximum(tables.best, 1e-9)), _HOVERS_MAX)
+    best_bits = _MANY_BITS * np.maximum(tables.best, 1e-30)
+    hovers = np.minimum(np.ceil(values["mission"]["r_min_bits"] / best_bits), _HOVERS_MAX)
     n_hovers = float(hovers.sum())
     if users.get("user"):  # those around one cell are collected together, or one after another
         together = 1.5 * len(tables.first)
