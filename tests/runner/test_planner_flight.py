@@ -19,17 +19,18 @@ from uav_dc_ros.planners import PLANNERS
 SEED, WEIGHT = 5, 0.8
 
 
-def test_search_flies_in_nodes_as_in_a_rollout(
-    ros: Ros, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("name", ["search", "plan"])
+def test_a_planner_flies_in_nodes_as_in_a_rollout(
+    ros: Ros, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     status, output = ros.run_all(
-        *("--scenario", "random:2", "--policy", "search", "--objective", WEIGHT, "--pace", "lockstep"),
+        *("--scenario", "random:2", "--policy", name, "--objective", WEIGHT, "--pace", "lockstep"),
         *("--seed", SEED, "--nodes", "world,channel_monitor,policy,recorder", "--bag", "bag"),
         *("--summary", "summary.json"),
     )
     assert status == 0, output
     scenario, actions = scenarios.load("random:2"), []
-    planner = PLANNERS["search"](scenario, WEIGHT)
+    planner = PLANNERS[name](scenario, WEIGHT)
 
     def act(state):
         actions.append(int(planner(state)[0]))
@@ -42,7 +43,7 @@ def test_search_flies_in_nodes_as_in_a_rollout(
     rates = [payload for name, payload in bag if name == "/rates"][-1]
     np.testing.assert_array_equal(rates["data_bits"], last.data_bits[0])
     summary = json.loads((ros.folder / "summary.json").read_text())
-    assert (summary["policy"], summary["outcome"]) == ("search", "landed")
+    assert (summary["policy"], summary["outcome"]) == (name, "landed")
 
     def run(*arguments: object) -> str:
         with pytest.raises(SystemExit) as end:
@@ -52,16 +53,16 @@ def test_search_flies_in_nodes_as_in_a_rollout(
         return out
 
     out = run("verify", ros.folder / "bag", "--complete")
-    assert "in scenario 'random_2', planner 'search' (w = 0.8)" in out
+    assert f"in scenario 'random_2', planner {name!r} (w = 0.8)" in out
     n_steps = scenario.mission.max_steps
     assert f"decisions: {n_steps} of {n_steps} steps recomputed, equal to the last bit" in out
     out = run("verify", ros.folder / "bag", "--policy", "tour")
     assert "'tour' decides differently in " in out
     out = run("info", ros.folder / "bag")
-    assert "search" in out
+    assert name in out
     run("report", ros.folder / "bag", "--out", tmp_path / "report.html")
     shown = unpacked(tmp_path / "report.html")["data"]
-    assert (shown["policy"], shown["about"]["objective_weight"]) == ("search", "0.8")
+    assert (shown["policy"], shown["about"]["objective_weight"]) == (name, "0.8")
 
 
 @pytest.mark.long
