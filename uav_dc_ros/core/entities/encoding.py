@@ -160,7 +160,7 @@ def encode(
     )
     value = open_users * w[:, None]
     cost = (detour.clip(0.0) + hovers) * per_step[:, None]
-    gain = (open_users[:, None] * progress_after.clip(0.0, 1.0)).sum(axis=-1)
+    gain = (open_users[:, None] * progress_after).sum(axis=-1)
     limited = scenario.energy is not None and scenario.energy.ends != "steps"
 
     of_mission = [
@@ -224,7 +224,7 @@ def encode(
         given_mean.clip(0.0, 1.5),
         reached,
     ]
-    by_action = xp.moveaxis(progress_after, -2, -1).clip(0.0, 1.5)  # [N, M, 7]
+    by_action = xp.moveaxis(progress_after, -2, -1)  # [N, M, 7]
     clusters = xp.concat([xp.stack(of_clusters, axis=-1), by_action], axis=-1)
     parts = [xp.stack(of_mission, axis=-1), *of_actions, clusters.reshape((clusters.shape[0], -1))]
     return xp.concat(parts, axis=-1).reshape((*leading, size(scenario)))

@@ -49,10 +49,9 @@ class EntityTables:
         # Whether the UAV is over each cluster: about as many of its users are in reach as from any cell, bool
         # [C, M].
         self.over: Array = reached >= OVER * np.where(free[:, None], reached, 0.0).max(axis=0)
-        served = np.minimum(progress, 1.0)
         best = np.where(free[:, None], progress, 0.0).max(axis=0)
         self.best: Array = best.astype(np.float32)  # progress of each cluster in its best cell, [M]
-        good = free[:, None] & (served >= GOOD * np.where(free[:, None], served, 0.0).max(axis=0))
+        good = free[:, None] & (progress >= GOOD * best)
         centres_m = np.asarray(scenario.cluster_centres_m)
         away_m = np.linalg.norm((cells[:, :2] * grid.cell_m)[:, None] - centres_m, axis=-1)
         # Rows of the cells where the clusters are served: the nearest good one, the lowest of them, [M]. One
@@ -76,12 +75,12 @@ class EntityTables:
         self.members: Array = (self.stop_of[:, None] == np.arange(n_stops)).astype(np.float32)
         # Stops of each set, numbers 0 and 1, float32 [S, 2^S].
         self.sets: Array = ((np.arange(2**n_stops) >> np.arange(n_stops)[:, None]) & 1).astype(np.float32)
-        self.none: Array = np.where(self.sets.any(axis=0), FAR, 0.0).astype(
-            np.float32
-        )  # FAR: not the empty set
+        # 0 for the empty set, FAR for others, float32 [2^S].
+        self.none: Array = np.where(self.sets.any(axis=0), FAR, 0.0).astype(np.float32)
         # Clusters of each set of stops, numbers 0 and 1, float32 [2^S, M].
         self.clusters: Array = np.ascontiguousarray((self.members @ self.sets).T)
-        self.shared = n_stops < n_clusters  # whether clusters share stops
+        self.shared: bool = n_stops < n_clusters  # whether clusters share stops
+        # Clusters of each stop, [S, most of a stop]; M where a stop has fewer.
         self.of_stop: Array = _padded(np.bincount(self.stop_of), np.argsort(self.stop_of, kind="stable"))
         # Moves from each cell past the stops of each set to the dock, float32 [C, 2^S]; none if stops are
         # shared: then they begin at different clusters.
@@ -93,9 +92,7 @@ class EntityTables:
         # Users of each cluster, [M, largest size]; the number of all users where a cluster has fewer.
         self.users: Array = _padded(np.asarray(scenario.users.sizes), np.arange(scenario.n_users))
         radii_m = np.asarray([disc.radius_m for disc in scenario.users.clusters])
-        self.radii: Array = (radii_m / scenario.mission.d_cons_m).astype(
-            np.float32
-        )  # in units of d_cons, [M]
+        self.radii: Array = (radii_m / scenario.mission.d_cons_m).astype(np.float32)  # units of d_cons, [M]
         self.goals_cells: Array = np.asarray(scenario.goals_cells, np.float32)  # [M + 1, 2]
         self._on_device: dict[Any, EntityTables] = {}
 

@@ -10,6 +10,7 @@ and learns what the plan does not know. V is fitted to the lambda-returns by an 
 Deviations: a batch holds whole missions, so no return is cut off, and is passed over once.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -84,7 +85,7 @@ class PpoLearner(SetLearner):
         logits = (settings.sharpness * steps).masked_fill(~mask, -torch.inf)
         chosen = functional.log_softmax(logits, dim=1).gather(1, action[:, None])[:, 0]
         by_chance = settings.random_moves / mask.sum(dim=1)
-        now = torch.logaddexp(chosen + float(np.log(1.0 - settings.random_moves)), by_chance.log())
+        now = torch.logaddexp(chosen + math.log(1.0 - settings.random_moves), by_chance.log())
         ratio = (now - before).exp()
         clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
         surrogate = torch.minimum(ratio * advantage, clipped * advantage).mean()
@@ -115,11 +116,9 @@ class PpoTraining(GeneralistTraining):
             value = np.zeros(len(mask), np.float32)
             value[observed.flying] = self.learner.values(observed.observation[observed.flying])
             probability = self._probabilities(mask, preferences)
-            chance = rng.random((len(mask), 1), np.float32)
-            # The last sum may be less than 1 by rounding.
-            action = (probability.cumsum(axis=-1) > chance * probability.sum(axis=-1, keepdims=True)).argmax(
-                -1
-            )
+            sums = probability.cumsum(axis=-1)  # the last may differ from 1 by rounding
+            chance = rng.random((len(mask), 1), np.float32) * sums[:, -1:]
+            action = (sums > chance).argmax(axis=-1)
             chosen = np.take_along_axis(probability, action[:, None], axis=-1)[:, 0]
             flight.append((*observed, action, np.log(chosen), value, *flown.step(action)))
         observation, flying, action, chosen, value, reward, over = map(np.stack, zip(*flight, strict=True))
