@@ -199,3 +199,5 @@ def test_a_field_that_is_too_large_is_refused():
     scenario = changed("three_clusters_hover", grid=grid, mission=limits)
     with pytest.raises(ParameterError, match=r"cells times users; the planner expects up to 20000000"):
         PLANNERS["search"](scenario)
+    with pytest.raises(ParameterError, match=r"planner 'plan' needs the observation 'entities' in scenario "):
+        PLANNERS["plan"](scenario)

@@ -24,7 +24,7 @@ def plan(scenario: Scenario, weight: float) -> Act:
         ParameterError: the scenario is too large for the observation `entities`.
     """
     if (problem := entities.problem(scenario)) is not None:
-        raise ParameterError(problem)
+        raise ParameterError(f"planner 'plan' needs {problem}")
 
     def act(state: State) -> Array:
         observation = world.observe("entities", scenario, state, weight)
