@@ -122,7 +122,14 @@ def test_the_end_is_received_before_the_rates(bench: Bench, received: int) -> No
     (ended,) = bench.ends
     summary = ended.summary(bench.scenario, "policy", None)
     last = max(received - 1, 0)
-    assert (summary.outcome, summary.steps, summary.data_bits) == (Phase.ABORTED, last, last * MBIT)
+    assert (summary.outcome, summary.steps, summary.data_bits) == (Phase.ABORTED, STEPS, last * MBIT)
+    assert summary.sum_rate_bps == (MBIT if last else 0.0), "the mean of the steps with rates"
+    if received == STEPS + 1:
+        assert bench.notes == []
+    else:
+        of = f"those of step {last}" if received else "unknown"
+        missed = f"mission 0: rates of step {STEPS} were not received; its users and data are {of}"
+        assert bench.notes == [missed]
     assert summary.distance_m == 100.0 * min(last, 2)
 
 

@@ -241,7 +241,7 @@ class MissionRunner:
         if mission is None or mission.index != index:
             mission = MonitoredMission(index=index, seed=self.config.seed + index)
         if self._status is not None and self._status.mission == index:
-            mission.add(0, self._status, None)
+            mission.add_without_rates(self._status)
         if self._abort_reason or not mission.reason:
             mission.reason = self._abort_reason or "run_all was interrupted"
         mission.outcome = Phase.ABORTED.value

@@ -38,6 +38,11 @@ class MonitoredMission(MissionTotals):
     sum_of_sum_rates_bps: float = 0.0  # over the measured steps, bit/s
     unmeasured_steps: int = 0  # flown without rates
 
+    def add_without_rates(self, status: messages.Mission) -> None:
+        """Add a status whose rates, or those of steps before it, were not received."""
+        self.unmeasured_steps += max(status.step - self.steps, 0)
+        self.add(status.step, status, None)
+
     def summary(self, scenario: Scenario, policy: str, bag: str | None) -> Summary:
         """The result of a mission that is over."""
         return Summary(
@@ -209,7 +214,12 @@ class MissionMonitor(MissionNode):
                 return
             if self.mission is None or self.mission.index < index:
                 self.mission = MonitoredMission(index=index)
-            self.mission.add(0, self._unreported[index], None)
+            status, last = self._unreported[index], self.mission.rates
+            if last is None or last.step < status.step:
+                at = "unknown" if last is None else f"those of step {last.step}"
+                missed = f"mission {index}: rates of step {status.step} were not received"
+                self._on_note(f"{missed}; its users and data are {at}")
+            self.mission.add_without_rates(status)
             self._report_end(self.mission)
 
     def _report_end(self, mission: MonitoredMission) -> None:
