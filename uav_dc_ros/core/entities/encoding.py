@@ -24,7 +24,7 @@ from uav_dc_ros.core.users.clusters import cluster_means
 if TYPE_CHECKING:  # a scenario holds its `EntityTables`
     from uav_dc_ros.core.scenario import Scenario
 
-FEATURES = 2  # version of the encoding, which a policy's config holds
+FEATURES = 3  # version of the encoding, which a policy's config holds
 CLUSTERS_MAX = 100
 SHAPE_MAX = (40, 40, 8)  # cells east, north, up
 N_ACTIONS = len(Action)

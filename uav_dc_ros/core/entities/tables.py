@@ -1,7 +1,7 @@
 """What the observation `entities` looks up: of each cell, the ways from it and the data that it gives.
 
-Everything here follows from the scenario alone, and is computed once. Users are taken to be where they start:
-those of a disc evenly spread, see `expected_users_m`.
+Everything here follows from the scenario alone, and is computed once. Users are taken to be spread evenly
+over their discs, and as far as they walk beyond, see `expected_users_m`.
 """
 
 import math
@@ -24,6 +24,8 @@ STOPS_MAX = 8  # of which every order is known; more clusters share stops
 FAR = 10_000.0  # moves to where no way leads, and the way of an order that visits what it need not
 GOOD = 0.8  # share of the progress in a cluster's best cell that a cell has in which the cluster is served
 OVER = 0.9  # share of the users in reach from the best cell from which the UAV is over a cluster
+_SETS = 4  # sets of places in which users are expected: a small cluster is not judged by two or three
+_WALK = 0.3  # share of the mission after which it is expected that users are where they have walked to
 _BLOCK = 200_000  # links of users that are measured at a time
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
@@ -110,13 +112,23 @@ class EntityTables:
 
 
 def expected_users_m(scenario: "Scenario") -> Array:
-    """Where users are expected, metres, `[U, 2]`: spread evenly over their cluster's disc, or as listed."""
-    turn = np.concatenate([np.arange(n) for n in scenario.users.sizes])
-    of_size = np.repeat(scenario.users.sizes, scenario.users.sizes)
-    area = np.zeros(len(turn)) if scenario.users.user else (turn + 0.5) / of_size
-    draws = np.stack([area, turn * _GOLDEN % 1.0], axis=-1)
-    centres_m = np.asarray(scenario.user_centres_m)
-    return mobility.scatter(centres_m, scenario.user_radii_m(draws), draws)
+    """Where users are expected, metres: sets of places with a place for each user, `[_SETS, U, 2]`.
+
+    The places of a cluster, or of a listed user, are spread evenly over a disc around its centre. Its
+    variance is that of the disc in which the users start and of the random walk until a cluster is usually
+    visited.
+    """
+    users, step_s = scenario.users, scenario.mission.step_s
+    turn = np.concatenate([np.arange(n) for n in users.sizes])
+    turn = np.arange(_SETS)[:, None] + _SETS * turn  # [_SETS, U]
+    share = turn % _SETS if users.user else turn
+    share = (share + 0.5) / (_SETS if users.user else _SETS * np.repeat(users.sizes, users.sizes))
+    draws = np.stack([share, turn * _GOLDEN % 1.0], axis=-1)
+    # A step of the walk is uniform in length and direction: the mean of its square is (v step_s)^2 / 3. That
+    # of a place in a disc, from its centre, is half of the squared radius.
+    walked_m = (users.v_max_mps or 0.0) * step_s * math.sqrt(2.0 / 3.0 * _WALK * scenario.mission.max_steps)
+    radii_m = np.hypot(scenario.user_radii_m(draws), walked_m)
+    return mobility.scatter(np.asarray(scenario.user_centres_m), radii_m, draws)
 
 
 def _progress(scenario: "Scenario", cells: Array) -> tuple[Array, Array]:
@@ -127,15 +139,15 @@ def _progress(scenario: "Scenario", cells: Array) -> tuple[Array, Array]:
     from uav_dc_ros.core.world import measure  # which imports this package
 
     users_m, step_s = expected_users_m(scenario), scenario.mission.step_s
-    uav_m = scenario.grid.centre_m(cells, like=users_m)
+    uav_m = scenario.grid.centre_m(cells, like=users_m)[:, None]
     collected = np.zeros(scenario.n_users, bool)
     blocks, reached = [], []
-    for block_m in np.array_split(uav_m, max(1, len(cells) * scenario.n_users // _BLOCK)):
+    for block_m in np.array_split(uav_m, max(1, len(cells) * _SETS * scenario.n_users // _BLOCK)):
         all_m = np.broadcast_to(users_m, (len(block_m), *users_m.shape))
         link = measure(scenario, block_m, all_m, collected)
         share = link.rate_bps * link.served * step_s / scenario.user_r_min_bits(users_m)
-        blocks.append(cluster_means(scenario, np.minimum(share, 1.0)))
-        reached.append(cluster_means(scenario, link.served.astype(np.float64)))
+        blocks.append(cluster_means(scenario, np.minimum(share, 1.0)).mean(axis=1))
+        reached.append(cluster_means(scenario, link.served.astype(np.float64)).mean(axis=1))
     return np.concatenate(blocks), np.concatenate(reached)
 
 
