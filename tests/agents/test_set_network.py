@@ -118,9 +118,9 @@ def test_a_field_or_a_file_that_it_cannot_read_is_an_error(tmp_path):
     with pytest.raises(PolicyError, match="policy 'any' needs the observation 'entities' in scenario "):
         own.check(msgspec.structs.replace(small, grid=grid))
     folder = tmp_path / "any"
-    edit_config(folder, features=1)
-    assert "features = 1; expected 2" in refused(folder)
-    edit_config(folder, features=2, width=8)
+    edit_config(folder, features=2)
+    assert "features = 2; expected 3" in refused(folder)
+    edit_config(folder, features=3, width=8)
     assert "tensor 'advantage.cluster.bias' is float32 (16,); expected float32 (8,)" in refused(folder)
     edit_config(folder, width=16, format=3)
     assert "$.format" in refused(folder)
