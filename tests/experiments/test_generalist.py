@@ -6,34 +6,39 @@ import numpy as np
 import pytest
 
 from tests.experiments.test_train_cli import field, refused  # noqa: F401
+from tests.support.worlds import changed
 from uav_dc_ros.agents import policy, set_network
 from uav_dc_ros.agents.set_network import SetArchitecture
-from uav_dc_ros.agents.set_policy import PpoSettings, PqnSettings
-from uav_dc_ros.core.entities.encoding import ALLOWED, GLOBAL, LOSS, PRICE, allowed
+from uav_dc_ros.agents.set_policy import PqnSettings, RolloutSettings
+from uav_dc_ros.core import mission, world
+from uav_dc_ros.core.entities.encoding import ALLOWED, GLOBAL, GLOBALS, LOSS, PRICE, allowed
+from uav_dc_ros.core.grid import MOVES, Action
 from uav_dc_ros.experiments.evaluate.evaluation import evaluate
 from uav_dc_ros.experiments.train.cli import main
-from uav_dc_ros.experiments.train.generalist import card, layouts
+from uav_dc_ros.experiments.train.generalist import card, layouts, symmetry
 from uav_dc_ros.experiments.train.generalist import training as training_module
 from uav_dc_ros.experiments.train.generalist.missions import LayoutMissions
-from uav_dc_ros.experiments.train.generalist.ppo import (
+from uav_dc_ros.experiments.train.generalist.policy_iteration import (
     ADVANTAGE,
     VALUE,
-    PpoBatch,
-    PpoLearner,
-    PpoTraining,
-    generalised_advantages,
+    Decisions,
+    RolloutLearner,
+    RolloutTraining,
 )
 from uav_dc_ros.experiments.train.generalist.pqn import Batch, PqnLearner, PqnTraining, lambda_returns
+from uav_dc_ros.experiments.train.generalist.rollouts import Situations, action_values
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = SetArchitecture(width=8, hidden=(16,), n_actions=7)
+# Keys of clusters, which a field of listed users lacks.
+CLUSTERED = ("cluster_centres_m", "users_per_cluster", "cluster_radius_m")
 SMALL_RUN = {"iterations": 4, "layouts": 2, "missions": 4, "batch_size": 64}
 
 
 def begun(algorithm):
     """A training before its first iteration."""
-    if algorithm == "ppo":
-        return PpoTraining(PpoSettings(**SMALL_RUN), SMALL, 3)
+    if algorithm == "rollouts":
+        return RolloutTraining(RolloutSettings(**SMALL_RUN, kept=2, tested=0.3), SMALL, 3)
     return PqnTraining(PqnSettings(**SMALL_RUN), SMALL, 3)
 
 
@@ -79,35 +84,19 @@ def test_lambda_returns_are_those_of_the_definition():
     for trace, discount in ((0.0, 0.9), (0.7, 1.0), (0.7, 0.9), (1.0, 0.9)):
         found = lambda_returns(reward, over, best, trace, discount)
         worth = discount ** np.arange(7)
-        for mission, t in itertools.product(range(3), range(6)):
-            last = int(over[:, mission].argmax())
+        for one, t in itertools.product(range(3), range(6)):
+            last = int(over[:, one].argmax())
             if t > last:
                 continue
             # The mean of the n-step returns with weights (1 - trace) trace^(n - 1); the last has the rest.
             expected, left = 0.0, 1.0
             for n in range(1, last - t + 2):
                 whole = t + n > last
-                value = worth[:n] @ reward[t : t + n, mission]
-                value += 0.0 if whole else worth[n] * best[t + n, mission]
+                value = worth[:n] @ reward[t : t + n, one]
+                value += 0.0 if whole else worth[n] * best[t + n, one]
                 share = left if whole else left * (1.0 - trace)
                 expected, left = expected + share * value, left - share
-            assert found[t, mission] == pytest.approx(expected)
-
-
-def test_generalised_advantages_are_sums_of_the_errors_of_v():
-    rng = np.random.default_rng(0)
-    reward, value = rng.random((2, 6, 3))
-    over = np.zeros((6, 3), bool)
-    over[3:, 0] = over[5:] = True
-    for trace in (0.0, 0.9, 1.0):
-        found = generalised_advantages(reward, over, value, trace)
-        for mission, t in itertools.product(range(3), range(6)):
-            last = int(over[:, mission].argmax())
-            if t > last:
-                continue
-            after = np.append(value[t + 1 : last + 1, mission], 0.0)
-            errors = reward[t : last + 1, mission] + after - value[t : last + 1, mission]
-            assert found[t, mission] == pytest.approx(errors @ trace ** np.arange(len(errors)))
+            assert found[t, one] == pytest.approx(expected)
 
 
 def rows_of(n):
@@ -136,24 +125,93 @@ def test_pqn_fits_targets_of_taken_actions():
     assert (learner.preferences(rows).argmax(axis=-1) == 0).mean() > 0.9, "preferred as demonstrated"
 
 
-def test_ppo_learns_v_and_prefers_actions_with_an_advantage():
+def test_rollouts_fit_v_and_the_differences_between_actions():
     rows, rng = rows_of(512)
-    learner = PpoLearner(SMALL, set_network.initial(SMALL, rng), PpoSettings(batch_size=64))
+    learner = RolloutLearner(SMALL, set_network.initial(SMALL, rng), RolloutSettings(steps_max=2.0))
     learner.set_rate(3e-3, VALUE)
     learner.set_rate(3e-3, ADVANTAGE)
-    good = np.where(rows[:, 3] > 0, 2, 5)
-    losses = []
-    for _ in range(40):
-        preferences = 2.0 * learner.preferences(rows)
-        powers = np.exp(preferences - preferences.max(axis=-1, keepdims=True))
-        chances = 0.98 * powers / powers.sum(axis=-1, keepdims=True) + 0.02 / 7
-        action = (chances.cumsum(axis=-1) > rng.random((512, 1)) * chances.sum(-1, keepdims=True)).argmax(-1)
-        log_chance = np.log(np.take_along_axis(chances, action[:, None], axis=-1)[:, 0]).astype(np.float32)
-        gained = np.where(action == good, 0.1, -0.02).astype(np.float32)
-        of_ppo = PpoBatch(rows, action, log_chance, rows[:, 4] * np.float32(0.1), gained)
-        losses.append(learner.fit(of_ppo, rng.permutation(512), True))
-    assert losses[-1] < 0.1 * losses[0]
-    assert (learner.preferences(rows).argmax(axis=-1) == good).mean() > 0.9
+    # A number that no symmetry changes decides which of two actions is the best, by one step of 0.1 J. Of the
+    # others one is so bad that only the limit counts, and one is not allowed.
+    number = GLOBALS.index("steps_left")
+    best = np.where(rows[:, number] > 0, Action.UPWARD, Action.DOWNWARD)
+    values = np.repeat(rows[:, number, None] * np.float32(0.1), 7, axis=1)
+    values[np.arange(512), best] += 0.1
+    values[:, Action.HOVER] -= 100.0
+    values[:, Action.LEFT] = np.nan
+    decisions = Decisions(rows, values, np.full(512, Action.FORWARD))
+    # All turns but those that move the action that is not allowed to another side.
+    losses = [learner.fit(decisions, rng.integers(512, size=64), int(rng.choice([0, 4]))) for _ in range(500)]
+    assert np.mean(losses[-20:]) < 0.1 * np.mean(losses[:20])
+    found = learner.preferences(rows)
+    found = found - found[:, Action.FORWARD, None]
+    assert (found[:, 1:].argmax(axis=-1) + 1 == best).mean() > 0.9
+    assert abs(found[np.arange(512), best].mean() - 1.0) < 0.2
+    assert found[:, Action.HOVER].max() < -1.0, "bad, by at least about the limit"
+
+
+def test_what_an_action_is_worth_is_what_a_mission_gains_after_it():
+    """Against missions that are flown one by one in an environment."""
+    layout = changed("five_clusters", mission={"max_steps": 44}, users={"v_max_mps": 0.0})
+    seen, weights = [], np.asarray([0.3, 10 / 11], np.float32)
+
+    def decide(observation):
+        seen.append(len(observation))
+        loss = np.where(allowed(observation), observation[:, LOSS : LOSS + 7], np.inf)
+        return loss.argmin(axis=-1)
+
+    rng = np.random.default_rng(4)
+    start = np.repeat(rng.random((1, *layout.draws_shape), np.float32), 2, axis=0)
+    state = world.initial(layout, start)
+    state, _ = world.step(layout, state, np.asarray([1, 1]), np.repeat(start[:1], 2, axis=0))
+    observation = world.observe("entities", layout, state, weights)
+    situations = Situations(state=state, weight=weights, arrival=np.full(2, np.nan, np.float32))
+    values = action_values(layout, situations, observation, decide, np.random.default_rng(1))
+    assert (np.isnan(values) == ~allowed(observation)).all()
+    for row, weight in enumerate(weights):
+        for action in np.flatnonzero(allowed(observation)[row]):
+            one = situations.take(np.asarray([row])).state
+            before, arrival, act = float(one.collected.sum()), None, np.asarray([action])
+            while int(one.step[0]) < 44:  # users stand still: no draw matters
+                one, outcome = world.step(layout, one, act, start[:1])
+                docked = bool(mission.at_dock(one.cell, layout.dock_cell)[0])
+                arrival = (arrival or int(one.step[0])) if docked else None
+                act = decide(world.observe("entities", layout, one, weights[row : row + 1]))
+            assert bool(outcome.landed[0])
+            assert arrival is not None
+            gained = weight * (float(one.collected.sum()) - before) / layout.n_users
+            assert values[row, action] == pytest.approx(gained - (1 - weight) * (arrival - 1) / 44, abs=1e-5)
+    assert min(seen) >= 1
+
+
+@pytest.mark.parametrize("number", range(symmetry.N))
+def test_a_turned_field_is_seen_as_the_turned_observation(number):
+    swap, mirror_x, mirror_y = (bool(number >> bit & 1) for bit in range(3))
+
+    def turned(x, y, last=900.0):
+        x, y = (y, x) if swap else (x, y)
+        return (last - x if mirror_x else x), (last - y if mirror_y else y)
+
+    def layout(turn):
+        places = (130.0, 280.0), (660.0, 210.0), (420.0, 830.0)
+        users = [{"x_m": x, "y_m": y} for x, y in (turn(*place) for place in places)]
+        return changed(
+            "three_clusters",
+            grid={"n_x": 10, "n_y": 10, "n_z": 2, "cell_m": 100.0, "altitude_step_m": 50.0},
+            users={"user": users, "v_max_mps": 0.0} | dict.fromkeys(CLUSTERED),
+            mission={"start_m": (*turn(300.0, 200.0), 150.0), "dock_m": turn(800.0, 700.0), "max_steps": 40},
+        )
+
+    def observed(one):
+        state = world.initial(one, np.full((1, *one.draws_shape), 0.5, np.float32))
+        return world.observe("entities", one, state, 0.8)
+
+    found = symmetry.symmetry(number)
+    plain = observed(layout(lambda x, y: (x, y)))
+    np.testing.assert_allclose(found.of_observation(plain), observed(layout(turned)), atol=2e-5)
+    moves = np.asarray(MOVES)
+    for new, old in enumerate(found.action):
+        x, y = turned(*moves[old][:2].astype(float), 0.0)
+        assert (x, y, moves[old][2]) == tuple(moves[new])
 
 
 def test_layouts_repeat_and_differ_and_share_no_seed():
@@ -164,7 +222,7 @@ def test_layouts_repeat_and_differ_and_share_no_seed():
     assert layouts.SELECTION_SEEDS.start > 10**5  # above those of `random:SEED` that test
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "pqn"])
+@pytest.mark.parametrize("algorithm", ["rollouts", "pqn"])
 def test_a_run_repeats_and_continues_to_the_last_bit(algorithm):
     def run(n, training):
         for _ in range(n):
@@ -193,7 +251,9 @@ def quick(monkeypatch):
 
 
 def command(folder, *more):
-    options = "--scenario random --algo ppo --iterations 3 --layouts 2 --missions 3 --width 8 --hidden 16"
+    options = (
+        "--scenario random --algo rollouts --iterations 3 --layouts 2 --missions 3 --width 8 --hidden 16"
+    )
     return [*options.split(), "--checkpoint-every", "2", "--out", str(folder), *more]
 
 
@@ -209,19 +269,19 @@ def test_the_command_writes_a_policy_and_resumes_with_the_same_bytes(tmp_path, m
     assert "seeds 10000000 to 10000005" in text
     assert "| `three_clusters` |" in text
 
-    iterate = PpoTraining.iterate
+    iterate = RolloutTraining.iterate
 
     def stopped(self):
         if self.n_done == 2:
             raise KeyboardInterrupt
         return iterate(self)
 
-    monkeypatch.setattr(PpoTraining, "iterate", stopped)
+    monkeypatch.setattr(RolloutTraining, "iterate", stopped)
     with pytest.raises(SystemExit) as exit:
         main(command(tmp_path / "again" / "whole"))
     assert exit.value.code == 130
     assert "--resume continues" in capsys.readouterr().err
-    monkeypatch.setattr(PpoTraining, "iterate", iterate)
+    monkeypatch.setattr(RolloutTraining, "iterate", iterate)
     other = [*command(tmp_path / "again" / "whole"), "--resume", "--seed", "1"]
     assert "with seed = 0; expected 1" in refused(capsys, *other)
     with pytest.raises(SystemExit) as exit:
@@ -236,7 +296,7 @@ def test_the_command_writes_a_policy_and_resumes_with_the_same_bytes(tmp_path, m
     ("more", "expected"),
     [
         (["--scenario", "five_clusters"], "argument --scenario: invalid choice: 'five_clusters'"),
-        (["--trace", "2"], "--trace is 2.0; expected float <= 1.0"),
+        (["--tested", "2"], "--tested is 2.0; expected float <= 1.0"),
         (["--layouts", "0"], "--layouts is 0; expected int >= 1"),
         (["--observation", "map"], "argument --observation: invalid choice: 'map'"),
     ],

@@ -130,9 +130,13 @@ class Policy:
 
     def q_values(self, observation: Array) -> Array:
         """Q(s, a) of observations `[..., D]`, float64 `[..., A]`."""
+        return self._of_actions(observation, set_network.q_values)
+
+    def _of_actions(self, observation: Array, of_sets: Callable[..., Array]) -> Array:
+        """A number for each action by the network, or by the function `of_sets` of one for any field."""
         rows = np.asarray(observation, np.float64).reshape(-1, observation.shape[-1])
         if isinstance(self._architecture, SetArchitecture):
-            values = set_network.q_values(self._architecture, self._float64, rows)
+            values = of_sets(self._architecture, self._float64, rows)
         else:
             values = network.q_values(self._architecture, self._float64, rows)
         return values.reshape(*observation.shape[:-1], self._architecture.n_actions)
@@ -144,10 +148,11 @@ class Policy:
         observation `entities` it is the best one of those that the observation names, see
         `core.entities.encoding.allowed`.
         """
-        q_values = self.q_values(observation)
+        # The order of the advantages is that of Q, and V is a network of its own, which takes as long.
+        values = self._of_actions(observation, set_network.advantages)
         if self.config.observation == "entities":
             mask = allowed(observation)
-        return (q_values if mask is None else np.where(mask, q_values, -np.inf)).argmax(axis=-1)
+        return (values if mask is None else np.where(mask, values, -np.inf)).argmax(axis=-1)
 
     def check(self, scenario: Scenario) -> None:
         """Reject a world in which the policy's observations have another meaning.

@@ -28,19 +28,18 @@ class FlyingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     batch_size: Count = 512  # decisions in a mini-batch
 
 
-class PpoSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="ppo"):
-    """Hyperparameters of proximal policy optimisation on random layouts."""
+class RolloutSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="rollouts"):
+    """Hyperparameters of policy iteration with rollouts on random layouts."""
 
+    missions: Count = 16  # in each layout
+    tested: Annotated[float, Meta(gt=0, le=1)] = 0.12  # share of the decisions in which all actions are flown
+    random_moves: Annotated[float, Meta(ge=0, lt=1)] = 0.1  # share of the moves that are random
+    kept: Count = 20  # iterations of which the decisions are fitted
+    batches: Count = 16  # mini-batches of an iteration
     value_rate: LearningRate = 7e-4  # learning rate of Adam for V; it falls to a fiftieth
-    advantage_rate: LearningRate = 2e-4  # for A, likewise, after the iterations in which V alone learns
-    value_only: Annotated[float, Meta(ge=0, lt=1)] = 0.02  # share of the iterations in which V alone learns
-    trace: Probability = 0.95  # lambda of the returns
-    # A difference of one step between actions counts so much in the logarithm of their probabilities.
-    sharpness: Annotated[float, Meta(gt=0, le=1000)] = 2.0
-    random_moves: Annotated[float, Meta(gt=0, lt=1)] = 0.02  # share of the moves that are random
-    clip: Annotated[float, Meta(gt=0, lt=1)] = 0.2  # of the ratio of probabilities
-    # Weight of the squared difference between A and the plan's, in steps, in the loss.
-    restraint: Annotated[float, Meta(ge=0)] = 0.01
+    advantage_rate: LearningRate = 1e-3  # for A, likewise
+    # Limit of the difference between an action and the policy's own, in steps, that is fitted.
+    steps_max: Annotated[float, Meta(gt=0)] = 10.0
 
 
 class PqnSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="pqn"):
@@ -74,7 +73,7 @@ class SetPolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         tuple[network.Width, ...], Meta(min_length=1, max_length=16)
     ]  # units behind the pooling
     actions: tuple[str, ...] = ACTION_LABELS  # labels of the actions, in the order of the network's outputs
-    hyperparameters: PpoSettings | PqnSettings  # of training; `type` names the algorithm
+    hyperparameters: RolloutSettings | PqnSettings  # of training; `type` names the algorithm
     seed: Annotated[int, Meta(ge=0)]  # of its run
     iteration: Annotated[int, Meta(ge=0)]  # after which these parameters were taken
     version: str  # version of the package that made it

@@ -37,21 +37,24 @@ GLOBAL_NAMES = (
     *("steps_max", "shared", "plan_worth", "price"),
     *("allowed_a", "gain_a", "home_a", "loss_a", "lost_steps_a", "lost_users_a"),
 )
-_GLOBALS = tuple(
-    name if not n else f"{name}{n - 1}"
-    for name in GLOBAL_NAMES
-    for n in (range(1, N_ACTIONS + 1) if name.endswith("_a") else (0,))
-)
 CLUSTER_NAMES = (
     *("present", "east", "north", "moves", "moves_share", "detour", "visit_share", "fits", "users"),
     *("collected", "open", "data", "hovers", "worth", "planned", "radius", "closeness", "nearly"),
     *("delivered", "reached"),
     "progress_a",
 )
-GLOBAL = len(_GLOBALS)  # numbers of the mission
-CLUSTER = len(CLUSTER_NAMES) - 1 + N_ACTIONS  # numbers of a cluster
-ALLOWED = _GLOBALS.index("allowed_a0")  # the first of the actions from which the UAV can still land
-WORTH, PRICE, LOSS = (_GLOBALS.index(name) for name in ("plan_worth", "price", "loss_a0"))
+
+
+def _by_action(names: tuple[str, ...]) -> tuple[str, ...]:
+    of_each = {name: range(N_ACTIONS) if name.endswith("_a") else ("",) for name in names}
+    return tuple(f"{name}{suffix}" for name, suffixes in of_each.items() for suffix in suffixes)
+
+
+GLOBALS = _by_action(GLOBAL_NAMES)  # the name of every number of the mission
+CLUSTERS = _by_action(CLUSTER_NAMES)  # and of a cluster
+GLOBAL, CLUSTER = len(GLOBALS), len(CLUSTERS)
+ALLOWED = GLOBALS.index("allowed_a0")  # the first of the actions from which the UAV can still land
+WORTH, PRICE, LOSS = (GLOBALS.index(name) for name in ("plan_worth", "price", "loss_a0"))
 MIN, MAX = -1.0, 2.0  # of every number
 _LEAST_STEP = 0.01  # of what a user is worth in J: what a step costs at least
 

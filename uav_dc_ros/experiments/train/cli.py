@@ -94,7 +94,7 @@ def options_parser() -> cli.Parser:
     )
     add = parser.add_argument
     algorithms = "the paper's algorithms 1 and 2, each with a double target, too; "
-    algorithms += "--algo ppo --help lists the options for a policy for any field"
+    algorithms += "--algo rollouts --help lists the options for a policy for any field"
     text = f"shipped: {', '.join(scenarios.names())}"
     add("--scenario", required=True, metavar="NAME|FILE|random:SEED", help=text)
     add("--algo", required=True, choices=[*get_args(Algorithm), *generalist.SETTINGS], help=algorithms)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from uav_dc_ros import __version__
 from uav_dc_ros.agents.policy import Policy
-from uav_dc_ros.agents.set_policy import PpoSettings, PqnSettings, SetPolicyConfig
+from uav_dc_ros.agents.set_policy import PqnSettings, RolloutSettings, SetPolicyConfig
 from uav_dc_ros.core.entities.encoding import CLUSTERS_MAX, SHAPE_MAX
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, evaluate, mean_and_interval
@@ -77,14 +77,14 @@ channel in simulation only: no wind, no fading, no lost packets.
 """
 
 
-def _how(values: PpoSettings | PqnSettings) -> str:
+def _how(values: RolloutSettings | PqnSettings) -> str:
     """The algorithm and its hyperparameters."""
-    if isinstance(values, PpoSettings):
-        return f"""PPO (Schulman et al., 2017) of the plan's decisions: {values.iterations} iterations,
-  batches of {values.batch_size}, learning rates {values.value_rate:g} of V and
-  {values.advantage_rate:g} of A, which fall to a fiftieth, lambda {values.trace:g}, sharpness
-  {values.sharpness:g}, clip {values.clip:g}, restraint {values.restraint:g}, {values.random_moves:.0%} random
-  moves; V alone learns in the first {values.value_only:.0%} of the iterations"""
+    if isinstance(values, RolloutSettings):
+        return f"""policy iteration with rollouts: {values.iterations} iterations; in {values.tested:.0%} of
+  the decisions all actions were flown to the end, and {values.random_moves:.0%} of the moves were random;
+  fitted to the decisions of {values.kept} iterations with {values.batches} batches of {values.batch_size} in
+  an iteration, seen in the eight symmetries of the grid; differences up to {values.steps_max:g} steps;
+  learning rates {values.value_rate:g} of V and {values.advantage_rate:g} of A, which fall to a fiftieth"""
     return f"""PQN (Gallici et al., 2025): {values.iterations} iterations, {values.epochs} pass(es), batches
   of {values.batch_size}, learning rate {values.learning_rate:g}, which falls to a fiftieth, lambda
   {values.trace:g}, discount {values.discount:g}, advantage learning with alpha {values.advantage:g},

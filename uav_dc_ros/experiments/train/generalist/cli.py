@@ -1,4 +1,4 @@
-"""The command line of `python -m uav_dc_ros.train --algo ppo` (or `pqn`): a policy for unseen fields."""
+"""The command line of `python -m uav_dc_ros.train --algo rollouts` (or `pqn`): a policy for unseen fields."""
 
 import argparse
 import shutil
@@ -14,7 +14,7 @@ from uav_dc_ros import __version__, cli, scenarios
 from uav_dc_ros.agents import policy
 from uav_dc_ros.agents.agent import greedy_act
 from uav_dc_ros.agents.policy import LEARNING_CURVE, TRAJECTORY, Policy
-from uav_dc_ros.agents.set_policy import PpoSettings, PqnSettings, SetPolicyConfig
+from uav_dc_ros.agents.set_policy import PqnSettings, RolloutSettings, SetPolicyConfig
 from uav_dc_ros.core.keys import leaves
 from uav_dc_ros.experiments.evaluate.evaluation import TEST_SEEDS, save_mission_picture
 from uav_dc_ros.experiments.train.generalist.card import card, checkpoint_card
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 RANDOM = "random"  # the value of `--scenario`: random layouts
 HOME = "five_clusters"  # the world in which a generalist flies where no other is given
-SETTINGS: dict[str, type[PpoSettings | PqnSettings]] = {
-    "ppo": PpoSettings,
+SETTINGS: dict[str, type[RolloutSettings | PqnSettings]] = {
+    "rollouts": RolloutSettings,
     "pqn": PqnSettings,
 }  # by algorithm
 _TEXTS = {
@@ -36,11 +36,11 @@ _TEXTS = {
     "batch_size": "decisions in a mini-batch",
     "value_rate": "learning rate of V at the start; it falls to a fiftieth",
     "advantage_rate": "learning rate of A at the start; it falls to a fiftieth",
-    "value_only": "share of the iterations in which V alone learns, at first",
-    "sharpness": "what a difference of one step counts in the logarithm of a probability",
+    "tested": "share of the decisions in which all actions are flown",
     "random_moves": "share of the moves that are random",
-    "clip": "of the ratio of probabilities",
-    "restraint": "weight of the squared difference between A and the plan's, in steps",
+    "kept": "iterations of which the decisions are fitted",
+    "batches": "mini-batches of an iteration",
+    "steps_max": "limit of the difference between an action and the policy's own, in steps, that is fitted",
     "epochs": "passes over the decisions of an iteration",
     "learning_rate": "of Adam at the start; it falls to a fiftieth",
     "trace": "lambda of the returns",
@@ -99,7 +99,7 @@ def train(options: argparse.Namespace, command: str, prog: str) -> int:
     torch_device("cpu", options.threads)
     # These need torch.
     from uav_dc_ros.experiments.train import checkpoint
-    from uav_dc_ros.experiments.train.generalist.ppo import PpoTraining
+    from uav_dc_ros.experiments.train.generalist.policy_iteration import RolloutTraining
     from uav_dc_ros.experiments.train.generalist.pqn import PqnTraining
     from uav_dc_ros.experiments.train.generalist.training import BASELINES
 
@@ -108,8 +108,8 @@ def train(options: argparse.Namespace, command: str, prog: str) -> int:
     policy.check_new(options.out)
     architecture = config.architecture(scenarios.load(HOME))
     training: GeneralistTraining
-    if isinstance(config.hyperparameters, PpoSettings):
-        training = PpoTraining(config.hyperparameters, architecture, config.seed)
+    if isinstance(config.hyperparameters, RolloutSettings):
+        training = RolloutTraining(config.hyperparameters, architecture, config.seed)
     else:
         training = PqnTraining(config.hyperparameters, architecture, config.seed)
     progress = _SavedProgress(every)
