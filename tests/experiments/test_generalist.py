@@ -11,7 +11,7 @@ from uav_dc_ros.agents import policy, set_network
 from uav_dc_ros.agents.set_network import SetArchitecture
 from uav_dc_ros.agents.set_policy import PqnSettings, RolloutSettings
 from uav_dc_ros.core import mission, world
-from uav_dc_ros.core.entities.encoding import ALLOWED, GLOBAL, GLOBALS, LOSS, PRICE, allowed
+from uav_dc_ros.core.entities.encoding import ALLOWED, GLOBAL, GLOBALS, LOSS, PRICE, WORTH, allowed
 from uav_dc_ros.core.grid import MOVES, Action
 from uav_dc_ros.experiments.evaluate.evaluation import evaluate
 from uav_dc_ros.experiments.train.cli import main
@@ -152,10 +152,9 @@ def test_rollouts_fit_v_and_the_differences_between_actions():
 def test_what_an_action_is_worth_is_what_a_mission_gains_after_it():
     """Against missions that are flown one by one in an environment."""
     layout = changed("five_clusters", mission={"max_steps": 44}, users={"v_max_mps": 0.0})
-    seen, weights = [], np.asarray([0.3, 10 / 11], np.float32)
+    weights = np.asarray([0.3, 10 / 11], np.float32)
 
     def decide(observation):
-        seen.append(len(observation))
         loss = np.where(allowed(observation), observation[:, LOSS : LOSS + 7], np.inf)
         return loss.argmin(axis=-1)
 
@@ -165,7 +164,7 @@ def test_what_an_action_is_worth_is_what_a_mission_gains_after_it():
     state, _ = world.step(layout, state, np.asarray([1, 1]), np.repeat(start[:1], 2, axis=0))
     observation = world.observe("entities", layout, state, weights)
     situations = Situations(state=state, weight=weights, arrival=np.full(2, np.nan, np.float32))
-    values = action_values(layout, situations, observation, decide, np.random.default_rng(1))
+    values = action_values(layout, situations, observation, decide, 1000, np.random.default_rng(1))
     assert (np.isnan(values) == ~allowed(observation)).all()
     for row, weight in enumerate(weights):
         for action in np.flatnonzero(allowed(observation)[row]):
@@ -180,7 +179,13 @@ def test_what_an_action_is_worth_is_what_a_mission_gains_after_it():
             assert arrival is not None
             gained = weight * (float(one.collected.sum()) - before) / layout.n_users
             assert values[row, action] == pytest.approx(gained - (1 - weight) * (arrival - 1) / 44, abs=1e-5)
-    assert min(seen) >= 1
+    short = action_values(layout, situations, observation, decide, 1, np.random.default_rng(1))
+    for action in np.flatnonzero(allowed(observation)[0]):
+        after, _ = world.step(layout, state, np.asarray([action, action]), np.repeat(start[:1], 2, axis=0))
+        left = world.observe("entities", layout, after, weights)[:, WORTH]
+        users = after.collected.sum(axis=-1) - state.collected.sum(axis=-1)
+        expected = weights * users / layout.n_users - (1 - weights) / 44 + left
+        np.testing.assert_allclose(short[:, action], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("number", range(symmetry.N))

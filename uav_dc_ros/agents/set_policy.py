@@ -32,10 +32,12 @@ class RolloutSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, k
     """Hyperparameters of policy iteration with rollouts on random layouts."""
 
     missions: Count = 16  # in each layout
-    tested: Annotated[float, Meta(gt=0, le=1)] = 0.12  # share of the decisions in which all actions are flown
+    tested: Annotated[float, Meta(gt=0, le=1)] = 0.3  # share of the decisions in which all actions are flown
+    horizon: Count = 8  # steps that are flown then, before the plan says what the mission is worth from there
     random_moves: Annotated[float, Meta(ge=0, lt=1)] = 0.1  # share of the moves that are random
-    kept: Count = 20  # iterations of which the decisions are fitted
-    batches: Count = 16  # mini-batches of an iteration
+    kept: Count = 40  # iterations of which the decisions are fitted
+    batch_size: Count = 1024  # decisions in a mini-batch
+    batches: Count = 8  # mini-batches of an iteration
     value_rate: LearningRate = 7e-4  # learning rate of Adam for V; it falls to a fiftieth
     advantage_rate: LearningRate = 1e-3  # for A, likewise
     # Limit of the difference between an action and the policy's own, in steps, that is fitted.

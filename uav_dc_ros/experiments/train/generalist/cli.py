@@ -38,6 +38,7 @@ _TEXTS = {
     "advantage_rate": "learning rate of A at the start; it falls to a fiftieth",
     "tested": "share of the decisions in which all actions are flown",
     "random_moves": "share of the moves that are random",
+    "horizon": "steps that are flown then, before the plan says what is left",
     "kept": "iterations of which the decisions are fitted",
     "batches": "mini-batches of an iteration",
     "steps_max": "limit of the difference between an action and the policy's own, in steps, that is fitted",

@@ -1,10 +1,10 @@
 """Policy iteration with rollouts: the policy learns which action is worth most if it flies on itself.
 
 Bertsekas and Tsitsiklis, "Neuro-Dynamic Programming", 1996; Lagoudakis and Parr, "Reinforcement Learning as
-Classification", ICML 2003. In states that the policy meets all actions are flown to the end of the mission,
-see `rollouts`. The network of the advantages is fitted to the differences in J between them, and that of V to
-J of the policy's own action. The next iteration flies with the new policy: a detour that only a wiser
-policy would make good is seen as the loss that it is. Needs torch.
+Classification", ICML 2003. In states that the policy meets all actions are flown for some steps, see
+`rollouts`. The network of the advantages is fitted to the differences in J between them, and that of V to J
+of the policy's own action. The next iteration flies with the new policy: a detour that only a wiser policy
+would make good is seen as the loss that it is. Needs torch.
 """
 
 from collections import deque
@@ -117,7 +117,7 @@ class RolloutTraining(GeneralistTraining):
             if parts:
                 situations = joined([one for one, _ in parts])
                 seen = np.concatenate([observation for _, observation in parts])
-                values = action_values(layout, situations, seen, self._decide, rng)
+                values = action_values(layout, situations, seen, self._decide, settings.horizon, rng)
                 decisions.append(Decisions(seen, values, self._decide(seen)))
         if decisions:
             self._recent.append(_together(decisions))
@@ -127,7 +127,8 @@ class RolloutTraining(GeneralistTraining):
         losses = []
         if self._recent:
             recent = _together(self._recent)
-            for _ in range(settings.batches):
+            n_batches = max(1, min(settings.batches, len(recent.chosen) // settings.batch_size))
+            for _ in range(n_batches):
                 rows = rng.integers(len(recent.chosen), size=settings.batch_size)
                 losses.append(self.learner.fit(recent, rows, int(rng.integers(symmetry.N))))
         n_tested = sum(len(one.chosen) for one in decisions)

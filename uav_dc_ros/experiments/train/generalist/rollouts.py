@@ -1,8 +1,8 @@
 """What each action of a mission is worth, by flying all of them. Needs no torch.
 
-After the action a mission is flown to its end by the policy. The missions of one state share the random
-numbers of every step, so that they differ by the action alone: the differences have a fraction of the
-variance of J.
+After the action the policy flies some steps, and the plan says what the mission is worth from there. The
+missions of one state share the random numbers of every step, so that they differ by the action alone: the
+differences have a fraction of the variance of J.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import numpy as np
 
 from uav_dc_ros.core import mission, world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.entities.encoding import allowed
+from uav_dc_ros.core.entities.encoding import WORTH, allowed
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.objective import objective
 from uav_dc_ros.core.scenario import Scenario
@@ -50,17 +50,23 @@ def joined(parts: list[Situations]) -> Situations:
 
 
 def action_values(
-    layout: Scenario, situations: Situations, observation: Array, decide: Decide, rng: np.random.Generator
+    layout: Scenario,
+    situations: Situations,
+    observation: Array,
+    decide: Decide,
+    n_steps: int,
+    rng: np.random.Generator,
 ) -> Array:
     """J from now on of each allowed action, float32 `[K, 7]`; NaN of those that are not allowed.
 
     J from now on is that of the whole mission, less what the users collected and the steps flown until now
-    are worth. `observation` `[K, D]` is that of the situations.
+    are worth. `observation` `[K, D]` is that of the situations; `n_steps` are flown at most, including the
+    action, before the plan says what is left.
     """
     mask = allowed(observation)
     row, action = np.nonzero(mask)
     values = np.full(mask.shape, np.nan, np.float32)
-    values[row, action] = _fly(layout, situations, row, action, decide, rng)
+    values[row, action] = _fly(layout, situations, row, action, decide, n_steps, rng)
     weight, limits = situations.weight, layout.mission
     users = situations.state.collected.sum(axis=-1) / layout.n_users
     until_now = weight * users + (1.0 - weight) * (1.0 - situations.state.step / limits.max_steps)
@@ -73,14 +79,16 @@ def _fly(
     row: Array,
     action: Array,
     decide: Decide,
+    n_steps: int,
     rng: np.random.Generator,
 ) -> Array:
     """J of missions that begin in the situations `row` with an `action`, integers `[B]` both."""
+    limits = layout.mission
     flown = situations.take(row)
     state, weight, arrival = flown.state, flown.weight, flown.arrival
     over, landed = np.zeros(len(row), bool), np.zeros(len(row), bool)
     users = state.collected.sum(axis=-1)
-    while True:
+    for _ in range(n_steps):
         draws = rng.random((len(situations.weight), *layout.draws_shape), np.float32)
         state, outcome = world.step(layout, state, action, draws[row])
         docked = mission.at_dock(state.cell, layout.dock_cell)
@@ -89,16 +97,15 @@ def _fly(
         users = np.where(over, users, state.collected.sum(axis=-1))
         landed |= outcome.landed & ~over
         over |= outcome.terminated | outcome.truncated
-        if not over.all():
-            action = decide(world.observe("entities", layout, state, weight))
-            if not (over | docked & (action == Action.HOVER)).all():
-                continue
-            landed |= ~over  # those that wait over the dock for the end
-        return objective(
-            users,
-            arrival,
-            landed,
-            n_users=layout.n_users,
-            max_steps=layout.mission.max_steps,
-            weight=weight,
-        )
+        observation = world.observe("entities", layout, state, weight)
+        action = decide(observation)
+        waits = docked & (action == Action.HOVER)
+        if (over | waits).all():
+            break
+    # Those that wait over the dock land. Of others the plan says what is left.
+    ended = objective(
+        users, arrival, landed | waits, n_users=layout.n_users, max_steps=limits.max_steps, weight=weight
+    )
+    steps = np.asarray(np.where(docked, arrival, state.step), np.float32)
+    until_then = weight * users / layout.n_users + (1.0 - weight) * (1.0 - steps / limits.max_steps)
+    return np.where(over | waits, ended, until_then + observation[:, WORTH])
