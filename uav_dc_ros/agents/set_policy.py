@@ -29,19 +29,21 @@ class FlyingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class RolloutSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="rollouts"):
-    """Hyperparameters of policy iteration with rollouts on random layouts."""
+    """Hyperparameters of policy improvement with rollouts on random layouts."""
 
     missions: Count = 16  # in each layout
     tested: Annotated[float, Meta(gt=0, le=1)] = 0.3  # share of the decisions in which all actions are flown
     horizon: Count = 8  # steps that are flown then, before the plan says what the mission is worth from there
+    # Steps by which an action must be worth more than the plan's own to be preferred: estimates are random.
+    caution: Annotated[float, Meta(ge=0)] = 0.5
     random_moves: Annotated[float, Meta(ge=0, lt=1)] = 0.1  # share of the moves that are random
-    kept: Count = 40  # iterations of which the decisions are fitted
+    kept: Count = 100  # iterations of which the decisions are fitted
     batch_size: Count = 1024  # decisions in a mini-batch
     batches: Count = 8  # mini-batches of an iteration
     value_rate: LearningRate = 7e-4  # learning rate of Adam for V; it falls to a fiftieth
     advantage_rate: LearningRate = 1e-3  # for A, likewise
-    # Limit of the difference between an action and the policy's own, in steps, that is fitted.
-    steps_max: Annotated[float, Meta(gt=0)] = 10.0
+    # Limit of the difference between an action and the plan's own, in steps, that is fitted.
+    steps_max: Annotated[float, Meta(gt=0)] = 20.0
 
 
 class PqnSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="pqn"):

@@ -4,17 +4,12 @@ It knows where clusters are, not where users are. From the last step it knows wh
 is silent, or walked out of reach, is not waited for. It is the policy for any field before its training.
 """
 
-import numpy as np
-
 from uav_dc_ros.core import entities, world
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.entities.encoding import LOSS, N_ACTIONS, allowed
-from uav_dc_ros.core.grid import Action
+from uav_dc_ros.core.entities.encoding import planned_action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.core.world import Act, State
 from uav_dc_ros.errors import ParameterError
-
-_TIE = 1e-7  # of J: of moves that are worth the same, a hover costs the least energy
 
 
 def plan(scenario: Scenario, weight: float) -> Act:
@@ -27,9 +22,6 @@ def plan(scenario: Scenario, weight: float) -> Act:
         raise ParameterError(f"planner 'plan' needs {problem}")
 
     def act(state: State) -> Array:
-        observation = world.observe("entities", scenario, state, weight)
-        loss = np.where(allowed(observation), observation[..., LOSS : LOSS + N_ACTIONS], np.inf)
-        loss[..., Action.HOVER] -= _TIE
-        return loss.argmin(axis=-1)
+        return planned_action(world.observe("entities", scenario, state, weight))
 
     return act

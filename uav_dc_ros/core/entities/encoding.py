@@ -56,6 +56,7 @@ GLOBAL, CLUSTER = len(GLOBALS), len(CLUSTERS)
 ALLOWED = GLOBALS.index("allowed_a0")  # the first of the actions from which the UAV can still land
 WORTH, PRICE, LOSS = (GLOBALS.index(name) for name in ("plan_worth", "price", "loss_a0"))
 MIN, MAX = -1.0, 2.0  # of every number
+_TIE = 1e-7  # of J
 _LEAST_STEP = 0.01  # of what a user is worth in J: what a step costs at least
 
 
@@ -240,6 +241,16 @@ def allowed(observation: Array) -> Array:
     late, it is the shortest way home.
     """
     return observation[..., ALLOWED : ALLOWED + N_ACTIONS] > 0.5
+
+
+def planned_action(observation: Array) -> Array:
+    """The action of the best plan for observations `[..., D]`, integers `[...]`, numpy.
+
+    Of actions that are worth the same it is a hover, which costs the least energy.
+    """
+    loss = np.where(allowed(observation), observation[..., LOSS : LOSS + N_ACTIONS], np.inf)
+    loss[..., Action.HOVER] -= _TIE
+    return loss.argmin(axis=-1)
 
 
 def can_land(scenario: "Scenario", *, cell: Array, step: Array, energy_used_j: Array) -> Array:

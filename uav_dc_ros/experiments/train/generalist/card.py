@@ -80,12 +80,13 @@ channel in simulation only: no wind, no fading, no lost packets.
 def _how(values: RolloutSettings | PqnSettings) -> str:
     """The algorithm and its hyperparameters."""
     if isinstance(values, RolloutSettings):
-        return f"""policy iteration with rollouts: {values.iterations} iterations; in {values.tested:.0%} of
-  the decisions all actions were flown for {values.horizon} steps, and {values.random_moves:.0%} of the moves
-  were random; in an iteration fitted to the decisions of {values.kept} iterations with {values.batches}
-  batches of {values.batch_size}, seen in the eight symmetries of the grid; differences up to
-  {values.steps_max:g} steps; learning rates {values.value_rate:g} of V and {values.advantage_rate:g} of A,
-  which fall to a fiftieth"""
+        return f"""policy improvement with rollouts (AggreVaTe; Ross and Bagnell, 2014): {values.iterations}
+  iterations; in {values.tested:.0%} of the decisions all actions were flown, then the plan, for
+  {values.horizon} steps; {values.random_moves:.0%} of the policy's moves were random; an iteration fits the
+  decisions of the last {values.kept} with {values.batches} batches of {values.batch_size}, seen in the eight
+  symmetries of the grid; an action must be worth {values.caution:g} steps more than the plan's; differences
+  up to {values.steps_max:g} steps; learning rates {values.value_rate:g} of V and {values.advantage_rate:g} of
+  A, which fall to a fiftieth"""
     return f"""PQN (Gallici et al., 2025): {values.iterations} iterations, {values.epochs} pass(es), batches
   of {values.batch_size}, learning rate {values.learning_rate:g}, which falls to a fiftieth, lambda
   {values.trace:g}, discount {values.discount:g}, advantage learning with alpha {values.advantage:g},

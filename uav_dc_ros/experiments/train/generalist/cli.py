@@ -39,9 +39,10 @@ _TEXTS = {
     "tested": "share of the decisions in which all actions are flown",
     "random_moves": "share of the moves that are random",
     "horizon": "steps that are flown then, before the plan says what is left",
+    "caution": "steps by which an action must be worth more than the plan's own to be preferred",
     "kept": "iterations of which the decisions are fitted",
     "batches": "mini-batches of an iteration",
-    "steps_max": "limit of the difference between an action and the policy's own, in steps, that is fitted",
+    "steps_max": "limit of the difference between an action and the plan's own, in steps, that is fitted",
     "epochs": "passes over the decisions of an iteration",
     "learning_rate": "of Adam at the start; it falls to a fiftieth",
     "trace": "lambda of the returns",
@@ -100,8 +101,8 @@ def train(options: argparse.Namespace, command: str, prog: str) -> int:
     torch_device("cpu", options.threads)
     # These need torch.
     from uav_dc_ros.experiments.train import checkpoint
-    from uav_dc_ros.experiments.train.generalist.policy_iteration import RolloutTraining
     from uav_dc_ros.experiments.train.generalist.pqn import PqnTraining
+    from uav_dc_ros.experiments.train.generalist.rollout_training import RolloutTraining
     from uav_dc_ros.experiments.train.generalist.training import BASELINES
 
     folder = options.out.with_name(f"{options.out.name}.checkpoints")

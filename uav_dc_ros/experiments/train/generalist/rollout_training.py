@@ -1,19 +1,19 @@
-"""Policy iteration with rollouts: the policy learns which action is worth most if it flies on itself.
+"""Policy improvement with rollouts: the policy learns by how much an action is worth more than the plan's.
 
-Bertsekas and Tsitsiklis, "Neuro-Dynamic Programming", 1996; Lagoudakis and Parr, "Reinforcement Learning as
-Classification", ICML 2003. In states that the policy meets all actions are flown for some steps, see
-`rollouts`. The network of the advantages is fitted to the differences in J between them, and that of V to J
-of the policy's own action. The next iteration flies with the new policy: a detour that only a wiser policy
-would make good is seen as the loss that it is. Needs torch.
+Ross and Bagnell, "Reinforcement and Imitation Learning via Interactive No-Regret Learning" (AggreVaTe), 2014;
+Bertsekas and Tsitsiklis, "Neuro-Dynamic Programming", 1996. The policy flies. In some of the states that it
+meets all actions are flown, and then the plan, see `rollouts`. The network of the advantages is fitted to the
+differences in J from the plan's own action, and that of V to J of that action. Since the plan flies on after
+each action, a policy that goes to and fro sees every step of that as a loss. Needs torch.
 """
 
+import math
 from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from uav_dc_ros.agents import set_network
 from uav_dc_ros.agents.network import Parameters
@@ -21,7 +21,7 @@ from uav_dc_ros.agents.set_network import VALUE_SCALE, SetArchitecture
 from uav_dc_ros.agents.set_policy import RolloutSettings
 from uav_dc_ros.core import entities, mission
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.entities.encoding import PRICE, allowed
+from uav_dc_ros.core.entities.encoding import PRICE, planned_action
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.experiments.train.generalist import symmetry
 from uav_dc_ros.experiments.train.generalist.rollouts import Situations, action_values, joined
@@ -29,7 +29,7 @@ from uav_dc_ros.experiments.train.generalist.set_learner import FALL, SetLearner
 from uav_dc_ros.experiments.train.generalist.training import GeneralistTraining, Iteration
 
 VALUE, ADVANTAGE = "value", "advantage"
-LINEAR_FROM = 3.0  # steps of error from which the loss of the advantages grows linearly (Huber)
+_LAYOUTS_OF_BATCH = 32  # of a mini-batch
 _SYMMETRIES = tuple(symmetry.symmetry(number) for number in range(symmetry.N))
 
 
@@ -38,7 +38,6 @@ class Decisions(NamedTuple):
 
     observation: Array  # float32 `[R, D]`
     values: Array  # J from now on of each action, float32 `[R, 7]`; NaN of those that are not allowed
-    chosen: Array  # the policy's action, integers `[R]`
 
 
 class RolloutLearner(SetLearner):
@@ -58,27 +57,27 @@ class RolloutLearner(SetLearner):
     def _advantages(self, observation: Tensor) -> Tensor:
         return set_network.advantages(self.architecture, self.theta, observation, active)
 
-    def fit(self, decisions: Decisions, rows: Array, number: int) -> float:
-        """A gradient step with some rows, integers, seen in a symmetry; the squared error of V before it."""
-        turned = _SYMMETRIES[number]
-        observation = torch.from_numpy(turned.of_observation(decisions.observation[rows]))
-        values, chosen = decisions.values[rows], decisions.chosen[rows]
-        target = np.take_along_axis(values, chosen[:, None], axis=-1)[:, 0]
+    def fit(self, decisions: Decisions, number: int) -> float:
+        """A gradient step, with the decisions seen in a symmetry; the squared error of V before it."""
+        turned, settings = _SYMMETRIES[number], self._settings
+        planned = planned_action(decisions.observation)[:, None]
+        own = np.take_along_axis(decisions.values, planned, axis=-1)
+        observation = torch.from_numpy(turned.of_observation(decisions.observation))
         error = set_network.values(self.architecture, self.theta, observation, active)
-        error = VALUE_SCALE * (error - torch.from_numpy(target))
+        error = VALUE_SCALE * (error - torch.from_numpy(own[:, 0]))
         loss = (error * error).mean()
         self.descend(loss, VALUE)
-        # In steps, against the policy's own action. Of a user that is lost only a part counts: such
-        # differences are rare and random. By how much an action is worse than the limit is left to the plan.
-        limit = self._settings.steps_max
-        steps = (values - target[:, None]) / decisions.observation[rows, PRICE, None]
-        steps = torch.from_numpy(turned.of_actions(steps.clip(-limit, limit)))
-        own = torch.from_numpy(np.argsort(turned.action)[chosen])[:, None]
+        # In steps, against the plan's action. The mean counts: a loss that grows linearly would make little of
+        # users that are rarely lost. By how much an action is worse than the limit is left to the plan.
+        steps = (decisions.values - own) / decisions.observation[:, PRICE, None] - settings.caution
+        np.put_along_axis(steps, planned, 0.0, axis=-1)
+        steps = torch.from_numpy(turned.of_actions(steps.clip(-settings.steps_max, settings.steps_max)))
+        at = torch.from_numpy(np.argsort(turned.action)[planned])
         found = self._advantages(observation)
-        found = (found - found.gather(1, own)).clamp(min=-limit)
+        found = (found - found.gather(1, at)).clamp(min=-settings.steps_max)
         mask = ~torch.isnan(steps)
-        errors = functional.smooth_l1_loss(found, steps.nan_to_num(), reduction="none", beta=LINEAR_FROM)
-        self.descend((errors * mask).sum() / mask.sum(), ADVANTAGE)
+        errors = torch.where(mask, found - steps, 0.0)
+        self.descend((errors * errors).sum() / mask.sum() / settings.steps_max, ADVANTAGE)
         return float(loss.detach()) / VALUE_SCALE**2
 
 
@@ -90,7 +89,8 @@ class RolloutTraining(GeneralistTraining):
         self.settings = settings
         start = set_network.initial(architecture, self.generator())
         self.learner: RolloutLearner = RolloutLearner(architecture, start, settings)
-        self._recent: deque[Decisions] = deque(maxlen=settings.kept)
+        # Of one layout in one iteration each.
+        self._kept: deque[Decisions] = deque(maxlen=settings.kept * settings.layouts)
 
     def iterate(self) -> Iteration:
         """See `GeneralistTraining`."""
@@ -112,37 +112,40 @@ class RolloutTraining(GeneralistTraining):
                     tested[i].append((every.take(rows), seen))
             by_chance = (rng.random(mask.shape, np.float32) * mask).argmax(axis=-1)
             flown.step(np.where(rng.random(len(mask)) < settings.random_moves, by_chance, action))
-        decisions = []
+        n_tested = 0
         for layout, parts in zip(drawn, tested, strict=True):
             if parts:
                 situations = joined([one for one, _ in parts])
                 seen = np.concatenate([observation for _, observation in parts])
-                values = action_values(layout, situations, seen, self._decide, settings.horizon, rng)
-                decisions.append(Decisions(seen, values, self._decide(seen)))
-        if decisions:
-            self._recent.append(_together(decisions))
+                values = action_values(layout, situations, seen, planned_action, settings.horizon, rng)
+                self._kept.append(Decisions(seen, values))
+                n_tested += len(seen)
         fall = max(1.0 - done, FALL)
         self.learner.set_rate(settings.value_rate * fall, VALUE)
         self.learner.set_rate(settings.advantage_rate * fall, ADVANTAGE)
-        losses = []
-        if self._recent:
-            recent = _together(self._recent)
-            n_batches = max(1, min(settings.batches, len(recent.chosen) // settings.batch_size))
-            for _ in range(n_batches):
-                rows = rng.integers(len(recent.chosen), size=settings.batch_size)
-                losses.append(self.learner.fit(recent, rows, int(rng.integers(symmetry.N))))
-        n_tested = sum(len(one.chosen) for one in decisions)
-        return self.end(flown, sum(losses) / max(len(losses), 1), n_tested)
+        n_kept = sum(len(one.values) for one in self._kept)
+        n_batches = min(settings.batches, math.ceil(n_kept / settings.batch_size))
+        losses = [self.learner.fit(self._batch(rng), int(rng.integers(symmetry.N))) for _ in range(n_batches)]
+        return self.end(flown, sum(losses) / max(n_batches, 1), n_tested)
 
-    def _decide(self, observation: Array) -> Array:
-        """The greedy actions for observations `[B, D]`, integers `[B]`."""
-        preferences = self.learner.preferences(observation)
-        return np.where(allowed(observation), preferences, -np.inf).argmax(axis=-1)
+    def _batch(self, rng: np.random.Generator) -> Decisions:
+        """Random decisions of random layouts."""
+        parts = []
+        for place in rng.integers(len(self._kept), size=_LAYOUTS_OF_BATCH):
+            one = self._kept[place]
+            rows = rng.integers(len(one.values), size=self.settings.batch_size // _LAYOUTS_OF_BATCH)
+            parts.append(Decisions(*(array[rows] for array in one)))
+        width = max(part.observation.shape[1] for part in parts)
+        # Padded with zeros to the most clusters.
+        padded = [
+            np.pad(part.observation, ((0, 0), (0, width - part.observation.shape[1]))) for part in parts
+        ]
+        return Decisions(np.concatenate(padded), np.concatenate([part.values for part in parts]))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """See `GeneralistTraining`."""
         arrays, values = super().state()
-        for i, decisions in enumerate(self._recent):
+        for i, decisions in enumerate(self._kept):
             named = decisions._asdict().items()
             arrays |= {f"decisions.{i}.{name}": torch.from_numpy(array) for name, array in named}
         return arrays, values
@@ -153,12 +156,4 @@ class RolloutTraining(GeneralistTraining):
         super().restore({name: array for name, array in arrays.items() if name not in kept}, values)
         for i in range(len(kept) // len(Decisions._fields)):
             named = {name: kept[f"decisions.{i}.{name}"].numpy() for name in Decisions._fields}
-            self._recent.append(Decisions(**named))
-
-
-def _together(parts: "list[Decisions] | deque[Decisions]") -> Decisions:
-    """Decisions one after another; observations are padded with zeros to the most clusters."""
-    width = max(part.observation.shape[1] for part in parts)
-    padded = [np.pad(part.observation, ((0, 0), (0, width - part.observation.shape[1]))) for part in parts]
-    others = (np.concatenate([getattr(part, name) for part in parts]) for name in Decisions._fields[1:])
-    return Decisions(np.concatenate(padded), *others)
+            self._kept.append(Decisions(**named))
