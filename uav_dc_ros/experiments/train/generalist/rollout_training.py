@@ -67,8 +67,8 @@ class RolloutLearner(SetLearner):
         error = VALUE_SCALE * (error - torch.from_numpy(own[:, 0]))
         loss = (error * error).mean()
         self.descend(loss, VALUE)
-        # In steps, against the plan's action. The mean counts: a loss that grows linearly would make little of
-        # users that are rarely lost. By how much an action is worse than the limit is left to the plan.
+        # In steps, against the plan's action. The mean counts: a loss that grows linearly would make little
+        # of users that are rarely lost. By how much an action is worse than the limit is left to the plan.
         steps = (decisions.values - own) / decisions.observation[:, PRICE, None] - settings.caution
         np.put_along_axis(steps, planned, 0.0, axis=-1)
         steps = torch.from_numpy(turned.of_actions(steps.clip(-settings.steps_max, settings.steps_max)))
