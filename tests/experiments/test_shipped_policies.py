@@ -8,11 +8,16 @@ from msgspec import UNSET
 
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import policy
+from uav_dc_ros.agents.set_policy import SetPolicyConfig
 from uav_dc_ros.experiments.evaluate.evaluation import COLUMNS, card_seeds, evaluate, rows
 from uav_dc_ros.experiments.train.cli import PROG, options_parser
+from uav_dc_ros.experiments.train.generalist import card as generalist_card
+from uav_dc_ros.experiments.train.generalist import cli as generalist_cli
 from uav_dc_ros.experiments.train.training import VALIDATION_SEEDS
 
 NAMES = policy.names()
+FOR_ANY_FIELD = [name for name in NAMES if isinstance(policy.load(name).config, SetPolicyConfig)]
+OF_A_FIELD = [name for name in NAMES if name not in FOR_ANY_FIELD]
 
 
 def card(name):
@@ -37,7 +42,7 @@ def test_it_has_one_name_however_it_is_loaded(name, monkeypatch):
         assert loaded.scenario.fingerprint == scenarios.load(loaded.scenario.name).fingerprint
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OF_A_FIELD)
 def test_the_figures_on_the_card_come_out_again(name):
     loaded = policy.load(name)
     scenario = scenarios.load(loaded.scenario.name)
@@ -48,7 +53,27 @@ def test_the_figures_on_the_card_come_out_again(name):
     assert set(rows(result)) <= set(lines)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FOR_ANY_FIELD)
+def test_the_figures_of_one_for_any_field_come_out_again(name):
+    loaded = policy.load(name)
+    for scenario in ("three_clusters", "farm"):
+        assert generalist_card.row(loaded, scenarios.load(scenario)) in card(name).splitlines()
+
+
+@pytest.mark.parametrize("name", FOR_ANY_FIELD)
+def test_the_command_of_one_for_any_field_says_how_it_was_made(name):
+    command = shlex.split(re.search(r"```\n(.+)\n```", card(name))[1].removeprefix(PROG))
+    config = policy.load(name).config
+    algorithm = command[command.index("--algo") + 1]
+    assert isinstance(config.hyperparameters, generalist_cli.SETTINGS[algorithm])
+    options = generalist_cli.options_parser(PROG, algorithm).parse_args(command)
+    assert (options.out.name, options.width, tuple(options.hidden)) == (name, config.width, config.hidden)
+    assert options.seed == config.seed
+    for key in config.hyperparameters.__struct_fields__:
+        assert getattr(options, key) == getattr(config.hyperparameters, key)
+
+
+@pytest.mark.parametrize("name", OF_A_FIELD)
 def test_the_command_on_the_card_says_how_it_was_made(name):
     command = re.search(r"```\n(.+)\n```", card(name))[1]
     assert command.startswith(PROG)
