@@ -69,6 +69,14 @@ class RecorderNode(RecorderBase):
             for topic, (mission, step) in missing.items()
         }
 
+    def is_caught_up(self) -> bool:
+        """Whether, as far as is known, it has received all that the publishers have latched."""
+        has_mission = "mission" in self.newest or not self._is_recorded("mission")
+        return super().is_caught_up() and has_mission and not self.missing()
+
+    def _is_recorded(self, topic: str) -> bool:
+        return not self.selected or self.resolve_topic_name(topic) in self.selected
+
     def on_peers(self) -> None:
         """Add the topics of the row to the bag, also those without a message, before `ready`."""
         for name in self.row.subscribes:
