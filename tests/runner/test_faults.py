@@ -99,8 +99,8 @@ def test_nodes_end_with_a_launcher_that_is_killed(ros: Ros, arguments: list[obje
 
 WITH_LIMIT = """import sys
 from uav_dc_ros import run_all
-from uav_dc_ros.runner import mission_runner
-mission_runner.RECORDER_S = float(sys.argv.pop(1))
+from uav_dc_ros.runner import mission_runner, supervisor
+mission_runner.RECORDER_S, supervisor.BACK_OFF_S = float(sys.argv.pop(1)), 4.0
 run_all.main()"""
 
 
@@ -108,12 +108,12 @@ run_all.main()"""
 def test_a_mission_that_is_over_waits_for_its_recorder(
     ros: Ros, arguments: list[object], tmp_path: Path, limit_s: float
 ) -> None:
-    """Five steps take less time than the pause before the restart."""
+    """The rest of the mission takes less time than the pause before the restart."""
     process = ros.start_command(
-        *(sys.executable, "-c", WITH_LIMIT, limit_s, *arguments, *COMPOSED, "--pace", 300)
+        *(sys.executable, "-c", WITH_LIMIT, limit_s, *arguments, *COMPOSED, "--pace", 100)
     )
     assert process.stdout is not None
-    wait_for(process.stdout, "mission: step 25/30")
+    wait_for(process.stdout, FLYING)
     os.kill(ros.node("recorder"), signal.SIGKILL)
     status, output = finish(process)
     assert "Traceback" not in output

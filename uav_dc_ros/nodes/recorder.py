@@ -70,12 +70,9 @@ class RecorderNode(RecorderBase):
         }
 
     def is_caught_up(self) -> bool:
-        """Whether, as far as is known, it has received all that the publishers have latched."""
-        has_mission = "mission" in self.newest or not self._is_recorded("mission")
-        return super().is_caught_up() and has_mission and not self.missing()
-
-    def _is_recorded(self, topic: str) -> bool:
-        return not self.selected or self.resolve_topic_name(topic) in self.selected
+        """Whether it has received the latched `mission`. Publishers that stop wait until the rest is."""
+        is_recorded = not self.selected or self.resolve_topic_name("mission") in self.selected
+        return super().is_caught_up() and ("mission" in self.newest or not is_recorded)
 
     def on_peers(self) -> None:
         """Add the topics of the row to the bag, also those without a message, before `ready`."""

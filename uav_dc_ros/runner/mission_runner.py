@@ -1,6 +1,5 @@
 """One run of run_all: check the options, start the nodes, follow the missions, stop the nodes, report."""
 
-import contextlib
 import signal
 import threading
 import time
@@ -12,10 +11,10 @@ from typing import TYPE_CHECKING, cast
 import msgspec
 from rclpy.context import Context
 
-from uav_dc_ros import cdr, cli, files, messages, scenarios
+from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import agent as agents
 from uav_dc_ros.core import pace
-from uav_dc_ros.errors import BagError, MessageError, NodeError
+from uav_dc_ros.errors import BagError, NodeError
 from uav_dc_ros.messages import Mission, Phase, new_run
 from uav_dc_ros.mission_summary import Summary
 from uav_dc_ros.nodes.framework.node_table import mission_rows
@@ -284,27 +283,18 @@ class MissionRunner:
 
     def _report_lacking_bag(self) -> int:
         """Report what the bag lacks, since its recorder was still being restarted; returns 1."""
-        why = "when it was interrupted" if self.interrupted else f"after {RECORDER_S:g} s"
-        self.bag_lacks = f"the messages after {self._last_recorded()}: the recorder had not caught up {why}"
-        self._error(f"the bag {self.bag} lacks {self.bag_lacks}")
-        return 1
+        assert self.bag is not None
+        from uav_dc_ros.runner.last_recorded import last_recorded  # slow to import, and rarely needed
 
-    def _last_recorded(self) -> str:
-        """The last step whose `mission` is in the bag, in words."""
-        from uav_dc_ros.bags.read import BagReader  # slow to import, and rarely needed
-
-        last = "the start"
-        if self.bag is None or not self.bag.is_dir():
-            return last
         try:
-            with BagReader(self.bag) as reader:
-                for message in reader.messages([f"{self.config.namespace.rstrip('/')}/mission"]):
-                    with contextlib.suppress(MessageError):
-                        status = messages.decode(cdr.decode_string(message.data), Mission)
-                        last = f"step {status.step} of mission {status.mission}"
+            last = last_recorded(self.bag, self.config.namespace)
         except BagError as error:
             self._error(str(error))
-        return last
+            last = "an unknown step"
+        why = "when it was interrupted" if self.interrupted else f"after {RECORDER_S:g} s"
+        self.bag_lacks = f"the messages after {last}: the recorder had not caught up {why}"
+        self._error(f"the bag {self.bag} lacks {self.bag_lacks}")
+        return 1
 
     def _elsewhere(self) -> list[str]:
         """Peers that are started elsewhere."""
