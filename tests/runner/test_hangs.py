@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros, finish, read_bag, until, wait_for
+from tests.conftest import PATIENCE_S, Ros, finish, read_bag, until, wait_for
 from tests.support.fake_autopilot.flight import fake
 from uav_dc_ros.runner.node_process import Silence, waits_for_disk
 
@@ -26,7 +26,7 @@ def flown_with_hangs(ros: Ros, options: list[object], names: tuple[str, ...], *h
     printed = wait_for(flight.stdout, "step 5/30")
     for name in names:
         os.kill(ros.node(name), signal.SIGSTOP)
-    status, output = finish(flight, 300)
+    status, output = finish(flight, 6 * PATIENCE_S)  # five hundred missions on a busy computer
     assert status == 0, output
     assert "Traceback" not in output
     for name in names:
