@@ -36,3 +36,4 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     energy_per_mbit_j: float | UnsetType | None = UNSET
     reason: str  # end of a real vehicle's mission, or cause of an abort, in words; else empty
     bag: str | None  # folder of the bag, or null
+    bag_lacks: str | UnsetType = UNSET  # messages of the run that were not recorded; absent if none

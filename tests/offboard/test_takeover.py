@@ -180,7 +180,7 @@ def test_another_system_that_comes_in_flight_is_reported() -> None:
     flight.vehicle.other_controller = None
     flight.vehicle.battery = 0.1
     flight.until(Phase.LANDING)
-    assert flight.bridge.reason.endswith("; another system commands this vehicle: " + evidence)
+    assert flight.bridge.reason.startswith(f"another system commands this vehicle: {evidence}; battery 10%")
 
 
 def test_a_target_that_is_not_ours_for_long_ends_the_mission() -> None:
@@ -190,8 +190,42 @@ def test_a_target_that_is_not_ours_for_long_ends_the_mission() -> None:
     vehicle.fence_m = 1.0  # it keeps the target that it has
     vehicle.target = Enu(0.0, 500.0, 150.0)
     flight.until(Phase.LANDING, 12.0)
-    assert "the autopilot does not accept the setpoint: its target is" in flight.bridge.reason
+    assert flight.bridge.reason.startswith(NOT_ACCEPTED)
+    assert ";" not in flight.bridge.reason
     flight.until(Phase.ABORTED)
+
+
+NOT_ACCEPTED = "the autopilot does not accept the setpoint: its target is "
+ENDS = [
+    ({"falls": True}, "m too low; expected at most 10 m"),
+    ({"tilt_rad": 2.0}, "tilted by 115 degrees; expected at most 70"),
+    ({"offset": (0.0, 0.0, 600.0)}, "the vehicle is outside the fence: "),
+    ({"battery": 0.1}, "battery 10%"),
+    ({"frozen": True}, "no position for 0.5 s"),
+]
+
+
+@pytest.mark.parametrize(("change", "end"), ENDS, ids=[next(iter(change)) for change, _ in ENDS])
+@pytest.mark.parametrize("after_s", [2.0, 7.0], ids=["before", "on hold"])
+def test_the_reason_of_an_end_begins_with_its_cause(
+    change: dict[str, object], end: str, after_s: float
+) -> None:
+    """The cause is a target that is not ours: it holds the vehicle after 5 s, or is too recent for that."""
+    flight = fly_to_step(3, SafetySettings(arm=True, max_speed_mps=1e6))
+    vehicle = flight.vehicle
+    vehicle.fence_m, vehicle.target = 1.0, vehicle.position._replace(up_m=vehicle.position.up_m - 5.0)
+    flight.run(after_s)
+    assert (flight.bridge.fault is not None) == (after_s > 5.0)
+    for name, value in change.items():
+        setattr(vehicle, name, value)
+    flight.until(Phase.LANDING, 12.0)
+    reason = flight.bridge.reason
+    assert end in reason
+    # Without positions for five seconds, a target that deviated for two before is no fault.
+    assert reason.startswith(NOT_ACCEPTED) or (after_s < 5.0 and "frozen" in change), reason
+    assert reason.count(NOT_ACCEPTED) <= 1
+    flight.until(Phase.ABORTED)
+    assert flight.bridge.reason.startswith(reason)
 
 
 # A new mission beside a vehicle in the air, and Ctrl-C.

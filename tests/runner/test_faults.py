@@ -5,12 +5,13 @@ import os
 import re
 import resource
 import signal
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros, each_once, finish, read_bag, wait_for
+from tests.conftest import PATIENCE_S, Ros, each_once, finish, read_bag, wait_for
 from tests.runner.test_container import modules
 
 # Each fixture `ros` asserts at its end that no process of the test is left.
@@ -18,6 +19,7 @@ from tests.runner.test_container import modules
 FLYING = "mission: step 5/30"
 
 
+LATCHED = ("/mission", "/users", "/rates")
 COMPOSED = ("--compose",)  # where it is not about one of the nodes: fewer processes to start
 
 
@@ -93,6 +95,41 @@ def test_nodes_end_with_a_launcher_that_is_killed(ros: Ros, arguments: list[obje
     finish(process)
     assert ros.gone()
     assert len(read_bag(tmp_path / "bag")) > 20  # the recorder closed it on its own
+
+
+WITH_LIMIT = """import sys
+from uav_dc_ros import run_all
+from uav_dc_ros.runner import mission_runner, supervisor
+mission_runner.RECORDER_S, supervisor.BACK_OFF_S = float(sys.argv.pop(1)), 4.0
+run_all.main()"""
+
+
+@pytest.mark.parametrize("limit_s", [PATIENCE_S, 0.0])
+def test_a_mission_that_is_over_waits_for_its_recorder(
+    ros: Ros, arguments: list[object], tmp_path: Path, limit_s: float
+) -> None:
+    """The rest of the mission takes less time than the pause before the restart."""
+    process = ros.start_command(
+        *(sys.executable, "-c", WITH_LIMIT, limit_s, *arguments, *COMPOSED, "--pace", 100)
+    )
+    assert process.stdout is not None
+    wait_for(process.stdout, FLYING)
+    os.kill(ros.node("recorder"), signal.SIGKILL)
+    status, output = finish(process)
+    assert "Traceback" not in output
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["outcome"], summary["steps"]) == ("timeout", 30)
+    steps = {name: {m["step"] for at, m in read_bag(tmp_path / "bag") if at == name} for name in LATCHED}
+    if limit_s:
+        assert status == 0, output
+        assert "bag_lacks" not in summary
+        assert all(found == set(range(31)) for found in steps.values()), steps
+    else:
+        assert status == 1, output
+        last = max(steps["/mission"])
+        lacks = f"the messages after step {last} of mission 0: the recorder had not caught up after 0 s"
+        assert summary["bag_lacks"] == lacks
+        assert f"lacks {lacks}" in output
 
 
 @pytest.mark.long

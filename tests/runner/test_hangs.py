@@ -5,13 +5,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros, finish, read_bag, until, wait_for
+from tests.conftest import PATIENCE_S, Ros, finish, read_bag, until, wait_for
 from tests.support.fake_autopilot.flight import fake
-from uav_dc_ros.runner.node_process import waits_for_disk
+from uav_dc_ros.runner.node_process import Silence, waits_for_disk
 
 NODES = ("world", "channel_monitor", "policy", "recorder", "visualizer")
 AT_A_PACE = ("--pace", 15)  # twenty seconds: longer than the recorder is waited for
@@ -25,7 +26,7 @@ def flown_with_hangs(ros: Ros, options: list[object], names: tuple[str, ...], *h
     printed = wait_for(flight.stdout, "step 5/30")
     for name in names:
         os.kill(ros.node(name), signal.SIGSTOP)
-    status, output = finish(flight, 300)
+    status, output = finish(flight, 6 * PATIENCE_S)  # five hundred missions on a busy computer
     assert status == 0, output
     assert "Traceback" not in output
     for name in names:
@@ -54,6 +55,40 @@ def test_a_process_that_waits_for_the_disk_does_not_hang() -> None:
         waiting.wait()
         stopped.wait()
     assert not waits_for_disk(waiting.pid)
+
+
+BUSY = "while True: pass"
+
+
+def test_a_process_that_waits_for_a_cpu_does_not_hang() -> None:
+    """A process among busy ones on a CPU, then stopped: two seconds without a sign of life each time."""
+    cpu = min(os.sched_getaffinity(0))
+    starved, *busy = (subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(3))
+
+    def silent_s() -> float:
+        silence = Silence(starved.pid)
+        last_s = began_s = time.monotonic()
+        while last_s < began_s + 2.0:
+            time.sleep(0.02)
+            now_s = time.monotonic()
+            silence.add(now_s - last_s)
+            last_s = now_s
+        return silence.silent_s
+
+    try:
+        for process in (starved, *busy):
+            os.sched_setaffinity(process.pid, {cpu})
+        os.setpriority(os.PRIO_PROCESS, starved.pid, 19)
+        assert silent_s() < 1.0
+        for process in busy:
+            process.kill()
+        starved.send_signal(signal.SIGSTOP)
+        until(lambda: ") T " in Path(f"/proc/{starved.pid}/stat").read_text())
+        assert silent_s() >= 2.0
+    finally:
+        for process in (starved, *busy):
+            process.kill()
+            process.wait()
 
 
 @pytest.fixture

@@ -69,6 +69,11 @@ class RecorderNode(RecorderBase):
             for topic, (mission, step) in missing.items()
         }
 
+    def is_caught_up(self) -> bool:
+        """Whether it has received the latched `mission`. Publishers that stop wait until the rest is."""
+        is_recorded = not self.selected or self.resolve_topic_name("mission") in self.selected
+        return super().is_caught_up() and ("mission" in self.newest or not is_recorded)
+
     def on_peers(self) -> None:
         """Add the topics of the row to the bag, also those without a message, before `ready`."""
         for name in self.row.subscribes:

@@ -32,8 +32,11 @@ from uav_dc_ros.topics import SIMULATED, TOPICS
 if TYPE_CHECKING:
     from uav_dc_ros.runner.console import MissionConsole
 
+RECORDER = "recorder"
 STEP_TIMEOUT_S = 30.0  # for the discovery of the nodes, and for a due step
 LAST_RATES_S = 5.0  # longest wait for the rates of a mission's last step: their node may be restarting
+# Longest wait at the end for a recorder that is being restarted: on a busy computer it takes half a minute.
+RECORDER_S = 60.0
 FINAL_S, FINAL_QUIET_S = 2.0, 0.2  # longest wait for the nodes' last messages, and for the next one
 RESEND_S = 1.0  # for lost messages from other hosts, which are sent again ten times a second
 TICK_S = 0.02  # period of checks of the nodes
@@ -99,6 +102,8 @@ class MissionRunner:
         self.errors: list[str] = []  # that were printed
         self.interrupted = self._aborted = False
         self._abort_reason = ""  # of the whole run
+        self._recorder_is_behind = False  # at the end: the bag lacks messages
+        self.bag_lacks = ""  # which; empty: none that is known
         self._step_s = 0.0  # time of the last step, monotonic clock
         self._status: Mission | None = None  # last message of the vehicle
 
@@ -129,6 +134,7 @@ class MissionRunner:
                 stack.enter_context(self._locks(network.node))
                 self._note_other_world()
                 self._follow(supervisor, network.node, network.executor)
+                self._wait_for_recorder(supervisor, network.executor)
             except NodeError as error:
                 self._abort_reason = str(error)
                 self._error(self._abort_reason)
@@ -141,11 +147,15 @@ class MissionRunner:
                 time.sleep(RESEND_S)  # what the monitor has received, the recorder may not yet have
             if self._page is not None and web_page.is_attended() and self._show and not self.interrupted:
                 view = supervisor.release(web_page.NODE)
+            # An error that ended the run may be the recorder's own, and is printed already.
+            self._recorder_is_behind = not self._abort_reason and supervisor.is_catching_up(RECORDER)
             exits = supervisor.stop(network.leave if is_complete else lambda: None)
             status = max(status, self._check_exits(exits))
             if not is_complete:
                 self._complete_summaries(network.node, network.executor)
         status = max(status, self._repair_bag(), int(self._aborted))
+        if self._recorder_is_behind:
+            status = max(status, self._report_lacking_bag())
         self._write_summary()
         status = cli.INTERRUPTED if self.interrupted else status
         if self._page is not None and view is not None:
@@ -196,6 +206,16 @@ class MissionRunner:
                 node.report_ends(LAST_RATES_S)
                 self._check_timeout(node, now_s)
             time.sleep(min(node.pause_s, tick_s))
+
+    def _wait_for_recorder(self, supervisor: Supervisor, executor: DirectExecutor) -> None:
+        """Let a recorder that is being restarted receive the end of the missions: the nodes latch it."""
+        deadline_s = time.monotonic() + RECORDER_S
+        while supervisor.is_catching_up(RECORDER) and not self.interrupted:
+            if time.monotonic() > deadline_s:
+                return
+            executor.spin_once(TICK_S)
+            supervisor.tick(may_bring_up=True)
+            time.sleep(TICK_S)
 
     @property
     def _is_complete(self) -> bool:
@@ -260,6 +280,21 @@ class MissionRunner:
             return 1
         self._note(f"the recorder did not close its bag: {repaired}")
         return 0
+
+    def _report_lacking_bag(self) -> int:
+        """Report what the bag lacks, since its recorder was still being restarted; returns 1."""
+        assert self.bag is not None
+        from uav_dc_ros.runner.last_recorded import last_recorded  # slow to import, and rarely needed
+
+        try:
+            last = last_recorded(self.bag, self.config.namespace)
+        except BagError as error:
+            self._error(str(error))
+            last = "an unknown step"
+        why = "when it was interrupted" if self.interrupted else f"after {RECORDER_S:g} s"
+        self.bag_lacks = f"the messages after {last}: the recorder had not caught up {why}"
+        self._error(f"the bag {self.bag} lacks {self.bag_lacks}")
+        return 1
 
     def _elsewhere(self) -> list[str]:
         """Peers that are started elsewhere."""
@@ -346,6 +381,10 @@ class MissionRunner:
         """Write the summary to its file, if there is one, and print it."""
         if self.bag is not None and not self.bag.is_dir():  # the recorder did not create it
             self.summaries = [msgspec.structs.replace(mission, bag=None) for mission in self.summaries]
+        if self.bag_lacks:
+            self.summaries = [
+                msgspec.structs.replace(mission, bag_lacks=self.bag_lacks) for mission in self.summaries
+            ]
         if self.config.summary is not None:
             content = self.summaries[0] if self.config.missions == 1 else self.summaries
             text = msgspec.json.format(msgspec.json.encode(content), indent=2)

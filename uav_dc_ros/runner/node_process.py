@@ -21,7 +21,7 @@ from uav_dc_ros.nodes.framework.process_control import FINALIZED, REPORTS, SUPER
 from uav_dc_ros.nodes.ros import environment
 
 READ_BYTES = 1 << 16  # capacity of a pipe
-DISK_WAIT_S = 0.5  # a process that is silent for so long may wait for the disk
+BLOCKED_S = 0.5  # a process that is silent for so long may wait for the disk or for a CPU
 READER_S = 1.0  # timeout for the last lines of output
 
 
@@ -31,10 +31,70 @@ def waits_for_disk(process_id: int) -> bool:
     It does not hang: it goes on when the disk does, and until then a kill ends neither it nor its wait.
     """
     try:
-        stat = Path(f"/proc/{process_id}/stat").read_bytes()
+        return _state(Path(f"/proc/{process_id}")).startswith(b"D")
     except OSError:  # it has ended
         return False
-    return stat.rpartition(b") ")[2].startswith(b"D")
+
+
+def _state(folder: Path) -> bytes:
+    """State of a process or thread, a letter, and what follows it in its folder of /proc."""
+    return (folder / "stat").read_bytes().rpartition(b") ")[2]
+
+
+class CpuWaits:
+    """How long the threads of a process had no CPU while they were ready to run, since the first look."""
+
+    def __init__(self, process_id: int) -> None:
+        self._threads = Path(f"/proc/{process_id}/task")
+        self._began_s: dict[str, float] = {}  # finished waits of each thread at its first look
+        self._changed: dict[str, tuple[str, float]] = {}  # its counters, and when they had changed last
+
+    def longest_s(self, now_s: float) -> float:
+        """Wait of the thread that waited longest; 0.0 where the kernel does not count."""
+        longest_s = 0.0
+        with contextlib.suppress(OSError):  # the process has ended
+            for thread in self._threads.iterdir():
+                with contextlib.suppress(OSError, IndexError):  # the thread has ended
+                    longest_s = max(longest_s, self._wait_s(thread, now_s))
+        return longest_s
+
+    def _wait_s(self, thread: Path, now_s: float) -> float:
+        counters = (thread / "schedstat").read_text()  # time on a CPU, time of finished waits, ns; turns
+        finished_s = int(counters.split()[1]) / 1e9
+        if self._changed.get(thread.name, ("", 0.0))[0] != counters:
+            self._changed[thread.name] = counters, now_s
+        wait_s = finished_s - self._began_s.setdefault(thread.name, finished_s)
+        if _state(thread).startswith(b"R"):  # it has waited since its counters changed last
+            wait_s += now_s - self._changed[thread.name][1]
+        return wait_s
+
+
+class Silence:
+    """Time without a sign of life of a process, less the time for which it waited for the disk or for a CPU.
+
+    On a busy computer a process may wait for most of the time. It does not hang: a kill would only add load.
+    """
+
+    def __init__(self, process_id: int) -> None:
+        self._process_id = process_id
+        self.end()
+
+    def end(self) -> None:
+        """Note a sign of life."""
+        self._passed_s = 0.0
+        self._waits: CpuWaits | None = None  # from `BLOCKED_S` on
+        self.silent_s = 0.0
+
+    def add(self, passed_s: float) -> None:
+        """Add time without a sign of life."""
+        if self._passed_s < BLOCKED_S or not waits_for_disk(self._process_id):
+            self._passed_s += passed_s
+        if self._passed_s < BLOCKED_S:
+            self.silent_s = self._passed_s
+            return
+        # All threads count: they wait for one another's locks, in the middleware and in Python.
+        self._waits = self._waits or CpuWaits(self._process_id)
+        self.silent_s = max(0.0, self._passed_s - self._waits.longest_s(time.monotonic()))
 
 
 class NodeProcess:
@@ -84,7 +144,7 @@ class NodeProcess:
         )
         os.close(write_end)
         self.kill_reason = ""  # empty: not killed
-        self.silent_s = 0.0  # since the last report, or the start
+        self._silence = Silence(self.process.pid)
         self.reports: Mapping[str, NodeReport] = {}  # last one by node name; empty until the start
         self._partial = b""  # start of a report
         self._on_line = on_line
@@ -98,6 +158,11 @@ class NodeProcess:
             self._last_line = raw.decode(errors="replace").rstrip()
             self._on_line(self.name, self._last_line)
 
+    @property
+    def silent_s(self) -> float:
+        """Time since the last report or the start, without that for which the process was blocked."""
+        return self._silence.silent_s
+
     def receive_reports(self, passed_s: float) -> None:
         """Update `reports` and `silent_s`; `passed_s` is the time since the last call."""
         try:
@@ -105,9 +170,9 @@ class NodeProcess:
         except BlockingIOError:
             received = b""
         if received:
-            self.silent_s = 0.0
-        elif self.silent_s < DISK_WAIT_S or not waits_for_disk(self.process.pid):
-            self.silent_s += passed_s
+            self._silence.end()
+        else:
+            self._silence.add(passed_s)
         *lines, self._partial = (self._partial + received).split(b"\n")
         if lines:
             self.reports = process_control.decode(lines[-1])

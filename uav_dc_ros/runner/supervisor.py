@@ -94,6 +94,16 @@ class Supervisor:
         """Number of restarts by node name."""
         return {node.row.name: node.restarts for node in self.nodes}
 
+    def is_catching_up(self, name: str) -> bool:
+        """Whether a node has ended, or was restarted and has not yet received what others have latched."""
+        for node in self.nodes:
+            if node.row.name == name and node.restarts:
+                report = None if node.process is None else node.process.reports.get(name)
+                return report is None or not report.caught_up
+            if node.row.name == name:
+                return node.process is None or node.process.has_ended
+        return False
+
     @property
     def have_started(self) -> bool:
         """Whether all processes report."""

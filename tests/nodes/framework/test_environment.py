@@ -1,5 +1,6 @@
 """An environment in which ROS cannot start is one line; nodes use UDP, on the interfaces of their range."""
 
+import fcntl
 import os
 import re
 import subprocess
@@ -94,6 +95,23 @@ def test_a_full_shared_memory_is_refused_before_it_ends_the_process(monkeypatch:
     monkeypatch.setattr(fastdds, "free_mb", lambda: 0.0)
     with pytest.raises(ParameterError, match=r"is full \(0\.00 MB free\).*expected 0.1 MB"):
         environment.prepare(local_only=True)
+
+
+def test_segments_of_the_dead_are_removed_and_those_of_the_living_are_not(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(fastdds, "SHARED_MEMORY", tmp_path)
+    dead, living, young = (f"fastrtps_{digit * 16}" for digit in "0a5")
+    others = ["fastrtps_port7000", "fastrtps_port7000_el", "sem.fastrtps_port7000_mutex", f"my_{dead}_el"]
+    for name in (*others, *(f"{segment}{end}" for segment in (dead, living, young) for end in ("", "_el"))):
+        (tmp_path / name).touch()
+        if not name.startswith(young):
+            os.utime(tmp_path / name, (0.0, 0.0))
+    with (tmp_path / f"{living}_el").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert fastdds.remove_segments_of_the_dead() == 1
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {*others, living, f"{living}_el", young, f"{young}_el"}
 
 
 LOCALHOST = ("fastdds_localhost.xml", "SUBNET", None)  # the profile limits the range

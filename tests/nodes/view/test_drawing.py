@@ -1,6 +1,7 @@
 """The markers and the path, read back by ROS itself and by rosbags, which share no code with it."""
 
 import math
+import random
 import time
 from typing import Any
 
@@ -273,6 +274,25 @@ def test_a_new_mission_starts_a_new_path_whatever_the_order_of_topics() -> None:
     for _, users in calls:
         users()
     assert flight.steps == [(1.0, float(step)) for step in range(5)]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_path_has_poses_of_two_missions(seed: int) -> None:
+    """Each topic keeps its order, but any of them may be ahead of the others, also where a path is drawn."""
+    dice = random.Random(seed)
+    flight = Flight(PathHistory(SCENARIO))
+    turns = [(mission, step) for mission in range(4) for step in range(61)]
+    waiting = [list(calls) for calls in zip(*(flight.step(*turn) for turn in turns), strict=True)]
+    waiting[2].pop(0)()  # the first users
+    while any(waiting):
+        calls = dice.choice([calls for calls in waiting if calls])
+        for _ in range(min(dice.randrange(40), len(calls))):
+            calls.pop(0)()
+        drawn = flight.steps
+        # Targets stand for poses that were missed: the first ones may be late.
+        mission, first = drawn[0] if drawn else (0.0, 0.0)
+        assert drawn == [(mission, first + step) for step in range(len(drawn))]
+    assert flight.steps == [(3.0, float(step)) for step in range(61)]
 
 
 def test_what_is_flown_between_two_missions_belongs_to_none() -> None:

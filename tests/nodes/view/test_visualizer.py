@@ -98,7 +98,7 @@ def by_hand(ros: Ros, scenario: object) -> Any:
 @pytest.mark.long
 def test_who_joins_late_draws_the_whole_mission(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
     bag_folder = ros.folder / "bag"
-    options = ("--scenario", small_scenario, "--policy", small_policy, "--pace", 30, "--bag", bag_folder)
+    options = ("--scenario", small_scenario, "--policy", small_policy, "--pace", 10, "--bag", bag_folder)
     flight = ros.start("uav_dc_ros.run_all", *options, *WITHOUT_VISUALIZER)
     assert flight.stdout is not None
     wait_for(flight.stdout, "step 10/30")

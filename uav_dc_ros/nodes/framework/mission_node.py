@@ -133,6 +133,10 @@ class MissionNode(ManagedNode):
         """Whether messages are still expected after `drain_quiet_s`: the node then stops later."""
         return False
 
+    def is_caught_up(self) -> bool:
+        """Whether the node is active and connected to all peers, also after a restart."""
+        return self._is_active and self._peers_found
+
     # Topics.
 
     def timer(self, period_s: float, callback: Callable[[], None], clock: Clock | None = None) -> Any:

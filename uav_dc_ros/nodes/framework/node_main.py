@@ -111,8 +111,10 @@ class Reporter:
         """Report all nodes."""
         if self._pipe is None:
             return
-        states = ((name, node.state) for name, node in self._nodes.items())
-        reports = {name: process_control.NodeReport(state, self._refused.get(name)) for name, state in states}
+        reports = {
+            name: process_control.NodeReport(node.state, self._refused.get(name), node.is_caught_up())
+            for name, node in self._nodes.items()
+        }
         # The pipe is full while run_all is suspended, and closed once it has ended: see StopMonitor.
         with contextlib.suppress(OSError):
             os.write(self._pipe, msgspec.json.encode(reports) + b"\n")

@@ -28,7 +28,8 @@ class NodeRow:
     rank: int = 1
     # Within `supervisor.RESTART_WINDOW_S`. One more failure ends the mission or, if not needed, its restarts.
     max_restarts: int = 3
-    # An active node without a report for so long is restarted: no callback takes it on a busy computer.
+    # An active node without a report for so long is restarted. Time for which it waits for a CPU or the disk
+    # does not count.
     hang_timeout_s: float = 5.0
     stop_timeout_s: float = 10.0  # for its process to end after SIGTERM: the bridge waits for its vehicle
     needed: bool = True  # the mission cannot fly without it (the bridge: only with a real vehicle)

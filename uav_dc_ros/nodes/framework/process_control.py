@@ -16,10 +16,14 @@ REASON_MAX = 1000  # characters; a report is shorter than what a pipe writes ato
 
 
 class NodeReport(msgspec.Struct, frozen=True):
-    """State of a node's life cycle, and why its last transition failed (None: it did not)."""
+    """State of a node's life cycle, and why its last transition failed (None: it did not).
+
+    `caught_up`: see `MissionNode.is_caught_up`.
+    """
 
     state: str
     refused: str | None = None
+    caught_up: bool = False
 
 
 decode = msgspec.json.Decoder(dict[str, NodeReport]).decode  # a line of reports, by name of the node

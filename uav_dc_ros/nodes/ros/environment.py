@@ -31,7 +31,8 @@ def prepare(*, local_only: bool) -> None:
 
 
 def select_shared_memory() -> None:
-    """Use shared memory for large messages, unless little of it is free."""
+    """Use shared memory for large messages, unless little of it is free; first remove what the dead left."""
+    fastdds.remove_segments_of_the_dead()
     if is_small := (free_mb := fastdds.free_mb()) < fastdds.RECOMMENDED_MB:
         _note(
             f"{fastdds.SHARED_MEMORY} has {free_mb:.1f} MB free; expected {fastdds.RECOMMENDED_MB}: messages "

@@ -22,18 +22,21 @@ class PathHistory:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._step_ns = scenario.step_ns
+        self._scenario = scenario
         self._min_distance_m = MIN_DISTANCE_CELLS * scenario.grid.cell_m
         self.version = 0  # changes with the path
         self._path: SpacedSeries[tuple[int, Pose]] = SpacedSeries(POSES_MAX)  # with the time of publication
         self._last: tuple[int, Pose] | None = None  # also if the path leaves it out
         self._targets: list[Pose] = []
-        self._start_ns = -1  # of the mission
+        self._start_ns, self._end_ns = -1, math.inf  # of the mission; the end is known in simulation only
         self._current: tuple[int, int] = (-1, 0)  # last mission and step in `users`
+        self._before_ns = -1  # time of publication of the last `users` before the mission
         self._users_ns = -1  # time of publication of the last `users`
 
     def add_pose(self, pose: Pose, published_ns: int) -> None:
-        """Add a pose, unless it repeats the last one or is too near to it."""
+        """Add a pose, unless it is of an earlier mission, repeats the last one or is too near to it."""
+        if not self._is_current((published_ns, pose)):
+            return
         self._last = published_ns, pose
         if not self._path.kept or self._is_apart(pose, self._path.kept[-1][1]):
             self._path.add(self._last)
@@ -62,18 +65,21 @@ class PathHistory:
         last, self._current = self._current, (mission, step)
         if mission == last[0] and step >= last[1]:
             return None
-        self._start_ns = stamp_ns - step * self._step_ns
+        self._start_ns, self._before_ns = stamp_ns - step * self._scenario.step_ns, before_ns
+        is_simulated = stamp_ns == self._scenario.time_ns(mission, step)
+        self._end_ns = self._scenario.time_ns(mission + 1, 0) if is_simulated else math.inf
         self.version += 1
         before, self._path = self._path.kept, SpacedSeries(POSES_MAX)
-        self._path.kept += (each for each in before if self._is_current(each, before_ns))
-        if self._last is not None and not self._is_current(self._last, before_ns):
+        self._path.kept += (each for each in before if self._is_current(each))
+        if self._last is not None and not self._is_current(self._last):
             self._last = None
         self._targets = [target for target in self._targets if target.stamp_ns >= self._start_ns]
         return before_ns
 
-    def _is_current(self, received: tuple[int, Pose], before_ns: int) -> bool:
+    def _is_current(self, received: tuple[int, Pose]) -> bool:
+        """Whether a pose is not of an earlier mission; it may be of the next one."""
         published_ns, pose = received
-        return published_ns > before_ns and pose.stamp_ns >= self._start_ns
+        return published_ns > self._before_ns and pose.stamp_ns >= self._start_ns
 
     @property
     def newest(self) -> Pose | None:
@@ -84,6 +90,7 @@ class PathHistory:
 
     @property
     def poses(self) -> list[Pose]:
-        """The path, in order."""
+        """The path, in order. The poses of the next mission wait for its users."""
         missed = [target for target in self._targets if self._is_before_poses(target)]
-        return missed + [pose for _, pose in self._path.kept]
+        known = missed + [pose for _, pose in self._path.kept]
+        return [pose for pose in known if pose.stamp_ns < self._end_ns]

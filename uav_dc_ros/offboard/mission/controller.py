@@ -300,11 +300,21 @@ class MissionController:
         return not self.policy_lost
 
     def _abort(self, reason: str, mode: Mode | None = None, blind_since_s: float | None = None) -> None:
-        """Land, and end the mission as `aborted`."""
+        """Land, and end the mission as `aborted`; the reason names what preceded it first."""
+        reason = "; ".join([*self._preceding(reason), reason])
         self._fault_timer.fault = None
-        reason = reason if self._other_controller is None else f"{reason}; {self._other_controller}"
         mode = mode or self.detector.landing_mode(self._now.steady_s, self._telemetry)
         self._land(mode, Phase.ABORTED, reason, blind_since_s)
+
+    def _preceding(self, reason: str) -> list[str]:
+        """What may be the cause of the end: another system's commands, the fault that held the vehicle."""
+        cause, last = self._fault_timer.cause, self._fault_timer.fault
+        if cause is None and self.phase in POLICY_CONTROLLED:
+            # A vehicle that flies to another target may crash or leave the fence before that is a fault.
+            cause = self._steps.target_fault(self._telemetry, self.settings.crash_timeout_s)
+        elif cause is not None and last is not None and cause.kind is last.kind and last.text == reason:
+            cause = None  # the fault itself ends the mission
+        return [text for text in (self._other_controller, cause.text if cause else None) if text is not None]
 
     # Phases.
 

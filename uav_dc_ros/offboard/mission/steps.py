@@ -101,9 +101,11 @@ class StepControl:
 
     def fault(self, telemetry: Telemetry, moves: bool) -> Fault | None:
         """A target that deviates from the setpoint, or, while the vehicle `moves`, missing progress."""
-        return self._target_fault(telemetry) or (self._progress_fault(telemetry) if moves else None)
+        target_fault = self.target_fault(telemetry, self._settings.target_timeout_s)
+        return target_fault or (self._progress_fault(telemetry) if moves else None)
 
-    def _target_fault(self, telemetry: Telemetry) -> Fault | None:
+    def target_fault(self, telemetry: Telemetry, timeout_s: float) -> Fault | None:
+        """A target that has deviated from the setpoint for longer than `timeout_s`."""
         target, target_s, setpoint = telemetry.target, telemetry.target_s, self._setpoint
         off_m = 0.0
         if target is not None and target_s is not None and setpoint is not None and target_s > self._sent_s:
@@ -113,7 +115,7 @@ class StepControl:
             return None
         if self._deviates_since_s is None:
             self._deviates_since_s = telemetry.vehicle_s
-        if telemetry.vehicle_s - self._deviates_since_s <= self._settings.target_timeout_s:
+        if telemetry.vehicle_s - self._deviates_since_s <= timeout_s:
             return None
         text = f"the autopilot does not accept the setpoint: its target is {off_m:.0f} m away from it"
         return Fault(FaultKind.TARGET, text)

@@ -9,6 +9,8 @@ from uav_dc_ros.offboard.vehicle import Command, TakeOff
 # Pauses between take-off commands. Motors need two seconds to lift the vehicle. ArduPilot disarms a vehicle
 # that stands for ten seconds: three commands may be lost before.
 TAKEOFF_RETRIES = 1.5
+# One loss of telemetry shows as several of these faults, one after the other.
+TELEMETRY_FAULTS = {FaultKind.LINK, FaultKind.ESTIMATE, FaultKind.POSITION, FaultKind.CLOCK}
 
 
 class Instant(NamedTuple):
@@ -25,6 +27,12 @@ class FaultTimer:
         self._timeout_s = timeout_s
         self.fault: Fault | None = None
         self.since = Instant(0.0, 0.0)  # start of the fault
+        self._first: Fault | None = None
+
+    @property
+    def cause(self) -> Fault | None:
+        """The fault with which the vehicle began to hold; others may have replaced it. None: no fault."""
+        return None if self.fault is None else self._first
 
     def update(self, now: Instant, fault: Fault | None) -> Literal["changed", "cleared", "expired"] | None:
         """Note the present fault; returns the change. `expired`: the timeout has passed on either clock.
@@ -35,10 +43,12 @@ class FaultTimer:
         if fault is None:
             return None if before is None else "cleared"
         if before is None:
-            self.since = now
+            self.since, self._first = now, fault
             return "changed"
         if before.kind in (fault.kind, FaultKind.LINK):
-            self.fault = before
+            self.fault = fault = before
+        if self._first is None or {self._first.kind, fault.kind} <= TELEMETRY_FAULTS:
+            self._first = fault
         if max(now.steady_s - self.since.steady_s, now.vehicle_s - self.since.vehicle_s) > self._timeout_s:
             return "expired"
         return None if self.fault is before else "changed"
