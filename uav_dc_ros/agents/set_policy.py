@@ -33,7 +33,7 @@ class RolloutSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, k
 
     missions: Count = 16  # in each layout
     tested: Annotated[float, Meta(gt=0, le=1)] = 0.3  # share of the decisions in which all actions are flown
-    horizon: Count = 8  # steps that are flown then, before the plan says what the mission is worth from there
+    horizon: Count = 8  # steps that are flown then; the plan estimates what the mission is worth from there
     # Steps by which an action must be worth more than the plan's own to be preferred: estimates are random.
     caution: Annotated[float, Meta(ge=0)] = 0.5
     random_moves: Annotated[float, Meta(ge=0, lt=1)] = 0.1  # share of the moves that are random

@@ -38,7 +38,7 @@ _TEXTS = {
     "advantage_rate": "learning rate of A at the start; it falls to a fiftieth",
     "tested": "share of the decisions in which all actions are flown",
     "random_moves": "share of the moves that are random",
-    "horizon": "steps that are flown then, before the plan says what is left",
+    "horizon": "steps that are flown then; the plan estimates what the mission is worth from there",
     "caution": "steps by which an action must be worth more than the plan's own to be preferred",
     "kept": "iterations of which the decisions are fitted",
     "batches": "mini-batches of an iteration",

@@ -1,6 +1,6 @@
 """What each action of a mission is worth, by flying all of them. Needs no torch.
 
-After the action the policy flies some steps, and the plan says what the mission is worth from there. The
+After the action some more steps are flown, and the plan estimates what the mission is worth from there. The
 missions of one state share the random numbers of every step, so that they differ by the action alone: the
 differences have a fraction of the variance of J.
 """
@@ -61,7 +61,7 @@ def action_values(
 
     J from now on is that of the whole mission, less what the users collected and the steps flown until now
     are worth. `observation` `[K, D]` is that of the situations; `n_steps` are flown at most, including the
-    action, before the plan says what is left.
+    action, before the plan estimates what is left.
     """
     mask = allowed(observation)
     row, action = np.nonzero(mask)
@@ -102,7 +102,7 @@ def _fly(
         waits = docked & (action == Action.HOVER)
         if (over | waits).all():
             break
-    # Those that wait over the dock land. Of others the plan says what is left.
+    # Those that wait over the dock land. Of others the plan estimates what is left.
     ended = objective(
         users, arrival, landed | waits, n_users=layout.n_users, max_steps=limits.max_steps, weight=weight
     )
