@@ -1,4 +1,4 @@
-"""Missions that planners fly: nodes and bag agree with the rollout to the last bit."""
+"""Missions in any field: nodes and bag agree with the rollout to the last bit."""
 
 import json
 from pathlib import Path
@@ -12,15 +12,17 @@ from tests.recordings.report_bags import unpacked
 from tests.support.fake_autopilot.flight import fake
 from uav_dc_ros import bag as command
 from uav_dc_ros import scenarios
+from uav_dc_ros.agents import policy
 from uav_dc_ros.core.grid import ACTION_LABELS
 from uav_dc_ros.core.world import rollout_steps
+from uav_dc_ros.experiments.evaluate.cli import candidates
 from uav_dc_ros.planners import PLANNERS
 
 SEED, WEIGHT = 5, 0.8
 
 
-@pytest.mark.parametrize("name", ["search", "plan"])
-def test_a_planner_flies_in_nodes_as_in_a_rollout(
+@pytest.mark.parametrize("name", ["search", "plan", "generalist"])
+def test_what_flies_any_field_flies_in_nodes_as_in_a_rollout(
     ros: Ros, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     status, output = ros.run_all(
@@ -29,11 +31,12 @@ def test_a_planner_flies_in_nodes_as_in_a_rollout(
         *("--summary", "summary.json"),
     )
     assert status == 0, output
+    assert "another world" not in output
     scenario, actions = scenarios.load("random:2"), []
-    planner = PLANNERS[name](scenario, WEIGHT)
+    decide = candidates([name])[0].act_in(scenario, WEIGHT)
 
     def act(state):
-        actions.append(int(planner(state)[0]))
+        actions.append(int(decide(state)[0]))
         return np.asarray(actions[-1:])
 
     *_, (last, _) = rollout_steps(scenario, act, [SEED])
@@ -53,7 +56,10 @@ def test_a_planner_flies_in_nodes_as_in_a_rollout(
         return out
 
     out = run("verify", ros.folder / "bag", "--complete")
-    assert f"in scenario 'random_2', planner {name!r} (w = 0.8)" in out
+    kind, what = (
+        ("planner", "") if name in PLANNERS else ("policy", f"sha256 {policy.load(name).sha256[:12]}, ")
+    )
+    assert f"in scenario 'random_2', {kind} {name!r} ({what}w = 0.8)" in out
     n_steps = scenario.mission.max_steps
     assert f"decisions: {n_steps} of {n_steps} steps recomputed, equal to the last bit" in out
     out = run("verify", ros.folder / "bag", "--policy", "tour")

@@ -8,6 +8,7 @@ import numpy as np
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.agents.policy import Policy
 from uav_dc_ros.agents.policy_search import PolicySearch
+from uav_dc_ros.agents.set_policy import SetPolicyConfig
 from uav_dc_ros.core.arrays import Array
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
@@ -49,6 +50,11 @@ class Agent:
     def home(self) -> Scenario | None:
         """The scenario in which a policy was trained."""
         return None if self.policy is None else self.policy.scenario
+
+    @property
+    def for_any_field(self) -> bool:
+        """Whether it flies in any field: a planner, or a policy that was trained for that."""
+        return self.policy is None or isinstance(self.policy.config, SetPolicyConfig)
 
     @property
     def knows_positions(self) -> bool:

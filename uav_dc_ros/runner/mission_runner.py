@@ -179,7 +179,9 @@ class MissionRunner:
 
     def _note_other_world(self) -> None:
         trained, flown = self.agent.home, self.scenario
-        if trained is not None and trained.fingerprint != flown.fingerprint:
+        if self.agent.for_any_field or trained is None:
+            return
+        if trained.fingerprint != flown.fingerprint:
             self._note(
                 f"policy {self.agent.name} was trained in another world ({trained.name} "
                 f"{trained.fingerprint}) than it flies in ({flown.name} {flown.fingerprint})"

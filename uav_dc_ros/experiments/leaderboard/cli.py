@@ -15,7 +15,6 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from uav_dc_ros import cli, files, scenarios
 from uav_dc_ros.agents import policy as policies
 from uav_dc_ros.agents.agent import Agent
-from uav_dc_ros.agents.set_policy import SetPolicyConfig
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT, EXPECTED_WEIGHT
 from uav_dc_ros.errors import FROM_TRAIN, UavDcError
 from uav_dc_ros.experiments.evaluate.cli import candidates
@@ -164,7 +163,7 @@ def _entrants(planners: Sequence[str], given: Sequence[str], searches: Sequence[
     if double := next((name for name in names if names.count(name) > 1), None):
         raise UavDcError(f"--policy: another policy has the name {double!r}; expected a name of its own")
     for one in every:
-        if not _for_any_field(one) and one.home is not None and one.home.name not in scenarios.names():
+        if not one.for_any_field and one.home is not None and one.home.name not in scenarios.names():
             raise UavDcError(
                 f"--policy {one.name}: it flies in {one.home.name!r} only; expected a policy for any field, "
                 f"or for one of {', '.join(scenarios.names())}"
@@ -173,17 +172,13 @@ def _entrants(planners: Sequence[str], given: Sequence[str], searches: Sequence[
 
 
 def _baseline(entrants: Sequence[Agent]) -> Agent:
-    for_any = [one for one in entrants if _for_any_field(one) and one.policy is not None]
+    for_any = [one for one in entrants if one.for_any_field and one.policy is not None]
     planners = sorted((one for one in entrants if one.policy is None), key=lambda one: one.name != "search")
     return [*for_any, *planners][0]
 
 
-def _for_any_field(one: Agent) -> bool:
-    return one.policy is None or isinstance(one.policy.config, SetPolicyConfig)
-
-
 def _flies(one: Agent, board: Board) -> bool:
-    return _for_any_field(one) or (one.home is not None and one.home.name == board.home)
+    return one.for_any_field or (one.home is not None and one.home.name == board.home)
 
 
 def _times(
