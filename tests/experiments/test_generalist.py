@@ -41,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = SetArchitecture(width=8, hidden=(16,), n_actions=7)
 # Keys of clusters, which a field of listed users lacks.
 CLUSTERED = ("cluster_centres_m", "users_per_cluster", "cluster_radius_m")
-SMALL_RUN = {"iterations": 4, "layouts": 2, "missions": 4, "batch_size": 64}
+SMALL_RUN = {"iterations": 4, "layouts": 2, "missions": 4, "batch_size": 20}
 
 
 def begun(algorithm):

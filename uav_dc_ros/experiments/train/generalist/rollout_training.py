@@ -130,10 +130,10 @@ class RolloutTraining(GeneralistTraining):
 
     def _batch(self, rng: np.random.Generator) -> Decisions:
         """Random decisions of random layouts."""
-        parts = []
+        parts, n_rows = [], math.ceil(self.settings.batch_size / _LAYOUTS_OF_BATCH)
         for place in rng.integers(len(self._kept), size=_LAYOUTS_OF_BATCH):
             one = self._kept[place]
-            rows = rng.integers(len(one.values), size=self.settings.batch_size // _LAYOUTS_OF_BATCH)
+            rows = rng.integers(len(one.values), size=n_rows)
             parts.append(Decisions(*(array[rows] for array in one)))
         width = max(part.observation.shape[1] for part in parts)
         # Padded with zeros to the most clusters.
