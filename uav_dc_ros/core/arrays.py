@@ -12,13 +12,60 @@ from typing import Any, TypeAlias
 import array_api_compat
 import numpy as np
 
-# numpy 2 follows the standard itself. The wrapper for numpy 1 imports f2py: a tenth of a node's start.
-_NUMPY: Any = np
-if np.lib.NumpyVersion(np.__version__) < "2.0.0":
-    _NUMPY = importlib.import_module("array_api_compat.numpy")
-
 # numpy.ndarray or torch.Tensor. The array API standard has no type for both.
 Array: TypeAlias = Any
+
+# numpy 2 follows the standard itself. The wrapper for numpy 1 imports f2py: a tenth of a node's start.
+_STANDARD: Any = np
+if np.lib.NumpyVersion(np.__version__) < "2.0.0":
+    _STANDARD = importlib.import_module("array_api_compat.numpy")
+
+
+class _Numpy:
+    """numpy's namespace, with methods of arrays in place of functions that call them in the end.
+
+    On the arrays of a node such a function takes longer than what it calls.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(_STANDARD, name)
+        setattr(self, name, found)  # so that this is called once for each name
+        return found
+
+    @staticmethod
+    def take(values: Array, indices: Array, axis: int) -> Array:
+        return values.take(indices, axis)
+
+    @staticmethod
+    def astype(values: Array, dtype: Any) -> Array:
+        return values.astype(dtype)
+
+    @staticmethod
+    def max(values: Array, axis: int, keepdims: bool = False) -> Array:
+        return values.max(axis=axis, keepdims=keepdims)
+
+    @staticmethod
+    def min(values: Array, axis: int, keepdims: bool = False) -> Array:
+        return values.min(axis=axis, keepdims=keepdims)
+
+    @staticmethod
+    def any(values: Array, axis: int, keepdims: bool = False) -> Array:
+        return values.any(axis=axis, keepdims=keepdims)
+
+    @staticmethod
+    def argmax(values: Array, axis: int) -> Array:
+        return values.argmax(axis=axis)
+
+    @staticmethod
+    def zeros_like(values: Array) -> Array:
+        return np.zeros(values.shape, values.dtype)
+
+    @staticmethod
+    def ones_like(values: Array) -> Array:
+        return np.ones(values.shape, values.dtype)
+
+
+_NUMPY = _Numpy()
 
 
 def array_namespace(*arrays: Array) -> Any:

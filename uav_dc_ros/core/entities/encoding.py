@@ -57,7 +57,36 @@ ALLOWED = GLOBALS.index("allowed_a0")  # the first of the actions from which the
 WORTH, PRICE, LOSS = (GLOBALS.index(name) for name in ("plan_worth", "price", "loss_a0"))
 MIN, MAX = -1.0, 2.0  # of every number
 _TIE = 1e-7  # of J
+# Numbers of a mission or a cluster that are squashed.
+_SQUASHED = {
+    *("steps_left", "slack", "dock_east", "dock_north", "dock_cells_east", "dock_cells_north", "height"),
+    *("gain_a", "lost_steps_a", "lost_users_a"),
+    *("east", "north", "moves", "detour", "hovers"),
+}
+# Minimum and maximum of others, where they are not MIN and MAX.
+_LIMITS = {
+    **dict.fromkeys(("home_share", "plan_share", "moves_share", "visit_share"), (0.0, MAX)),
+    **dict.fromkeys(("plan_worth", "home_a"), (MIN, 1.0)),
+    "delivered": (0.0, 1.5),
+}
 _LEAST_STEP = 0.01  # of what a user is worth in J: what a step costs at least
+
+
+class _Scales(NamedTuple):
+    """How the numbers of a mission or of a cluster are scaled, a number for each column."""
+
+    squashed: tuple[float, ...]  # 1: it is squashed; 0: it is not
+    low: tuple[float, ...]  # minimum
+    high: tuple[float, ...]  # maximum
+
+
+def _scales(names: tuple[str, ...]) -> _Scales:
+    of_columns = [name for name in names for _ in range(N_ACTIONS if name.endswith("_a") else 1)]
+    low, high = zip(*(_LIMITS.get(name, (MIN, MAX)) for name in of_columns), strict=True)
+    return _Scales(tuple(float(name in _SQUASHED) for name in of_columns), low, high)
+
+
+_OF_MISSION, _OF_CLUSTER = _scales(GLOBAL_NAMES), _scales(CLUSTER_NAMES)
 
 
 def problem(scenario: "Scenario") -> str | None:
@@ -110,14 +139,15 @@ def encode(
     if energy_used_j is not None:
         energy_used_j = energy_used_j.reshape((-1,))
     budget = _budget(xp, scenario, step, energy_used_j, home_after, valid)
-    slack = budget.left - home  # steps
+    slack, left = budget.left - home, budget.left.clip(1.0)  # steps
     one = xp.ones_like(home)
 
     share = xp.astype(collected, xp.float32)
-    user_data = xp.astype(data_bits, xp.float32) / scenario.user_r_min_bits(one)
+    r_min_bits = scenario.user_r_min_bits(one)
+    user_data = xp.astype(data_bits, xp.float32) / r_min_bits
     user_data = user_data.clip(0.0, 1.0)
     given = data_bits * 0.0 if delivered_bits is None else delivered_bits.reshape((-1, scenario.n_users))
-    given = xp.astype(given, xp.float32) / scenario.user_r_min_bits(one)  # in the last step
+    given = xp.astype(given, xp.float32) / r_min_bits  # in the last step
     # Users for which one more step here is enough.
     spread = xp.take(progress_after[:, Action.HOVER], tables.cluster_of, axis=-1)
     last = (user_data + spread >= 1.0) & (spread > 0.0) & ~collected
@@ -169,69 +199,82 @@ def encode(
 
     of_mission = [
         budget.left / budget.most,
-        squashed(budget.left / 16.0),
-        squashed(slack / 8.0),
-        (home / budget.left.clip(1.0)).clip(0.0, MAX),
-        squashed(to_dock[:, 0] / reach),
-        squashed(to_dock[:, 1] / reach),
-        squashed(to_dock[:, 0] / 4.0),
-        squashed(to_dock[:, 1] / 4.0),
-        xp.astype(home < 0.5, xp.float32),
+        budget.left / 16.0,
+        slack / 8.0,
+        home / left,
+        to_dock[:, 0] / reach,
+        to_dock[:, 1] / reach,
+        to_dock[:, 0] / 4.0,
+        to_dock[:, 1] / 4.0,
+        home < 0.5,
         w,
         per_step / (per_step + per_user),
         share.sum(axis=-1) / scenario.n_users,
         user_data.sum(axis=-1) / scenario.n_users,
         cell_f[:, 2] / max(grid.n_z - 1, 1),
-        squashed((grid.altitude_min_m + cell_f[:, 2] * grid.altitude_step_m) / limits.d_cons_m),
-        one * squashed(grid.altitude_step_m / limits.d_cons_m),
-        one * squashed(1.0 / reach),
-        one * squashed(4.0 * _speed_mps(scenario) * limits.step_s / limits.d_cons_m),
-        one * squashed(n_clusters / 4.0),
-        one * squashed(scenario.n_users / 32.0),
-        (plan.steps / budget.left.clip(1.0)).clip(0.0, MAX),
+        (grid.altitude_min_m + cell_f[:, 2] * grid.altitude_step_m) / limits.d_cons_m,
+        squashed(grid.altitude_step_m / limits.d_cons_m),
+        squashed(1.0 / reach),
+        squashed(4.0 * _speed_mps(scenario) * limits.step_s / limits.d_cons_m),
+        squashed(n_clusters / 4.0),
+        squashed(scenario.n_users / 32.0),
+        plan.steps / left,
         plan.clusters.sum(axis=-1) / n_clusters,
-        one * float(limited),
+        float(limited),
         budget.charge,
-        one * squashed(budget.most / 32.0),
-        one * float(tables.shared),
-        plan.worth.clip(MIN, 1.0),
+        squashed(budget.most / 32.0),
+        float(tables.shared),
+        plan.worth,
         price,
     ]
     of_actions = [
-        xp.astype(budget.allowed, xp.float32),
-        squashed(4.0 * gain),
-        (home_after - home[:, None]).clip(MIN, 1.0),
+        budget.allowed,
+        4.0 * gain,
+        home_after - home[:, None],
         plan.loss,
-        squashed(plan.loss / (2.0 * price)[:, None]),
-        squashed(plan.loss / per_user.clip(1e-6)[:, None]),
+        plan.loss / (2.0 * price)[:, None],
+        plan.loss / per_user.clip(1e-6)[:, None],
     ]
-    ones = xp.ones_like(ways)
     of_clusters = [
-        ones,
-        squashed(to_clusters[..., 0] / reach),
-        squashed(to_clusters[..., 1] / reach),
-        squashed(ways / 8.0),
-        (ways / budget.left.clip(1.0)[:, None]).clip(0.0, MAX),
-        squashed(detour / 8.0),
-        ((detour + hovers) / slack.clip(1.0)[:, None]).clip(0.0, MAX),
-        xp.astype(fits, xp.float32),
-        ones * (tables.sizes / scenario.n_users),
+        1.0,
+        to_clusters[..., 0] / reach,
+        to_clusters[..., 1] / reach,
+        ways / 8.0,
+        ways / left[:, None],
+        detour / 8.0,
+        (detour + hovers) / slack.clip(1.0)[:, None],
+        fits,
+        tables.sizes / scenario.n_users,
         done,
         open_users,
         data_of_open,
-        squashed(hovers / 4.0),
+        hovers / 4.0,
         value / (value + cost).clip(1e-9),
         plan.clusters,
-        ones * squashed(tables.radii),
+        squashed(tables.radii),
         xp.exp(-0.5 * (to_clusters * to_clusters).sum(axis=-1) / (reach * reach)),
         nearly,
-        given_mean.clip(0.0, 1.5),
+        given_mean,
         reached,
     ]
     by_action = xp.moveaxis(progress_after, -2, -1)  # [N, M, 7]
-    clusters = xp.concat([xp.stack(of_clusters, axis=-1), by_action], axis=-1)
-    parts = [xp.stack(of_mission, axis=-1), *of_actions, clusters.reshape((clusters.shape[0], -1))]
-    return xp.concat(parts, axis=-1).reshape((*leading, size(scenario)))
+    numbers = _vector(one, of_mission, of_actions, _OF_MISSION)
+    clusters = _vector(ways, of_clusters, [by_action], _OF_CLUSTER)
+    numbers = xp.concat([numbers, clusters.reshape((len(numbers), -1))], axis=-1)
+    return numbers.reshape((*leading, size(scenario)))
+
+
+def _vector(like: Array, numbers: list[Array | float], by_action: list[Array], scales: _Scales) -> Array:
+    """Columns of the shape of `like` `[...]`, then others by action `[..., 7]`, scaled, `[..., D]`."""
+    # Columns are set one by one: to squash and to stack them takes a node a third longer.
+    vector = like[..., None] * constant(scales.squashed, like)
+    for place, column in enumerate(numbers):
+        vector[..., place] = column
+    for i, columns in enumerate(by_action):
+        place = len(numbers) + i * N_ACTIONS
+        vector[..., place : place + N_ACTIONS] = columns
+    vector = vector / (1.0 + abs(vector) * constant(scales.squashed, like))
+    return vector.clip(constant(scales.low, like), constant(scales.high, like))
 
 
 def allowed(observation: Array) -> Array:
