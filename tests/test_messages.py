@@ -232,6 +232,11 @@ def test_a_number_that_json_does_not_know_never_leaves(value: float) -> None:
     bad = msgspec.structs.replace(EXAMPLES["users"], x_m=[value, 0.0])
     with pytest.raises(MessageError):
         messages.encode(bad)
+    mission = msgspec.structs.replace(EXAMPLES["mission"], fault=None, reason="null")
+    assert messages.decode(messages.encode(mission), Mission) == mission
+    for fault in (None, messages.FaultKind.LINK):
+        with pytest.raises(MessageError):
+            messages.encode(msgspec.structs.replace(mission, fault=fault, energy_used_j=value))
 
 
 def test_columns_have_one_length() -> None:

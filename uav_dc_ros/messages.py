@@ -102,10 +102,10 @@ class PerUser(Stepped, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         """Reject columns of different lengths."""
-        values = {name: getattr(self, name) for name in self.__struct_fields__}
-        lengths = {name: len(column) for name, column in values.items() if isinstance(column, list)}
-        if len(set(lengths.values())) > 1:
-            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        values = msgspec.structs.astuple(self)
+        if len({len(column) for column in values if type(column) is list}) > 1:
+            columns = zip(self.__struct_fields__, values, strict=True)
+            listed = ", ".join(f"{name} {len(column)}" for name, column in columns if type(column) is list)
             raise ValueError(f"columns of different length: {listed}")
 
 
@@ -262,7 +262,9 @@ def encode(payload: Payload) -> bytes:
         MessageError: a number that is not finite, which JSON does not have.
     """
     text = msgspec.json.encode(payload)
-    if b"null" in text:  # a number that is not finite, or a mission without a fault
+    # A number that is not finite is `null`, as is a field that is None.
+    n_none = msgspec.structs.astuple(payload).count(None)
+    if text.count(b"null") != n_none:
         decode(text, type(payload))
     return text
 

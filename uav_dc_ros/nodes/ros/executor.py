@@ -6,7 +6,6 @@ EventsExecutor is experimental, and called no callback in the wheels of 7.1.6. `
 compares this executor with rclpy's own.
 """
 
-import contextlib
 import gc
 import threading
 import time
@@ -27,7 +26,8 @@ TURN_MAX, TURN_MAX_S = 100, 0.2
 QUIET_TURNS = 10
 BUSY_S = 0.003  # while messages keep coming, timers and services are checked this often
 BUSY_NS = round(BUSY_S * 1e9)
-_Entity = tuple[str, Any, Callable[[Any], None]]  # kind (as in the wait set), entity, and what handles it
+# A kind of entities, as the wait set names it, the entities, and what handles one that is ready.
+_Kind = tuple[str, list[Any], Callable[[Any], None]]
 
 
 class DirectExecutor:
@@ -49,7 +49,7 @@ class DirectExecutor:
         self._nodes: list[Node] = []
         self._wait_set: Any = None
         self._subscriptions_wait_set: Any = None
-        self._subscriptions: list[_Entity] = []  # as of the last full wait
+        self._subscriptions: list[Any] = []  # as of the last full wait
         self._capacity: tuple[int, ...] = (0,) * 5  # of the wait set
         self._full_wait_s = 0.0  # time of the last full wait
         self._received_s = 0.0  # time of the last message
@@ -90,40 +90,55 @@ class DirectExecutor:
         while messages keep coming, it waits for subscriptions only, for at most `BUSY_S`.
         """
         is_busy = self._subscriptions and time.monotonic() - self._full_wait_s < BUSY_S
-        if is_busy and self._wait(self._subscriptions_wait_set, self._subscriptions, BUSY_NS):
-            return
-        timers = self._entities("timer", _call_timer)
-        subscriptions = self._entities("subscription", self._take_messages)
-        services = self._entities("service", _serve)
-        clients = self._entities("client", _complete)
-        capacity = len(subscriptions), 1, len(timers), len(clients), len(services)
+        if is_busy:
+            subscriptions: _Kind = "subscription", self._subscriptions, self._take_messages
+            if self._wait(self._subscriptions_wait_set, [subscriptions], BUSY_NS):
+                return
+        kinds: list[_Kind] = [
+            ("timer", self._entities("timers"), _call_timer),
+            ("subscription", self._entities("subscriptions"), self._take_messages),
+            ("service", self._entities("services"), _serve),
+            ("client", self._entities("clients"), _complete),
+        ]
+        n_timers, n_subscriptions, n_services, n_clients = (len(entities) for _, entities, _ in kinds)
+        capacity = n_subscriptions, 1, n_timers, n_clients, n_services
         if any(has < needed for has, needed in zip(self._capacity, capacity, strict=True)):
             self._capacity = capacity
             self._wait_set = rclpy_private.wait_set(self._context, *capacity)
         timeout_ns = -1 if timeout_s is None else round(timeout_s * 1e9)
-        self._wait(self._wait_set, [*timers, *subscriptions, *services, *clients], timeout_ns)
+        self._wait(self._wait_set, kinds, timeout_ns)
         self._full_wait_s = time.monotonic()
-        subscriptions = self._entities("subscription", self._take_messages)
-        if len(subscriptions) > len(self._subscriptions):
-            capacity = len(subscriptions), 1, 0, 0, 0
-            self._subscriptions_wait_set = rclpy_private.wait_set(self._context, *capacity)
-        self._subscriptions = subscriptions
+        present = self._entities("subscriptions")
+        if len(present) > len(self._subscriptions):
+            self._subscriptions_wait_set = rclpy_private.wait_set(self._context, len(present), 1, 0, 0, 0)
+        self._subscriptions = present
 
-    def _entities(self, kind: str, handle: Callable[[Any], None]) -> list[_Entity]:
-        return [(kind, entity, handle) for node in self._nodes for entity in getattr(node, f"{kind}s")]
+    def _entities(self, kinds: str) -> list[Any]:
+        return [entity for node in self._nodes for entity in getattr(node, kinds)]
 
-    def _wait(self, wait_set: Any, entities: list[_Entity], timeout_ns: int) -> bool:
+    def _wait(self, wait_set: Any, kinds: list[_Kind], timeout_ns: int) -> bool:
         """Wait for entities, handle those that are ready; false after the timeout, but true after `wake`."""
         wait_set.clear_entities()
-        at = [getattr(wait_set, f"add_{kind}")(entity.handle) for kind, entity, _ in entities]
+        places = []
+        for kind, entities, _ in kinds:
+            add = getattr(wait_set, f"add_{kind}")
+            places.append([add(entity.handle) for entity in entities])
         wait_set.add_guard_condition(self._guard.handle)
         wait_set.wait(timeout_ns)
+        is_ready = wait_set.is_ready
         # All that is ready is listed before a callback may create or destroy entities.
-        ready = [one for one, index in zip(entities, at, strict=True) if wait_set.is_ready(one[0], index)]
-        is_woken: bool = wait_set.is_ready("guard_condition", 0)
-        for _, entity, handle in ready:
-            with contextlib.suppress(InvalidHandle):  # destroyed by an earlier callback of this turn
+        ready = [
+            (handle, entity)
+            for (kind, entities, handle), at in zip(kinds, places, strict=True)
+            for entity, place in zip(entities, at, strict=True)
+            if is_ready(kind, place)
+        ]
+        is_woken: bool = is_ready("guard_condition", 0)
+        for handle, entity in ready:
+            try:
                 handle(entity)
+            except InvalidHandle:  # destroyed by an earlier callback of this turn
+                continue
         return bool(ready) or is_woken
 
     def _take_messages(self, subscription: Any) -> None:
