@@ -95,7 +95,7 @@ def parser(prog: str = PROG) -> cli.Parser:
     cli.add_namespace(options, namespace)
     nodes = "nodes to start on this host, the others being started elsewhere (default: all)"
     add("--nodes", type=cli.names("names of nodes"), metavar="A,B,...", help=nodes)
-    compose = "world, channel monitor and policy in one process (default: in lockstep)"
+    compose = "share processes: world, channel monitor, policy; visualizer, web view (default: in lockstep)"
     add("--compose", action=argparse.BooleanOptionalAction, help=compose)
     port = cli.whole_number(0, PORT_MAX, f"a TCP port from 0 (any) to {PORT_MAX}")
     live = "serve the mission to Foxglove over WebSocket (default port: %(const)s)"

@@ -5,15 +5,20 @@ the container is killed: test_flight and test_kills. That a lockstep has one by 
 """
 
 import json
+import os
+import re
 import resource
+import select
 import signal
 import subprocess
+import sys
+import urllib.request
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, finish, read_bag, wait_for
+from tests.conftest import PATIENCE_S, Ros, finish, read_bag, wait_for
 from tests.runner.test_options import refused
 
 COMPOSED = ("world", "channel_monitor", "policy")
@@ -82,6 +87,43 @@ def test_a_composed_mission_says_who_shares_a_process(ros: Ros, flight: list[obj
     shared = {node: ids[node] for node in COMPOSED}
     assert len(set.union(*shared.values())) == 1
     assert len(set.union(*ids.values())) == len(ids) - len(COMPOSED) + 1
+
+
+@pytest.mark.long
+def test_the_page_stays_while_the_visualizer_beside_it_ends(ros: Ros, flight: list[object]) -> None:
+    """A page that stays open in a terminal is served by a process in which the visualizer flew, too."""
+    ours, theirs = os.openpty()
+    options = (*flight, "--pace", "lockstep", "--missions", 3, "--view", 0, "--bag", "bag")
+    terminal = subprocess.Popen(
+        [sys.executable, "-m", "uav_dc_ros.run_all", *map(str, options)],
+        env=ros.environment,
+        cwd=ros.folder,
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+    )
+    os.close(theirs)
+    output = ""
+    while not (stays := re.search(r"the page stays at (http://\S+) until Ctrl-C", output)):
+        assert select.select([ours], [], [], PATIENCE_S)[0], output
+        output += os.read(ours, 1 << 16).decode()
+    running = list(ros.processes().values())
+    assert sum("nodes.container visualizer web_view " in command for command in running) == 1, running
+    assert not any("nodes.recorder" in command or "nodes.container world" in command for command in running)
+    with urllib.request.urlopen(stays[1], timeout=PATIENCE_S) as answer:
+        assert answer.status == 200
+    paths = [message for topic, message in read_bag(ros.folder / "bag") if topic == "/path"]
+    assert len(paths[-1].poses) == 31, "the last mission is drawn to its end"
+    terminal.send_signal(signal.SIGINT)
+    while select.select([ours], [], [], PATIENCE_S)[0]:
+        try:
+            output += os.read(ours, 1 << 16).decode()
+        except OSError:  # the last process has closed the terminal
+            break
+    os.close(ours)
+    assert terminal.wait(PATIENCE_S) == 0, output
+    assert ros.gone()
 
 
 def test_composing_what_cannot_be_composed(ros: Ros) -> None:

@@ -3,8 +3,8 @@
     python -m uav_dc_ros.nodes.container world channel_monitor policy --ros-args --params-file mission.yaml
 
 Nodes that wait for one another in every step do not run in parallel. In one process the middleware delivers a
-message in the thread that publishes it; between processes each message wakes two threads and a node. But a
-node that dies ends the others, too.
+message in the thread that publishes it; between processes each message wakes two threads and a node. Nodes of
+one process also receive one copy of a message from another. But a node that dies ends the others, too.
 """
 
 import importlib
@@ -14,7 +14,7 @@ from typing import NoReturn
 from uav_dc_ros import cli
 from uav_dc_ros.nodes.framework import node_main
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
-from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
+from uav_dc_ros.nodes.framework.node_table import CONTAINERS, NODES
 
 
 def parser() -> cli.Parser:
@@ -24,7 +24,8 @@ def parser() -> cli.Parser:
         description="Run several nodes in one process. Parameters follow --ros-args, as of any node; those "
         "of one node come from a file (--params-file).",
     )
-    options.add_argument("nodes", nargs="+", choices=COMPOSABLE, metavar="NODE", help=", ".join(COMPOSABLE))
+    choices = [name for names in CONTAINERS.values() for name in names]
+    options.add_argument("nodes", nargs="+", choices=choices, metavar="NODE", help=", ".join(choices))
     return options
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes.framework import process_control
+from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.framework.process_control import FINALIZED, REPORTS, SUPERVISED, NodeReport
 from uav_dc_ros.nodes.ros import environment
 
@@ -114,7 +115,7 @@ class NodeProcess:
     ) -> None:
         names = list(parameters)
         is_single = len(names) == 1
-        self.name = names[0] if is_single else "container"
+        self.name = names[0] if is_single else NODES[names[0]].container
         self.description = f"node {self.name}" if is_single else f"the container of {', '.join(names)}"
         file = folder / f"{self.name}.yaml"
         of_nodes = {f"/**/{name}": {"ros__parameters": values} for name, values in parameters.items()}
@@ -131,7 +132,8 @@ class NodeProcess:
             variables[environment.LINES] = environment.LINE_OF_ONE_OF_MANY
         self.process = subprocess.Popen(
             [
-                *(sys.executable, "-m", f"uav_dc_ros.nodes.{self.name}", *([] if is_single else names)),
+                *(sys.executable, "-m", f"uav_dc_ros.nodes.{self.name if is_single else 'container'}"),
+                *([] if is_single else names),
                 *("--ros-args", "--params-file", str(file)),
                 *("-r", f"__ns:={namespace}", "-r", "/clock:=clock"),
             ],

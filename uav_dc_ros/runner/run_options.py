@@ -13,7 +13,7 @@ from uav_dc_ros.core import pace
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.errors import BagError, ParameterError, UavDcError
-from uav_dc_ros.nodes.framework.node_table import COMPOSABLE, NODES
+from uav_dc_ros.nodes.framework.node_table import CONTAINERS, NODES, STEPS
 from uav_dc_ros.planners import PLANNERS
 from uav_dc_ros.run_config import RunConfig
 from uav_dc_ros.topics import SIMULATED, VEHICLES
@@ -60,15 +60,15 @@ def nodes(config: RunConfig) -> list[str]:
     return [name for name in known if name in selected]
 
 
-def composed(config: RunConfig, nodes: list[str]) -> list[str]:
-    """Names of the nodes that share a process, by default in lockstep; may raise ParameterError."""
+def composed(config: RunConfig, nodes: list[str]) -> list[list[str]]:
+    """Names of the nodes that share each process, by default in lockstep; may raise ParameterError."""
     if not (config.factor is None if config.compose is None else config.compose):
         return []
-    found = [name for name in nodes if name in COMPOSABLE]
-    if config.compose and len(found) < 2:
-        expected = ", ".join(COMPOSABLE)
+    found = {key: [name for name in nodes if name in names] for key, names in CONTAINERS.items()}
+    if config.compose and len(found[STEPS]) < 2:
+        expected = ", ".join(CONTAINERS[STEPS])
         raise ParameterError(f"--compose: expected two of {expected} among --nodes {','.join(nodes)}")
-    return found
+    return [names for names in found.values() if len(names) > 1]
 
 
 def settings(config: RunConfig, nodes: list[str]) -> dict[str, dict[str, object]]:

@@ -9,7 +9,7 @@ from typing import Self
 from uav_dc_ros.errors import NodeError
 from uav_dc_ros.nodes.framework.node_main import EXIT_FAILED, EXIT_NOT_STARTED
 from uav_dc_ros.nodes.framework.node_table import NODES
-from uav_dc_ros.nodes.framework.process_control import ACTIVATE, CONFIGURE
+from uav_dc_ros.nodes.framework.process_control import ACTIVATE, CONFIGURE, FINALIZED, SHUT_DOWN
 from uav_dc_ros.runner.node_process import NodeProcess
 
 RESTART_WINDOW_S = 60.0  # the limit on restarts counts exits within this time
@@ -59,15 +59,16 @@ class SupervisedNode:
 class Supervisor:
     """The nodes of a mission on this host, with ROS parameters by name; a context manager that stops them.
 
-    `composed` nodes share a process. After its end each gets its own, which isolates a faulty node. `folder`
-    is for parameter files. Threads call `on_line` with the name of a process and a line of its output.
+    The nodes of each group in `composed` share a process. After its end each gets its own, which isolates a
+    faulty node. `folder` is for parameter files. Threads call `on_line` with the name of a process and a line
+    of its output.
     """
 
     def __init__(
         self,
         namespace: str,
         parameters: Mapping[str, Mapping[str, object]],
-        composed: Collection[str],
+        composed: Sequence[Collection[str]],
         folder: Path,
         on_line: Callable[[str, str], None],
         on_note: Callable[[str], None],
@@ -80,10 +81,13 @@ class Supervisor:
         self._checked_s = time.monotonic()
 
     def __enter__(self) -> Self:
-        composed = [node for node in self.nodes if node.row.name in self._composed]
-        for nodes in (composed, *([node] for node in self.nodes if node not in composed)):
-            if nodes:
-                self._start(nodes)
+        alone = list(self.nodes)
+        for names in self._composed:
+            shared = [node for node in alone if node.row.name in names]
+            alone = [node for node in alone if node not in shared]
+            self._start(shared)
+        for node in alone:
+            self._start([node])
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -190,12 +194,31 @@ class Supervisor:
         self.nodes.remove(node)
 
     def release(self, name: str) -> NodeProcess | None:
-        """Supervise a node no more: the caller stops its process. None: it does not run."""
-        for node in self.nodes:
-            if node.row.name == name:
-                self.nodes.remove(node)
-                return node.process
-        return None
+        """Supervise a node no more: the caller stops its process. None: it does not run.
+
+        Other nodes of its process are shut down.
+        """
+        released = next((node for node in self.nodes if node.row.name == name), None)
+        if released is None:
+            return None
+        self.nodes.remove(released)
+        process = released.process
+        for node in [node for node in self.nodes if process is not None and node.process is process]:
+            self._shut_down(node)
+            self.nodes.remove(node)
+        return process
+
+    def _shut_down(self, node: SupervisedNode) -> None:
+        """Shut down one node of a process."""
+        process, deadline_s = node.process, time.monotonic() + node.row.stop_timeout_s
+        assert process is not None
+        process.command(SHUT_DOWN, node.row.name)
+        while not process.has_ended and time.monotonic() < deadline_s:
+            process.receive_reports(0.0)
+            report = process.reports.get(node.row.name)
+            if report is not None and report.state == FINALIZED:
+                return
+            time.sleep(STOP_POLL_S)
 
     def stop(self, meanwhile: Callable[[], None] = lambda: None) -> dict[str, int]:
         """Stop all nodes, higher ranks first; returns exit statuses by process name.

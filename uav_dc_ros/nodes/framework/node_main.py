@@ -25,7 +25,15 @@ from uav_dc_ros.nodes.framework import process_control
 from uav_dc_ros.nodes.framework.mission_node import MissionNode
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.framework.parameters import COMMON, Parameter
-from uav_dc_ros.nodes.framework.process_control import CONFIGURE, REASON_MAX, REPORTS, STATES, SUPERVISED
+from uav_dc_ros.nodes.framework.process_control import (
+    ACTIVATE,
+    CONFIGURE,
+    REASON_MAX,
+    REPORTS,
+    SHUT_DOWN,
+    STATES,
+    SUPERVISED,
+)
 from uav_dc_ros.nodes.ros import environment, fastdds, rclpy_private
 from uav_dc_ros.nodes.ros.executor import DirectExecutor, shut_down
 
@@ -86,10 +94,7 @@ class StopMonitor:
 
 def make_transition(node: MissionNode, transition: str) -> bool:
     """Make a transition of a node; returns whether it succeeded."""
-    if transition == CONFIGURE:
-        node.trigger_configure()
-    else:
-        node.trigger_activate()
+    getattr(node, f"trigger_{transition}")()
     return node.state == STATES[transition]
 
 
@@ -100,8 +105,9 @@ class Reporter:
     stops them.
     """
 
-    def __init__(self, nodes: Sequence[MissionNode]) -> None:
+    def __init__(self, nodes: Sequence[MissionNode], executor: DirectExecutor) -> None:
         self._nodes = {node.row.name: node for node in nodes}
+        self._executor = executor
         self._refused: dict[str, str] = {}
         self._pipe: int | None = int(os.environ[REPORTS]) if REPORTS in os.environ else None
         if self._pipe is not None:
@@ -124,9 +130,18 @@ class Reporter:
         transition, name = line.split()
         node = self._nodes[name]
         self._refused.pop(name, None)
+        if transition == SHUT_DOWN:
+            drain([node], self._executor)
         if not make_transition(node, transition):
             self._refused[name] = str(node.failure or "it failed; see its log")[:REASON_MAX]
         self.report()
+
+
+def drain(nodes: Sequence[MissionNode], executor: DirectExecutor) -> None:
+    """Handle the last messages of nodes that are about to be shut down, until there is a pause."""
+    if quiet_s := max(node.drain_quiet_s if node.state == "active" else 0.0 for node in nodes):
+        end_s = time.monotonic() + DRAIN_S
+        executor.spin(lambda: time.monotonic() > end_s, quiet_s)
 
 
 def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -211,13 +226,13 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str], nodes
             executor.add_node(node)
             node.spin_once = executor.spin_once
         stop = StopMonitor(executor.wake)
-        reporter = Reporter(nodes)
+        reporter = Reporter(nodes, executor)
         reporter.report()
         for node in nodes:
             node.prepare()
         nodes[0].create_timer(process_control.PERIOD_S, reporter.report, clock=nodes[0].steady)
         to_start = [node for node in nodes if node.values["autostart"]]
-        transitions = ((node, name) for name in STATES for node in to_start)
+        transitions = ((node, name) for name in (CONFIGURE, ACTIVATE) for node in to_start)
         if all(make_transition(node, name) for node, name in transitions):
             gc.freeze()  # these objects stay: the collector need not scan them again
             if pause_s:
@@ -239,11 +254,10 @@ def _spin(
             executor.spin(lambda: stop.is_pending)
             while stop.commands and not stop.requested:
                 reporter.execute(stop.commands.popleft())
-        if quiet_s := max(node.drain_quiet_s if node.state == "active" else 0.0 for node in nodes):
-            began_s = time.monotonic()
-            executor.spin(lambda: time.monotonic() > began_s + DRAIN_S, quiet_s)
-            while any(node.is_awaiting() for node in nodes) and time.monotonic() < began_s + AWAIT_S:
-                executor.spin_once(AWAIT_POLL_S)
+        end_s = time.monotonic() + AWAIT_S
+        drain(nodes, executor)
+        while any(node.is_awaiting() for node in nodes) and time.monotonic() < end_s:
+            executor.spin_once(AWAIT_POLL_S)
     finally:
         for node in reversed(nodes):
             if node.state != "finalized":

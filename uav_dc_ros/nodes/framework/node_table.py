@@ -8,6 +8,8 @@ from uav_dc_ros.topics import TOPICS
 
 # Numbers of the mission as standard messages.
 NUMERIC = ("sum_rate", "users_collected", "remaining_steps", "odom")
+# Processes of several nodes: those that wait for one another in every step, and those that no node waits for.
+STEPS, VIEWS = "container", "view_container"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +24,7 @@ class NodeRow:
     services: tuple[str, ...] = ()
     keeps_all: bool = False  # subscriptions keep every message until it is handled, not only the newest 100
     process: bool = True  # it is a process of its own, `python -m uav_dc_ros.nodes.NAME`
-    composable: bool = False  # it may share a process with the others that wait for it in every step
+    container: str = ""  # the process of several nodes that it may join, see `CONTAINERS`
     # Nodes of a lower rank start first and stop last: the recorder receives the first and the last message,
     # and the world starts the mission.
     rank: int = 1
@@ -57,7 +59,7 @@ NODES: dict[str, NodeRow] = {
                 p.WAIT_FOR_START,
             ),
             services=VEHICLE_SERVICES,
-            composable=True,
+            container=STEPS,
             rank=2,
         ),
         NodeRow(
@@ -74,7 +76,7 @@ NODES: dict[str, NodeRow] = {
             publishes=("rates", "ready", "diagnostics"),
             subscribes=("pose", "users"),
             parameters=(p.SCENARIO, p.JOURNAL),
-            composable=True,
+            container=STEPS,
         ),
         NodeRow(
             name="policy",
@@ -87,7 +89,7 @@ NODES: dict[str, NodeRow] = {
                 p.SEARCH,
                 p.SEARCH_TIME_LIMIT_S,
             ),
-            composable=True,
+            container=STEPS,
         ),
         NodeRow(
             name="recorder",
@@ -131,6 +133,7 @@ NODES: dict[str, NodeRow] = {
             subscribes=("pose", "target", "users", "rates", "mission"),
             parameters=(p.SCENARIO, p.RATE_HZ, p.NUMERIC_RATE_HZ, p.TF),
             keeps_all=True,
+            container=VIEWS,
             needed=False,
         ),
         NodeRow(
@@ -146,6 +149,7 @@ NODES: dict[str, NodeRow] = {
             publishes=("diagnostics",),
             subscribes=("mission", "users", "rates"),
             parameters=(p.SCENARIO, p.WEB_PORT, p.ADDRESS, p.TOKEN),
+            container=VIEWS,
             needed=False,
             on_request=True,
         ),
@@ -160,7 +164,11 @@ NODES: dict[str, NodeRow] = {
     )
 }
 
-COMPOSABLE = tuple(row.name for row in NODES.values() if row.composable)
+# The nodes that may share a process, by its name.
+CONTAINERS = {
+    container: tuple(row.name for row in NODES.values() if row.container == container)
+    for container in (STEPS, VIEWS)
+}
 
 # A planner that knows where the users are.
 POLICY_WITH_POSITIONS = replace(NODES["policy"], subscribes=(*NODES["policy"].subscribes, "users"))

@@ -9,9 +9,9 @@ import msgspec
 SUPERVISED = "UAV_DC_ROS_SUPERVISED"  # set by run_all: how often this process has been restarted
 REPORTS = "UAV_DC_ROS_REPORTS"  # set by run_all: the file descriptor for the reports
 PERIOD_S = 0.25  # of the reports
-CONFIGURE, ACTIVATE = "configure", "activate"
-STATES = {CONFIGURE: "inactive", ACTIVATE: "active"}  # after each transition
+CONFIGURE, ACTIVATE, SHUT_DOWN = "configure", "activate", "shutdown"
 FINALIZED = "finalized"  # the state in which a node publishes no more
+STATES = {CONFIGURE: "inactive", ACTIVATE: "active", SHUT_DOWN: FINALIZED}  # after each transition
 REASON_MAX = 1000  # characters; a report is shorter than what a pipe writes atomically
 
 
