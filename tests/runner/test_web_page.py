@@ -9,7 +9,7 @@ import pytest
 from uav_dc_ros import RunConfig
 from uav_dc_ros.errors import ParameterError
 from uav_dc_ros.runner import web_page
-from uav_dc_ros.runner.run_options import nodes
+from uav_dc_ros.runner.run_options import composed, nodes
 from uav_dc_ros.runner.web_page import WebPage
 
 
@@ -52,6 +52,17 @@ def test_a_page_is_a_node_of_this_host() -> None:
     assert nodes(RunConfig(view=0, nodes=("policy",))) == ["policy", "web_view"]
     with pytest.raises(ParameterError, match="view: 65536; expected a whole number from 0 to 65535"):
         RunConfig(view=65536)
+
+
+def test_it_shares_a_process_with_the_visualizer_in_lockstep() -> None:
+    def shared(**how: Any) -> list[list[str]]:
+        config = RunConfig(view=0, **how)
+        return composed(config, nodes(config))
+
+    steps = ["world", "channel_monitor", "policy"]
+    assert shared(pace="lockstep") == [steps, ["visualizer", "web_view"]]
+    assert shared(pace=90.0) == shared(pace="lockstep", compose=False) == []
+    assert shared(pace="lockstep", nodes=(*steps, "recorder")) == [steps]
 
 
 @pytest.mark.parametrize(
