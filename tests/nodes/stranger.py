@@ -30,7 +30,7 @@ from uav_dc_ros.nodes.ros import fastdds, qos
 from uav_dc_ros.topics import TOPICS as ROWS
 
 BURST = 500
-PATIENCE_S = 60.0
+PATIENCE_S = 200.0
 SETTLED_S = 1.5  # longer than from one word of diagnostics to the next
 
 

@@ -42,7 +42,7 @@ class Running:
         assert self.process.stdout is not None
         self.lines.extend(self.process.stdout)
 
-    def end(self, number: int | None = None, timeout_s: float = 60.0) -> tuple[int, str]:
+    def end(self, number: int | None = None, timeout_s: float = 200.0) -> tuple[int, str]:
         """Ask it to end, or wait until it does; its exit status and what it printed."""
         if number is not None:
             self.process.send_signal(number)

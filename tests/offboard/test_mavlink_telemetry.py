@@ -128,6 +128,20 @@ def test_a_long_text_comes_in_parts() -> None:
     assert radio.telemetry.snapshot(1.5).refusal is None
 
 
+@pytest.mark.parametrize(
+    ("command", "shows"), [("arming", "heartbeat"), ("taking off", "extended_sys_state")]
+)
+def test_a_repeated_command_that_was_executed_is_not_refused(command: str, shows: str) -> None:
+    radio = met()
+    radio.telemetry.rejections.reject(command, "failed", 1.0)
+    assert radio.telemetry.snapshot(1.0).refusal == f"{command} refused: failed"
+    radio.send(shows, *{"heartbeat": (2, ARDUPILOT, 0x80, 4, 4), "extended_sys_state": (0, 2)}[shows])
+    radio.telemetry.rejections.reject(command, "failed", 1.2)
+    assert radio.telemetry.snapshot(1.2).refusal is None
+    radio.telemetry.rejections.reject("the change of mode", "denied", 1.3)
+    assert radio.telemetry.snapshot(1.3).refusal == "the change of mode refused: denied"
+
+
 # Which messages are news.
 
 

@@ -1,6 +1,7 @@
 """Commands that a vehicle rejected, and its status texts, which hold the reasons."""
 
 from collections import deque
+from collections.abc import Collection
 
 WARNING = 4  # MAV_SEVERITY; a lower number is more severe
 REASON_S = 2.0  # a text within this time before or after a rejection is its reason
@@ -35,9 +36,16 @@ class Rejections:
         """Warnings of the last `REASON_S`, joined; empty: none."""
         return "; ".join(self.texts(now_s - REASON_S, now_s))
 
-    def latest(self) -> str | None:
-        """The newest rejection with its reason, such as `arming refused: PreArm: ...`."""
-        if not self._rejected:
+    def latest(self, executed: Collection[str] = ()) -> str | None:
+        """The newest rejection with its reason, such as `arming refused: PreArm: ...`.
+
+        Commands that were `executed` do not count: a repeated one is rejected, and its acknowledgement may be
+        late.
+        """
+        rejected = [
+            (command, *values) for command, values in self._rejected.items() if command not in executed
+        ]
+        if not rejected:
             return None
-        command, (at_s, result) = max(self._rejected.items(), key=lambda item: item[1][0])
+        command, at_s, result = max(rejected, key=lambda one: one[1])
         return f"{command} refused: {'; '.join(self.texts(at_s - REASON_S, at_s + REASON_S)) or result}"

@@ -40,7 +40,7 @@ class FakeProcess:
         self.process.stdin.write(f"{line}\n")
         self.process.stdin.flush()
 
-    def wait_for(self, event: str, seconds: float = 90.0) -> dict[str, Any]:
+    def wait_for(self, event: str, seconds: float = 200.0) -> dict[str, Any]:
         """The next event of a name that was not waited for yet."""
         end = time.monotonic() + seconds
         while True:

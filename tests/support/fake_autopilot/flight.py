@@ -146,7 +146,7 @@ class Flight(FlightRecord):
         self.vehicle.set_setpoint(bridge.setpoint)
 
     def until(
-        self, done: Callable[[], bool], seconds: float = 60.0, beat: Callable[[], None] = lambda: None
+        self, done: Callable[[], bool], seconds: float = 200.0, beat: Callable[[], None] = lambda: None
     ) -> None:
         """Fly until something is so."""
         end = time.monotonic() + seconds

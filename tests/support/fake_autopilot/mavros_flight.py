@@ -107,7 +107,7 @@ class Flight(FlightRecord):
             bridge.move(bridge.step, way_home(bridge))
         self.vehicle.set_setpoint(bridge.setpoint)
 
-    def until(self, done: Callable[[], bool], seconds: float = 90.0) -> None:
+    def until(self, done: Callable[[], bool], seconds: float = 200.0) -> None:
         """Fly until something is so."""
         end = time.monotonic() + seconds
         while not done():

@@ -187,7 +187,7 @@ class MavlinkTelemetry:
             vehicle_s=self.vehicle_s,
             missing=self._missing(now_s),
             fence_refusal=self._fence_refusal(),
-            refusal=self.rejections.latest(),
+            refusal=self.rejections.latest(self._executed()),
             status_text=self.rejections.recent_texts(now_s),
             home=_enu_from(_geodetic(home), self.datum) if home is not None and self.datum else None,
             target=self.frame.from_autopilot(target) if self.frame and target else None,
@@ -244,6 +244,13 @@ class MavlinkTelemetry:
             wait = "the fence is uploaded once the vehicle is disarmed on the ground"
             return str(self.fence.state) if self.is_at_rest else wait
         return None
+
+    def _executed(self) -> list[str]:
+        """Commands that the vehicle's state shows to be executed."""
+        return [
+            *(["arming"] if self._armed else []),
+            *(["taking off"] if self.landed_state == IN_AIR else []),
+        ]
 
     def _fence_refusal(self) -> str | None:
         if self.fence is None or (self.fence.is_over and self.fence.refusal is None):
