@@ -130,7 +130,7 @@ class Reporter:
         transition, name = line.split()
         node = self._nodes[name]
         self._refused.pop(name, None)
-        if transition == SHUT_DOWN:
+        if transition == SHUT_DOWN and node.state == "active":
             drain([node], self._executor)
         if not make_transition(node, transition):
             self._refused[name] = str(node.failure or "it failed; see its log")[:REASON_MAX]
@@ -138,8 +138,8 @@ class Reporter:
 
 
 def drain(nodes: Sequence[MissionNode], executor: DirectExecutor) -> None:
-    """Handle the last messages of nodes that are about to be shut down, until there is a pause."""
-    if quiet_s := max(node.drain_quiet_s if node.state == "active" else 0.0 for node in nodes):
+    """Handle the last messages of active nodes that are about to be shut down, until there is a pause."""
+    if quiet_s := max((node.drain_quiet_s for node in nodes), default=0.0):
         end_s = time.monotonic() + DRAIN_S
         executor.spin(lambda: time.monotonic() > end_s, quiet_s)
 
@@ -255,8 +255,9 @@ def _spin(
             while stop.commands and not stop.requested:
                 reporter.execute(stop.commands.popleft())
         end_s = time.monotonic() + AWAIT_S
-        drain(nodes, executor)
-        while any(node.is_awaiting() for node in nodes) and time.monotonic() < end_s:
+        active = [node for node in nodes if node.state == "active"]
+        drain(active, executor)
+        while any(node.is_awaiting() for node in active) and time.monotonic() < end_s:
             executor.spin_once(AWAIT_POLL_S)
     finally:
         for node in reversed(nodes):
