@@ -318,6 +318,7 @@ def with_reason(message: Any, last: messages.Mission, reason: str) -> Any:
     return message._replace(data=cdr.encode_string(messages.encode(other)))
 
 
+@pytest.mark.long
 def test_a_comparison_is_drawn_and_fits_a_phone_too(browser_3d, comparison_page):
     groups = report_bags.unpacked(comparison_page)["data"]["groups"]
     opened = Opened(browser_3d, comparison_page, SMALL)
