@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from uav_dc_ros.errors import NodeError
+from uav_dc_ros.nodes.framework.node_main import EXIT_FAILED
 from uav_dc_ros.nodes.framework.process_control import NodeReport, command
 from uav_dc_ros.runner.supervisor import SupervisedNode, Supervisor
 
@@ -121,3 +123,36 @@ def test_a_rank_is_terminated_when_the_one_above_is_finalized(tmp_path: Path) ->
     assert log[6] == "meanwhile"
     assert sorted(log[7:]) == ["container ended", "recorder ended", "visualizer ended"]
     assert supervisor.stop() == {}
+
+
+class Failed:
+    """The ended process of several nodes."""
+
+    description, has_ended = "the container of visualizer, web_view", True
+
+    def __init__(self) -> None:
+        self.process = SimpleNamespace(returncode=EXIT_FAILED)
+
+    def exit_description(self) -> str:
+        """How it ended."""
+        return "ended with 3: a reason"
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_views_of_a_process_that_failed_get_their_own(tmp_path: Path) -> None:
+    notes: list[str] = []
+    names = ("visualizer", "web_view")
+    supervisor = Supervisor(
+        "/", {name: {} for name in names}, [names], tmp_path, lambda *_: None, notes.append
+    )
+    process = Failed()
+    for node in supervisor.nodes:
+        node.process = process  # type: ignore[assignment]
+    supervisor._handle_exit(process)  # type: ignore[arg-type]
+    assert [(node.row.name, node.process, node.restarts) for node in supervisor.nodes] == [
+        ("visualizer", None, 1),
+        ("web_view", None, 1),
+    ]
+    assert notes[0].endswith("ended with 3: a reason; its nodes go on in processes of their own")

@@ -161,7 +161,9 @@ class Supervisor:
         nodes = [node for node in self.nodes if node.process is process]
         for node in nodes:
             node.process, node.state = None, None
-        if process.process.returncode in (EXIT_NOT_STARTED, EXIT_FAILED):  # it would fail again
+        fails_again = process.process.returncode in (EXIT_NOT_STARTED, EXIT_FAILED)
+        # Which of several nodes failed shows when each has its own process; a mission that needs them ends.
+        if fails_again and (len(nodes) == 1 or any(node.row.needed for node in nodes)):
             for node in nodes:
                 self._drop(node, reason)
             return
