@@ -18,7 +18,7 @@ from uav_dc_ros.bags.salvage.recover import recover
 from uav_dc_ros.bags.write import BagWriter
 
 INTEROP = Path(__file__).with_name("interop")
-INSTALL_S = 200
+INSTALL_S = 90
 
 
 @pytest.fixture(scope="module")

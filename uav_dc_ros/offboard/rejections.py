@@ -42,10 +42,8 @@ class Rejections:
         Commands that were `executed` do not count: a repeated one is rejected, and its acknowledgement may be
         late.
         """
-        rejected = [
-            (command, *values) for command, values in self._rejected.items() if command not in executed
-        ]
+        rejected = {command: kept for command, kept in self._rejected.items() if command not in executed}
         if not rejected:
             return None
-        command, at_s, result = max(rejected, key=lambda one: one[1])
+        command, (at_s, result) = max(rejected.items(), key=lambda item: item[1][0])
         return f"{command} refused: {'; '.join(self.texts(at_s - REASON_S, at_s + REASON_S)) or result}"

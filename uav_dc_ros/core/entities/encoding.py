@@ -266,7 +266,7 @@ def encode(
 
 def _vector(like: Array, numbers: list[Array | float], by_action: list[Array], scales: _Scales) -> Array:
     """Columns of the shape of `like` `[...]`, then others by action `[..., 7]`, scaled, `[..., D]`."""
-    # Columns are set one by one: to squash and to stack them takes a node a third longer.
+    # Columns are set one by one: to squash each, and to stack them, takes a node longer.
     vector = like[..., None] * constant(scales.squashed, like)
     for place, column in enumerate(numbers):
         vector[..., place] = column

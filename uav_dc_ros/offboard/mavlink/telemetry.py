@@ -247,10 +247,8 @@ class MavlinkTelemetry:
 
     def _executed(self) -> list[str]:
         """Commands that the vehicle's state shows to be executed."""
-        return [
-            *(["arming"] if self._armed else []),
-            *(["taking off"] if self.landed_state == IN_AIR else []),
-        ]
+        shown = {"arming": self._armed, "taking off": self.landed_state == IN_AIR}
+        return [command for command, is_executed in shown.items() if is_executed]
 
     def _fence_refusal(self) -> str | None:
         if self.fence is None or (self.fence.is_over and self.fence.refusal is None):
