@@ -2,6 +2,7 @@
 
 import fcntl
 import functools
+import gc
 import json
 import os
 import shutil
@@ -30,10 +31,15 @@ ROOT = Path(__file__).parents[1]
 # How long a test waits for what must come, wall time. Only what never comes takes this long: a machine with
 # much else to do may take twenty times as long as a calm one.
 PATIENCE_S = 200.0
+# Options of run_all: fewer processes to start, where nobody looks.
+WITHOUT_VISUALIZER = ("--nodes", "world,channel_monitor,policy,recorder")
 
 # The tests start some hundred processes. Without bytecode each of them compiles this project anew.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# Threads of one pool that wait for one another occupy the cores, which several processes share.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 # What takes long on a busy machine is no failure.
 hypothesis.settings.register_profile("patient", deadline=None)
@@ -41,6 +47,15 @@ hypothesis.settings.load_profile("patient")
 
 # A shell without job control, such as that of a script, ignores Ctrl-C for what it starts in the background.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# Collecting makes hundreds of thousands of objects that stay: the garbage collector skips them, see below.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.enable()
+    gc.freeze()
 
 
 def pytest_configure() -> None:

@@ -77,6 +77,13 @@ def test_a_simulated_run_brings_no_way_to_an_autopilot() -> None:
     assert loaded(code, *vehicles) == []
 
 
+def test_a_numpy_scalar_brings_no_wrapper_of_numpy() -> None:
+    """It imports f2py: a tenth of a node's start."""
+    code = "import numpy as np\nfrom uav_dc_ros.core.arrays import array_namespace\n"
+    code += "assert array_namespace(np.float64(2.0)).exp(np.float64(2.0)) == np.exp(2.0)"
+    assert loaded(code, "numpy.f2py", "array_api_compat.numpy") == []
+
+
 def test_nodes_without_ros_name_the_cure() -> None:
     code = (
         "import sys; sys.modules['rclpy'] = None\n"

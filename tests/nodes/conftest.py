@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import PATIENCE_S, Ros, ros_in
+from tests.conftest import PATIENCE_S, WITHOUT_VISUALIZER, Ros, ros_in
 from tests.support.worlds import config, saved
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import network
@@ -147,8 +147,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Alone:
     def fly(ros: Ros) -> None:
         scenario, policy = small_in(ros.folder)
         given = ("--scenario", scenario, "--policy", policy, "--pace", "lockstep", "--missions", 4)
-        nodes = "world,channel_monitor,policy,recorder"
-        status, output = ros.run_all(*given, "--nodes", nodes, "--bag", "bag")
+        status, output = ros.run_all(*given, *WITHOUT_VISUALIZER, "--bag", "bag")
         assert status == 0, output
 
     folder = flown_once(tmp_path_factory, "alone", fly)

@@ -190,6 +190,7 @@ def check(ros: Ros, scenario: Path, policy: Path, per_topic: int, oversized: int
     return disturbed | {"missions": n_missions, "again": again}
 
 
+@pytest.mark.long  # a few of each kind are in test_garbage
 def test_dozens_on_each_topic(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
     check(ros, small_scenario, small_policy, 40, 0)
 

@@ -4,8 +4,6 @@ import json
 import re
 from pathlib import Path
 
-import pytest
-
 from tests.conftest import Ros, finish, wait_for
 from uav_dc_ros.nodes.framework.node_table import NODES
 
@@ -46,7 +44,6 @@ GARBAGE = {
 }
 
 
-@pytest.mark.long
 def test_a_broken_message_changes_nothing(
     ros: Ros, small_scenario: Path, small_policy: Path, tmp_path: Path
 ) -> None:

@@ -122,8 +122,10 @@ def test_guided_comes_before_the_estimate_and_arming_only_after(copter: Client) 
 
 def test_speeds_of_the_copter(copter: Client) -> None:
     copter.take_off(50.0)
-    up_s = copter.fake.all("taken off")[0]["t_s"] - copter.fake.all("armed")[0]["t_s"]
-    assert up_s == pytest.approx(2 + 50 / 2.5, abs=1.5)
+    commands = copter.fake.all("command")
+    (commanded,) = [event for event in commands if event["command"] == mav.MAV_CMD_NAV_TAKEOFF]
+    up_s = copter.fake.all("taken off")[0]["t_s"] - commanded["t_s"]
+    assert up_s == pytest.approx(2 + 50 / 2.5, abs=1.0)
     copter.send(100.0, 0.0, -50.0)
     begun_s, peak_mps = copter.t_s, 0.0
     while True:
@@ -319,12 +321,13 @@ def test_a_ground_station_is_missed_in_the_vehicle_s_own_time(copter: Client) ->
     copter.wait_s(8.0)
     assert copter.fake.report()["mode"] == "GUIDED", "none was there yet"
     heartbeat = (18, 8, 0, 0, 4)
+    before_s = copter.fake.report()["t_s"]
     mav.MAVLink(copter.link, 255, 191).heartbeat_send(*heartbeat)
-    begun_s = copter.fake.report()["t_s"]
+    after_s = copter.fake.report()["t_s"]
     event = copter.fake.wait_for("mode")
     while event["mode"] != "RTL":
         event = copter.fake.wait_for("mode")
-    assert event["t_s"] - begun_s == pytest.approx(5.0, abs=1.0)
+    assert before_s + 4.9 < event["t_s"] < after_s + 7.0
 
 
 def test_a_second_bridge_and_a_second_vehicle_on_the_link(copter: Client) -> None:

@@ -24,6 +24,7 @@ def _may() -> bool:
     return answers[0]
 
 
+@pytest.mark.long  # it occupies all CPUs for as long as it measures
 def test_setpoints_keep_their_pace_on_a_busy_computer() -> None:
     found = []
     for _ in range(3):  # one hiccup of a virtual machine is two of the eighty gaps of a try

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.conftest import Ros, finish, wait_for
+from tests.conftest import WITHOUT_VISUALIZER, Ros, finish, wait_for
 from tests.core.test_gain_map import X_M, Y_M, free_space_db
 from tests.core.test_gain_map import toml as mapped_toml
 from tests.recordings.made import about, bag_message, changing, copy, flight, nudged, pose, write
@@ -47,7 +47,7 @@ def flown(module_ros: Ros):
     bag = module_ros.folder / "bag"
     world = ("--scenario", "five_clusters_hover", "--policy", POLICY)
     given = ("--missions", 2, "--seed", 7, "--pace", "lockstep", "--bag", bag)
-    status, output = module_ros.run_all(*world, *given)
+    status, output = module_ros.run_all(*world, *given, *WITHOUT_VISUALIZER)
     assert status == 0, output
     return bag
 

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from tests.conftest import Ros, each_once, read_bag
+from tests.conftest import WITHOUT_VISUALIZER, Ros, each_once, read_bag
 from tests.nodes.conftest import SMALL
 from tests.support.worlds import saved
 from uav_dc_ros import bag as command
@@ -52,10 +52,10 @@ def test_nodes_and_verify_follow_the_environment_to_the_last_bit(
     path.write_text(text + OBSTACLES)
     scenario = scenarios.load(path)
     policy = saved(tmp_path / "untrained", scenario, name="untrained")
-    nodes = "world,channel_monitor,policy,recorder"
     status, output = ros.run_all(
         *("--scenario", path, "--policy", policy, "--pace", "lockstep", "--seed", 5),
-        *("--nodes", nodes, "--bag", "bag"),
+        *WITHOUT_VISUALIZER,
+        *("--bag", "bag"),
     )
     assert status == 0, output
     bag = read_bag(ros.folder / "bag")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import PATIENCE_S, Ros, each_once, finish, read_bag, wait_for
+from tests.conftest import PATIENCE_S, WITHOUT_VISUALIZER, Ros, each_once, finish, read_bag, wait_for
 from tests.runner.test_container import modules
 
 # Each fixture `ros` asserts at its end that no process of the test is left.
@@ -27,7 +27,7 @@ COMPOSED = ("--compose",)  # where it is not about one of the nodes: fewer proce
 def arguments(small_scenario: Path, small_policy: Path, tmp_path: Path) -> list[object]:
     """A mission of twelve seconds, which no test waits for."""
     return [
-        *("--nodes", "world,channel_monitor,policy,recorder"),
+        *WITHOUT_VISUALIZER,
         *("--scenario", small_scenario, "--policy", small_policy, "--pace", 25),
         *("--bag", tmp_path / "bag", "--summary", tmp_path / "summary.json"),
     ]

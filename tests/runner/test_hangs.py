@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import PATIENCE_S, Ros, finish, read_bag, until, wait_for
+from tests.conftest import PATIENCE_S, WITHOUT_VISUALIZER, Ros, finish, read_bag, until, wait_for
 from tests.support.fake_autopilot.flight import fake
 from uav_dc_ros.runner.node_process import Silence, waits_for_disk
 
@@ -98,8 +98,7 @@ def options(small_scenario: Path, small_policy: Path) -> list[object]:
 
 
 def test_a_node_that_hangs_is_started_again(ros: Ros, options: list[object]) -> None:
-    nodes = ("--nodes", "world,channel_monitor,policy,recorder")
-    output = flown_with_hangs(ros, options, ("policy",), *AT_A_PACE, *nodes)
+    output = flown_with_hangs(ros, options, ("policy",), *AT_A_PACE, *WITHOUT_VISUALIZER)
     assert "steps were hovered: no move came in time" in output
     missions = {m["step"] for name, m in read_bag(ros.folder / "bag") if name == "/mission"}
     assert missions == set(range(31))

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.conftest import Ros, but_run, finish, read_bag, wait_for
+from tests.conftest import WITHOUT_VISUALIZER, Ros, but_run, finish, read_bag, wait_for
 from tests.nodes.conftest import SMALL
 from tests.support.worlds import saved
 from uav_dc_ros import cdr, scenarios
@@ -26,7 +26,7 @@ def options(module_ros: Ros) -> list[object]:
     scenario = module_ros.folder / "small.toml"
     scenario.write_text(SMALL)
     policy = saved(module_ros.folder / "untrained", scenarios.load(scenario), name="untrained")
-    return ["--scenario", scenario, "--policy", policy]
+    return ["--scenario", scenario, "--policy", policy, *WITHOUT_VISUALIZER]
 
 
 @pytest.fixture(scope="module")

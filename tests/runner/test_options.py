@@ -8,11 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Ros
+from tests.conftest import WITHOUT_VISUALIZER, Ros
 from uav_dc_ros import cli
 from uav_dc_ros.runner import run_options
-
-NODES = "world,channel_monitor,policy,recorder"
 
 
 def refused(ros: Ros, *arguments: object) -> str:
@@ -170,13 +168,13 @@ def test_the_default_bag_is_dated(ros: Ros, small_scenario: Path, small_policy: 
     """A policy's folder may lie anywhere; a note reports a policy that was trained in another world."""
     folder = ros.folder / "a b 'c'" / "my policy"
     shutil.copytree(small_policy, folder)
-    given = ("--scenario", small_scenario, "--policy", folder, "--pace", "lockstep", "--nodes")
-    status, output = ros.run_all(*given, NODES)
+    given = ("--scenario", small_scenario, "--policy", folder, "--pace", "lockstep")
+    status, output = ros.run_all(*given, *WITHOUT_VISUALIZER)
     assert status == 0, output
     assert "timeout" in output
     assert "trained in another world" not in output
     small_scenario.write_text(small_scenario.read_text().replace("v_max_mps = 1.0", "v_max_mps = 2.0"))
-    without_recorder = (NODES.removesuffix(",recorder"), "--no-record")
+    without_recorder = ("--nodes", "world,channel_monitor,policy", "--no-record")
     status, output = ros.run_all(*given, *without_recorder)
     assert status == 0, output
     assert "note: policy untrained was trained in another world" in output

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import Ros, read_bag
+from tests.conftest import WITHOUT_VISUALIZER, Ros, read_bag
 from tests.nodes.test_bridge import NODES, beside
 from tests.recordings.report_bags import unpacked
 from tests.support.fake_autopilot.flight import fake
@@ -21,13 +21,13 @@ from uav_dc_ros.planners import PLANNERS
 SEED, WEIGHT = 5, 0.8
 
 
-@pytest.mark.parametrize("name", ["search", "plan", "generalist"])
+@pytest.mark.parametrize("name", ["search", "generalist", pytest.param("plan", marks=pytest.mark.long)])
 def test_what_flies_any_field_flies_in_nodes_as_in_a_rollout(
     ros: Ros, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     status, output = ros.run_all(
         *("--scenario", "random:2", "--policy", name, "--objective", WEIGHT, "--pace", "lockstep"),
-        *("--seed", SEED, "--nodes", "world,channel_monitor,policy,recorder", "--bag", "bag"),
+        *("--seed", SEED, *WITHOUT_VISUALIZER, "--bag", "bag"),
         *("--summary", "summary.json"),
     )
     assert status == 0, output

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.conftest import Ros, read_bag
+from tests.conftest import WITHOUT_VISUALIZER, Ros, read_bag
 from uav_dc_ros import bag as command
 from uav_dc_ros import scenarios
 from uav_dc_ros.agents import agent as agents
@@ -25,7 +25,7 @@ def verified(ros: Ros, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_a_search_flies_in_nodes_as_in_a_rollout(ros: Ros, capsys: pytest.CaptureFixture[str]) -> None:
-    nodes = ("--nodes", "world,channel_monitor,policy,recorder", "--pace", "lockstep")
+    nodes = (*WITHOUT_VISUALIZER, "--pace", "lockstep")
     status, output = ros.run_all(*GIVEN, *nodes)
     assert status == 0, output
     scenario, actions = scenarios.load(NAME), []

@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, each_once, finish, read_bag, wait_for
+from tests.conftest import WITHOUT_VISUALIZER, Ros, each_once, finish, read_bag, wait_for
 from tests.nodes.conftest import Alone
 from uav_dc_ros.topics import TOPICS
 
-NODES = "world,channel_monitor,policy,recorder"
 COMPARED = ("users", "rates", "mission", "move")
 SEEDS = (1, 2, 3)
 
@@ -51,7 +50,7 @@ def test_two_missions_in_two_namespaces_do_not_touch(ros: Ros, small: Small) -> 
     flights = [
         ros.start(
             "uav_dc_ros.run_all",
-            *(*small.options, "--nodes", NODES, "--seed", seed),
+            *(*small.options, *WITHOUT_VISUALIZER, "--seed", seed),
             *("--namespace", f"/fleet/uav{seed}", "--bag", ros.folder / f"side{seed}"),
         )
         for seed in (1, 2)

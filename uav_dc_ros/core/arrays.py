@@ -71,7 +71,7 @@ _NUMPY = _Numpy()
 def array_namespace(*arrays: Array) -> Any:
     """The array-API namespace of arrays of one library."""
     for array in arrays:  # a node calls this some twenty times a step: numpy's path is short
-        if type(array) is not np.ndarray:
+        if type(array) is not np.ndarray and not isinstance(array, np.generic):
             return array_api_compat.array_namespace(*arrays)
     return _NUMPY
 

@@ -6,13 +6,12 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Ros, each_once, finish, read_bag, wait_for
+from tests.conftest import WITHOUT_VISUALIZER, Ros, each_once, finish, read_bag, wait_for
 from tests.nodes.conftest import Observed
 from uav_dc_ros.nodes.view.markers import UserState
 
 STEPS = 30  # of the small world
 ADD = 0
-WITHOUT_VISUALIZER = ("--nodes", "world,channel_monitor,policy,recorder")
 
 
 class Bag:
