@@ -41,18 +41,18 @@ def plain_cut(obstacles, uav_m, user_m):
     return False
 
 
-def test_ten_thousand_links_are_cut_where_a_geometry_library_has_it_so():
+def test_thousands_of_links_are_cut_where_a_geometry_library_has_it_so():
     rng = np.random.default_rng(0)
     found = []
-    for _ in range(200):
+    for _ in range(60):
         obstacles = town(rng, 6)
         uav_m, users_m = rng.random(3) * [500, 500, 200], rng.random((50, 2)) * 500
         users_m[0] = uav_m[:2]  # right below the UAV
         ours = Buildings(obstacles).cut(uav_m, users_m)
         np.testing.assert_array_equal(ours, [plain_cut(obstacles, uav_m, user_m) for user_m in users_m])
         found += ours.tolist()
-    assert 2000 < sum(found) < 5000
-    assert len(found) == 10_000
+    assert 600 < sum(found) < 1500
+    assert len(found) == 3000
 
 
 def test_batches_of_both_libraries_are_cut_as_single_links():

@@ -262,11 +262,7 @@ def learns(folder, **others):
     return [str(part) for pair in values.items() for part in pair]
 
 
-FEW = (
-    "before a state takes its name",
-    "between a best policy and its state",
-    "in the midst of writing the result",
-)
+FEW = ("between a best policy and its state",)
 OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(MOMENTS)[1:] if name not in FEW]
 
 

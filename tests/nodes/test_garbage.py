@@ -4,10 +4,11 @@ import json
 import re
 from pathlib import Path
 
-from tests.conftest import Ros, finish, wait_for
+from tests.conftest import WITHOUT_VISUALIZER, Ros, finish, wait_for
 from uav_dc_ros.nodes.framework.node_table import NODES
 
 TIMES = 5
+FLOWN = (*WITHOUT_VISUALIZER[1].split(","), "mission_monitor")
 
 # topic -> (node that hears it, payloads with the reason for which each is refused); RUN: of the missions
 GARBAGE = {
@@ -47,9 +48,11 @@ GARBAGE = {
 def test_a_broken_message_changes_nothing(
     ros: Ros, small_scenario: Path, small_policy: Path, tmp_path: Path
 ) -> None:
-    options = ["--scenario", small_scenario, "--policy", small_policy]
+    options = ["--scenario", small_scenario, "--policy", small_policy, "--compose", *WITHOUT_VISUALIZER]
     quiet, disturbed = tmp_path / "quiet.json", tmp_path / "disturbed.json"
-    status, output = ros.run_all(*options, "--pace", "lockstep", "--no-record", "--summary", quiet)
+    status, output = ros.run_all(
+        *options, "--pace", "lockstep", "--bag", tmp_path / "quiet", "--summary", quiet
+    )
     assert status == 0, output
 
     recorded = ("--pace", 40, "--bag", tmp_path / "bag", "--summary", disturbed)
@@ -66,7 +69,7 @@ def test_a_broken_message_changes_nothing(
     ]
     commands += [{"topic": "pose", "pose": x, "frame": frame} for x, frame in (("nan", "map"), ("1", "odom"))]
     for command in commands:
-        hearing = sum(command["topic"] in row.subscribes for row in NODES.values() if not row.on_request)
+        hearing = sum(command["topic"] in NODES[name].subscribes for name in FLOWN)
         probe.stdin.write((json.dumps(command | {"hearing": hearing}) + "\n") * TIMES)
     probe.stdin.close()
     status, rest = finish(flight)
@@ -80,8 +83,10 @@ def test_a_broken_message_changes_nothing(
     expected["pose"] = ("channel_monitor", {"not_finite", "frame"})
     for topic, (node, reasons) in expected.items():
         for reason in reasons:
-            told = re.findall(rf"^{node}: WARN: {topic}: {reason}: .*logged once", output, re.MULTILINE)
+            told = re.findall(
+                rf"^container: WARN: {node}: {topic}: {reason}: .*logged once", output, re.MULTILINE
+            )
             assert len(told) == 1, output
-            counts = re.search(rf"^{node}: WARN: rejected messages: .*", output, re.MULTILINE)
+            counts = re.search(rf"^container: WARN: {node}: rejected messages: .*", output, re.MULTILINE)
             assert counts is not None, output
             assert f"{topic} {reason} {TIMES}" in counts[0]

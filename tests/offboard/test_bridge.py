@@ -267,7 +267,7 @@ def test_a_vehicle_that_flies_already_goes_on_where_it_was() -> None:
     assert flight.executed == list(range(7, SCENARIO.mission.max_steps))
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(at_s=st.floats(0.0, 1000.0), gone_s=st.floats(0.0, 60.0), falls=st.booleans(), pilot=st.booleans())
 def test_a_killed_bridge_is_taken_up_again(at_s: float, gone_s: float, falls: bool, pilot: bool) -> None:
     """Whenever it was killed, and whatever the vehicle, its failsafe or a pilot did meanwhile."""
@@ -359,7 +359,7 @@ FAULTS = st.sampled_from(
 )
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(fault=FAULTS, at_s=st.floats(0.0, 500.0), lasts_s=st.floats(0.1, 60.0))
 def test_whatever_goes_wrong_has_an_end(fault: str, at_s: float, lasts_s: float) -> None:
     flight = Flight()

@@ -293,7 +293,7 @@ def test_a_router_that_does_not_count_is_listened_to() -> None:
 FATES = st.sampled_from(["late", "twice", "zeroed", "nonsense", "lost", "ahead"])
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     fates=st.dictionaries(st.integers(1, 399), st.tuples(FATES, st.floats(0.06, 3.0)), max_size=120),
     boot_s=st.floats(1.0, 4e6),

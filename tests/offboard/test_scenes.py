@@ -69,7 +69,7 @@ class Unreliable:
         return arrives
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=6, deadline=None, derandomize=True)
 @given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**32), share=st.floats(0.0, 0.1))
 def test_a_mission_is_flown_whatever_happens_to_single_messages(kind: str, seed: int, share: float) -> None:
     channel = Unreliable(seed, share)

@@ -66,7 +66,7 @@ def test_the_page_of_missions_equals_the_summary_of_run_all(ros, reading):
     scenario = scenarios.load(scenario_file)
     saved(ros.folder / "untrained", scenario, name="untrained")
     # Two seconds: long enough for every node to publish its diagnostics.
-    flown = ("--scenario", "small.toml", "--policy", "untrained", "--pace", 300, "--missions", 2)
+    flown = ("--scenario", "small.toml", "--policy", "untrained", "--pace", 300, "--missions", 2, "--compose")
     status, printed = ros.run_all(*flown, "--bag", "flown", "--summary", "summary.json")
     assert status == 0, printed
     status, output = ros.run("uav_dc_ros.bag", "report", "flown")

@@ -73,6 +73,7 @@ def simulated() -> list[list[dict[str, Any]]]:
 
 def test_it_ends_well(flown: Flown) -> None:
     assert flown.status == 0, flown.output
+    assert "another world" not in flown.output
     assert "Traceback" not in flown.output
     assert "rejected" not in flown.output
     assert "bag: bag\n" in flown.output

@@ -165,18 +165,14 @@ def test_help_and_version_need_no_ros(ros: Ros) -> None:
 
 
 def test_the_default_bag_is_dated(ros: Ros, small_scenario: Path, small_policy: Path) -> None:
-    """A policy's folder may lie anywhere; a note reports a policy that was trained in another world."""
+    """A policy's folder may lie anywhere; a note reports that it was trained in another world."""
     folder = ros.folder / "a b 'c'" / "my policy"
     shutil.copytree(small_policy, folder)
+    small_scenario.write_text(small_scenario.read_text().replace("v_max_mps = 1.0", "v_max_mps = 2.0"))
     given = ("--scenario", small_scenario, "--policy", folder, "--pace", "lockstep")
     status, output = ros.run_all(*given, *WITHOUT_VISUALIZER)
     assert status == 0, output
     assert "timeout" in output
-    assert "trained in another world" not in output
-    small_scenario.write_text(small_scenario.read_text().replace("v_max_mps = 1.0", "v_max_mps = 2.0"))
-    without_recorder = ("--nodes", "world,channel_monitor,policy", "--no-record")
-    status, output = ros.run_all(*given, *without_recorder)
-    assert status == 0, output
     assert "note: policy untrained was trained in another world" in output
     (bag,) = (ros.folder / "bags").iterdir()
     assert bag.name.startswith("20")

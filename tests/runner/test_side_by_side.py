@@ -89,6 +89,7 @@ def test_one_mission_on_two_hosts(ros: Ros, small: Small) -> None:
     assert told[0]["seed"] == 3
 
 
+@pytest.mark.long  # nodes that start one after another: test_alone
 def test_a_policy_that_starts_late_flies_from_the_first_step(ros: Ros, small: Small) -> None:
     bag = ros.folder / "late"
     nodes = "world,channel_monitor,recorder"

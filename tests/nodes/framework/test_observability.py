@@ -136,12 +136,14 @@ def test_a_peer_with_another_qos_is_told_by_name_once(ros: Ros, options: list[ob
     peer = python(ros, DEMANDING)
     assert peer.stdout is not None
     wait_for(peer.stdout, "listening")
-    given = ("--no-record", "--nodes", "world,channel_monitor,policy")
+    given = ("--no-record", "--nodes", "world,channel_monitor,policy", "--compose")
     status, output = ros.run_all(*options, *given, "--pace", 40)  # the second check reports it
     peer.kill()
     peer.communicate()
     assert status == 0, output
-    assert output.count("world: WARN: /pose: /somebody/demanding does not match: its QoS: ") == 1, output
+    assert (
+        output.count("container: WARN: world: /pose: /somebody/demanding does not match: its QoS: ") == 1
+    ), output
     assert output.count("does not match") == 1, "no other node"
 
 
