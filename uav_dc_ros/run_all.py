@@ -5,6 +5,7 @@ python -m uav_dc_ros.run_all --vehicle mavlink --connect tcp:127.0.0.1:5760 --ar
 """
 
 import argparse
+import gc
 import os
 import signal
 import threading
@@ -115,14 +116,19 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
     def command() -> int:
         nonlocal has_flown
         config = _config(parser(prog).parse_args(arguments))
+        gc.disable()  # imports leave no garbage
         from uav_dc_ros.nodes.ros import environment, fastdds
 
         environment.prepare(local_only=config.nodes is None)
         fastdds.select_transports()
         from uav_dc_ros.nodes.framework import node_main
+        from uav_dc_ros.nodes.ros import rclpy_private
         from uav_dc_ros.runner.mission_runner import MissionRunner
 
+        rclpy_private.skip_message_generator()
         runner = MissionRunner(config)
+        gc.freeze()
+        gc.enable()
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the mission continues without its terminal
         cli.on_stop(runner.interrupt)
         node_main.use_batch_scheduling()

@@ -47,7 +47,10 @@ def path(tmp_path):
     return tmp_path / "training.safetensors"
 
 
-@pytest.mark.parametrize(("end", "worlds_in"), [("at_time_limit", "torch"), ("on_arrival", "numpy")])
+@pytest.mark.parametrize(
+    ("end", "worlds_in"),
+    [pytest.param("at_time_limit", "torch", marks=pytest.mark.long), ("on_arrival", "numpy")],
+)
 def test_what_goes_on_ends_as_what_was_never_interrupted(path, end, worlds_in):
     """To the last bit, in everything there is, wherever it was interrupted, more than once too."""
     never = fly(Training(made(end), CPU, worlds_in), 5)

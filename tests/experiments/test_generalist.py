@@ -234,7 +234,8 @@ def test_layouts_repeat_and_differ_and_share_no_seed():
     assert layouts.SELECTION_SEEDS.start > 10**5  # above those of `random:SEED` that test
 
 
-@pytest.mark.parametrize("algorithm", ["rollouts", "pqn"])
+# The command does it with rollouts: test_the_command_writes_a_policy...
+@pytest.mark.parametrize("algorithm", [pytest.param("rollouts", marks=pytest.mark.long), "pqn"])
 def test_a_run_repeats_and_continues_to_the_last_bit(algorithm):
     def run(n, training):
         for _ in range(n):

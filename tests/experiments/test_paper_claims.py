@@ -211,7 +211,9 @@ def test_runs_that_were_not_made_leave_claims_untested():
     assert decided_by("lr") == {"C1", "C20"}, "C1 needs the setting that all learning rates are compared with"
 
 
-@pytest.mark.parametrize("scale", [FULL, SMOKE], ids=["full", "smoke"])
+@pytest.mark.parametrize(
+    "scale", [pytest.param(FULL, id="full", marks=pytest.mark.long), pytest.param(SMOKE, id="smoke")]
+)
 def test_every_claim_can_be_tested(scale):
     results = once(scale)
     for one in check(results):

@@ -40,7 +40,12 @@ def tracks():
     return made
 
 
-@pytest.mark.parametrize("figure", FIGURES)
+DRAWN = ("Traj", "reward5clusters", "throughput3clusters", "lr")
+
+
+@pytest.mark.parametrize(
+    "figure", [*DRAWN, *(pytest.param(n, marks=pytest.mark.long) for n in FIGURES if n not in DRAWN)]
+)
 def test_every_figure_is_drawn(results, tracks, figure, tmp_path):
     path = tmp_path / f"{figure}.png"
     draw(figure, results, tracks, path)

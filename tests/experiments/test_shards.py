@@ -110,6 +110,7 @@ def test_a_shard_whose_worker_always_dies_is_given_up(tmp_path, monkeypatch):
     assert processes._TRIES == 3
 
 
+@pytest.mark.long  # an error ends the workers in the same way: see below
 def test_ctrl_c_leaves_no_worker(tmp_path):
     def interrupt(name, n_flown):
         raise KeyboardInterrupt

@@ -268,6 +268,7 @@ def test_without_webgl_there_is_a_map(page):
     assert scene_kinds(page) == {"scatter"}
 
 
+@pytest.mark.long
 def test_the_flight_of_a_real_vehicle(browser, tmp_path):
     """The page shows its reason and phases, and draws its path up to the slider's step."""
     scenario = tiny()

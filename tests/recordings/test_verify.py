@@ -523,6 +523,7 @@ def test_missions_whose_nodes_were_killed_verify(ros: Ros, capsys):
     assert int(recomputed[1]) >= steps - 3, out
 
 
+@pytest.mark.long
 def test_a_monitor_that_outlives_a_flight_takes_no_pose_of_it_for_the_next(ros: Ros, capsys):
     """Mission time begins again with each flight: the last pose of one has a stamp that comes again.
 

@@ -72,7 +72,8 @@ def stopped(process: subprocess.Popen[str]) -> tuple[int, str]:
     return finish(process)
 
 
-@pytest.mark.parametrize("tries", TRIES)
+@pytest.mark.long  # the refusal itself: test_rivals
+@pytest.mark.parametrize("tries", [20])
 def test_a_mission_beside_a_looping_player_is_refused_by_the_player_s_name(
     ros: Ros, options: list[object], bag: Path, tries: int
 ) -> None:

@@ -21,7 +21,9 @@ from uav_dc_ros.planners import PLANNERS
 SEED, WEIGHT = 5, 0.8
 
 
-@pytest.mark.parametrize("name", ["search", "generalist", pytest.param("plan", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "name", ["generalist", *(pytest.param(name, marks=pytest.mark.long) for name in ("search", "plan"))]
+)
 def test_what_flies_any_field_flies_in_nodes_as_in_a_rollout(
     ros: Ros, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:

@@ -1,6 +1,7 @@
 """The private API of rclpy that is in use: after a change in rclpy, this test shows where."""
 
 import re
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,7 @@ from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import String
 
 import uav_dc_ros
-from tests.conftest import Ros
+from tests.conftest import Ros, finish
 from uav_dc_ros.nodes.ros import rclpy_private
 
 PACKAGE = Path(uav_dc_ros.__file__).parent
@@ -42,6 +43,25 @@ def test_all_of_it_is_there(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
     finally:
         node.destroy_node()
         context.try_shutdown()
+
+
+TYPE_SUPPORT = """
+import sys
+from std_msgs.msg import String
+from uav_dc_ros.nodes.ros import rclpy_private
+if sys.argv[1:]:
+    rclpy_private.skip_message_generator()
+String.__class__.__import_type_support__()
+print("lark" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize("skipped", [True, False])
+def test_a_node_does_not_import_the_generator_of_messages(ros: Ros, skipped: bool) -> None:
+    """If the other case fails, ROS no longer imports it, and nothing needs to be skipped."""
+    arguments = ["skip"] if skipped else []
+    status, output = finish(ros.start_command(sys.executable, "-c", TYPE_SUPPORT, *arguments))
+    assert (status, output) == (0, f"{not skipped}\n")
 
 
 def check(node: LifecycleNode, context: Any) -> None:

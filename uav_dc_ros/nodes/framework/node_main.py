@@ -201,6 +201,8 @@ def main(
         arguments = ros_arguments(makes[0].__doc__ or "")
     if batch_scheduling:
         use_batch_scheduling()
+    gc.disable()  # until the nodes are there: a start has no garbage that is worth the search for it
+    rclpy_private.skip_message_generator()
     nodes: list[MissionNode] = []
     status = _run(makes, arguments, nodes)
     gc.unfreeze()
@@ -235,6 +237,7 @@ def _run(makes: Sequence[Callable[[], MissionNode]], arguments: list[str], nodes
         transitions = ((node, name) for name in (CONFIGURE, ACTIVATE) for node in to_start)
         if all(make_transition(node, name) for node, name in transitions):
             gc.freeze()  # these objects stay: the collector need not scan them again
+            gc.enable()
             if pause_s:
                 os.nice(BACKGROUND_NICENESS)
             status = EXIT_FAILED

@@ -3,6 +3,7 @@
 It is why the extra `ros` has an upper bound.
 """
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,15 @@ INIT_ERRORS: tuple[type[Exception], ...] = (
     *(_rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError),
     RCLError,
 )
+
+
+def skip_message_generator() -> None:
+    """Keep the first message of this process from importing what generates Python classes of messages.
+
+    The package whose function loads type support imports that, too, and goes on without it: a twentieth of a
+    node's start.
+    """
+    sys.modules.setdefault("rosidl_generator_py.generate_py_impl", None)  # type: ignore[arg-type]
 
 
 def wait_set(context: Any, subscriptions: int, guards: int, timers: int, clients: int, services: int) -> Any:
