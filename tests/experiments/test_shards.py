@@ -51,7 +51,7 @@ def expected():
     return {one: shards.train_shard(one).to_bytes() for one in made}
 
 
-@pytest.mark.long  # the command does it with its own workers: test_paper_cli
+@pytest.mark.long
 def test_workers_bring_what_one_process_brings(tmp_path, expected):
     reports, two = [], list(expected)[:2]
     train_locally(two, tmp_path, 2, lambda name, n_flown: reports.append((name, n_flown)))

@@ -104,7 +104,8 @@ mission_runner.RECORDER_S, supervisor.BACK_OFF_S = float(sys.argv.pop(1)), 4.0
 run_all.main()"""
 
 
-@pytest.mark.parametrize("limit_s", [PATIENCE_S, pytest.param(0.0, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("limit_s", [PATIENCE_S, 0.0])
 def test_a_mission_that_is_over_waits_for_its_recorder(
     ros: Ros, arguments: list[object], tmp_path: Path, limit_s: float
 ) -> None:

@@ -97,6 +97,7 @@ def options(small_scenario: Path, small_policy: Path) -> list[object]:
     return ["--scenario", small_scenario, "--policy", small_policy]
 
 
+@pytest.mark.long
 def test_a_node_that_hangs_is_started_again(ros: Ros, options: list[object]) -> None:
     output = flown_with_hangs(ros, options, ("policy",), *AT_A_PACE, *WITHOUT_VISUALIZER)
     assert "steps were hovered: no move came in time" in output

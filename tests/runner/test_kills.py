@@ -112,6 +112,7 @@ def check_a_flight_with_kills(ros: Ros, kills: int, seed: int, *, composed: bool
     assert (ros.folder / name / "metadata.yaml").is_file()
 
 
+@pytest.mark.long  # one kill: test_faults
 def test_missions_end_as_if_nobody_had_been_killed(ros: Ros) -> None:
     check_a_flight_with_kills(ros, kills=3, seed=1, composed=True, longest_s=0.4)
 
