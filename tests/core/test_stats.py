@@ -46,7 +46,9 @@ def test_the_mean_of_four_values_has_the_exact_interval():
     ("draw", "true", "n", "least", "greatest"),
     [
         (lambda rng, shape: rng.standard_normal(shape), 0.0, 5, 0.93, 0.97),
-        (lambda rng, shape: rng.standard_normal(shape), 0.0, 10, 0.93, 0.97),
+        pytest.param(
+            *(lambda rng, shape: rng.standard_normal(shape), 0.0, 10, 0.93, 0.97), marks=pytest.mark.long
+        ),
         (lambda rng, shape: rng.standard_exponential(shape), 1.0, 5, 0.89, 0.97),
         (lambda rng, shape: rng.standard_exponential(shape), 1.0, 10, 0.91, 0.97),
     ],

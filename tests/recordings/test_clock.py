@@ -166,7 +166,14 @@ def test_it_is_reported_and_nothing_is_missing(tmp_path: Path, capsys: pytest.Ca
     assert "3 missions" in run(capsys, "export", bag, "--out", tmp_path / "tables", "--format", "csv")
 
 
-@pytest.mark.parametrize(("at_s", "by_s"), [(1.0, -5.0), (33.3, -5.0), (33.3, -40.0), (60.0, -3600.0)])
+@pytest.mark.parametrize(
+    ("at_s", "by_s"),
+    [
+        (33.3, -5.0),
+        (60.0, -3600.0),
+        *(pytest.param(*case, marks=pytest.mark.long) for case in ((1.0, -5.0), (33.3, -40.0))),
+    ],
+)
 def test_beside_an_autopilot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], at_s: float, by_s: float
 ) -> None:

@@ -117,6 +117,7 @@ def test_a_mission_beside_another_is_refused_and_the_first_one_is_whole(
     assert summaries[-1]["reason"] == "run_all was interrupted"
 
 
+@pytest.mark.long
 def test_of_two_missions_that_start_at_once_one_is_flown(ros: Ros, options: list[object], bag: Path) -> None:
     """Before either is found by discovery, the kernel knows."""
     given = [("--pace", "lockstep", "--bag", name, "--summary", f"{name}.json") for name in ("one", "other")]
