@@ -49,6 +49,7 @@ def test_it_names_the_reward_that_it_compares(data):
     assert all(words in title for title in titles), titles
 
 
+@pytest.mark.long
 def test_it_shows_what_changes_with_the_papers_five_environments(tmp_path):
     """C9 is true in the first five environments, and its opposite in the others by as much."""
 

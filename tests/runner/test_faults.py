@@ -204,6 +204,7 @@ def test_a_summary_names_no_bag_that_was_never_made(
     assert (summary["bag"] is not None) == (tmp_path / "bag").is_dir()
 
 
+@pytest.mark.long  # a subscriber that stands still: test_acknowledgements
 def test_a_lockstep_waits_for_who_is_held_up(ros: Ros, arguments: list[object], tmp_path: Path) -> None:
     """The recorder, then run_all, stopped for as long as it takes to fly more steps than messages are kept.
 
