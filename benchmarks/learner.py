@@ -90,7 +90,10 @@ def measure(n_runs: int, processes: int, seconds: float) -> tuple[float, float]:
 
 def peer(python: str) -> tuple[float, float]:
     """Agent-steps per second of stable-baselines3: with the same settings, and at its best."""
-    done = subprocess.run([python, PEER], check=True, capture_output=True, text=True)
+    done = subprocess.run([python, PEER], capture_output=True, text=True)
+    if done.returncode:
+        why = done.stderr.splitlines()[-1]
+        raise SystemExit(f"{PEER.name} in {python}: {why}; expected stable-baselines3: see --peer")
     figures = json.loads(done.stdout.splitlines()[-1])
     return figures["agent_steps_per_s"], figures["best_agent_steps_per_s"]
 
