@@ -92,7 +92,7 @@ def peer(python: str) -> tuple[float, float]:
     """Agent-steps per second of stable-baselines3: with the same settings, and at its best."""
     done = subprocess.run([python, PEER], capture_output=True, text=True)
     if done.returncode:
-        why = done.stderr.splitlines()[-1]
+        why = done.stderr.strip().rpartition("\n")[2]
         raise SystemExit(f"{PEER.name} in {python}: {why}; expected stable-baselines3: see --peer")
     figures = json.loads(done.stdout.splitlines()[-1])
     return figures["agent_steps_per_s"], figures["best_agent_steps_per_s"]

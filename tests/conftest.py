@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 # How long a test waits for what must come, wall time. Only what never comes takes this long: a machine with
 # much else to do may take twenty times as long as a calm one.
 PATIENCE_S = 200.0
-# Options of run_all: fewer processes to start, where nobody looks.
+# Options of run_all: a process less to start, where markers do not matter.
 WITHOUT_VISUALIZER = ("--nodes", "world,channel_monitor,policy,recorder")
 
 # The tests start some hundred processes. Without bytecode each of them compiles this project anew.
@@ -65,8 +65,8 @@ def pytest_configure() -> None:
         os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(folder))
 
 
-# Where the longest tests are, in this order: at the end, short files are left for the workers to share.
 OUTSIDE = "files outside of a folder"
+# Where the longest tests are, in this order: at the end, short files are left for the workers to share.
 LONGEST_FIRST = ("nodes", "runner", "experiments", OUTSIDE, "offboard", "recordings", "bags")
 
 

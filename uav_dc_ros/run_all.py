@@ -141,6 +141,8 @@ def main(arguments: list[str] | None = None, prog: str = PROG) -> NoReturn:
         if has_flown and isinstance(exited.code, int):
             os._exit(exited.code)  # all output is written, and Python's own exit takes a fifth of a second
         raise
+    finally:
+        gc.enable()  # also for a caller in this process whose options were refused
 
 
 def fly(config: RunConfig | None = None, *, show: bool = False) -> "tuple[Summary, ...]":

@@ -83,10 +83,10 @@ def test_a_broken_message_changes_nothing(
     expected["pose"] = ("channel_monitor", {"not_finite", "frame"})
     for topic, (node, reasons) in expected.items():
         for reason in reasons:
-            told = re.findall(
+            warned = re.findall(
                 rf"^container: WARN: {node}: {topic}: {reason}: .*logged once", output, re.MULTILINE
             )
-            assert len(told) == 1, output
+            assert len(warned) == 1, output
             counts = re.search(rf"^container: WARN: {node}: rejected messages: .*", output, re.MULTILINE)
             assert counts is not None, output
             assert f"{topic} {reason} {TIMES}" in counts[0]

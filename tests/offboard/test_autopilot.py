@@ -327,7 +327,7 @@ def test_a_ground_station_is_missed_in_the_vehicle_s_own_time(copter: Client) ->
     event = copter.fake.wait_for("mode")
     while event["mode"] != "RTL":
         event = copter.fake.wait_for("mode")
-    assert before_s + 4.9 < event["t_s"] < after_s + 7.0
+    assert before_s + 4.9 < event["t_s"] < after_s + 6.0
 
 
 def test_a_second_bridge_and_a_second_vehicle_on_the_link(copter: Client) -> None:
