@@ -13,6 +13,8 @@ from uav_dc_ros import cli
 from uav_dc_ros.nodes.framework.node_table import NODES
 from uav_dc_ros.nodes.framework.parameters import COMMON
 
+QOS = re.compile(r"qos_overrides\./(\w+)\.(publisher|subscription)\.(?:history|depth|reliability|durability)")
+
 
 class Parsed(BaseException):
     """A command line was parsed; what it would do is not done."""
@@ -37,6 +39,10 @@ def commands(text: str) -> Iterator[list[str]]:
 def parameter(node: str, assignment: str) -> Any:
     """The value that a node would use of `NAME:=VALUE`."""
     name, _, text = assignment.partition(":=")
+    if (override := QOS.fullmatch(name)) is not None:
+        topic, end = override.groups()
+        assert topic in getattr(NODES[node], {"publisher": "publishes", "subscription": "subscribes"}[end])
+        return text
     row = {row.name: row for row in (*NODES[node].parameters, *COMMON)}[name]
     return row.value(YAML(typ="safe", pure=True).load(text))
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -174,13 +175,14 @@ print(json.dumps(told))
 """
 
 
-def python(ros: Ros, program: str, *arguments: object) -> subprocess.Popen[str]:
+def python(ros: Ros, program: str, *arguments: object, **how: Any) -> subprocess.Popen[str]:
     """Run a program of a few lines beside the nodes."""
     return subprocess.Popen(
         [sys.executable, "-c", program, *map(str, arguments)],
         env=ros.environment,
         stdout=subprocess.PIPE,
         text=True,
+        **how,
     )
 
 

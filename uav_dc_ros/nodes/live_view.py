@@ -20,6 +20,7 @@ LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # of the addresses that stand 
 class LiveViewNode(MissionNode):
     """A WebSocket server with one channel for each topic."""
 
+    drain_quiet_s = 0.1  # a client receives the end of a mission, too
     pause_s = 0.02  # no node waits for it
 
     def __init__(self) -> None:

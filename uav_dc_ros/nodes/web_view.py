@@ -28,6 +28,7 @@ SHOWN = ("mission", "users", "rates")
 class WebViewNode(MissionNode):
     """A web server with one page."""
 
+    drain_quiet_s = 0.1  # it shows the end of a mission, too
     pause_s = 0.05  # no node waits for it
 
     def __init__(self) -> None:

@@ -305,7 +305,10 @@ def test_a_monitor_receives_the_same_from_a_played_mission_as_from_the_real_one(
     """Its rates are those of the bag, to the last digit."""
     recorded = [content for topic, content in read_bag(alone.bag) if topic == "/rates"]
     assert len(recorded) >= 31
-    monitor = ros.start("uav_dc_ros.nodes.channel_monitor", "--ros-args", "-p", f"scenario:={alone.scenario}")
+    # A best-effort subscription of a busy machine may lose the first poses, and with them a mission.
+    reliable = "qos_overrides./pose.subscription.reliability:=reliable"
+    given = ("-p", f"scenario:={alone.scenario}", "-p", reliable)
+    monitor = ros.start("uav_dc_ros.nodes.channel_monitor", "--ros-args", *given)
     listens = listener(ros, "/rates", latched=True)
     play(ros, alone.bag, "--topics", "/pose,/users", *WAIT)
     again = [json.loads(content) for _, content, *_ in received_by(listens)]

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import PATIENCE_S, Ros, finish, wait_for
+from tests.nodes.conftest import python
 from tests.nodes.view.foxglove_client import is_free
 from uav_dc_ros import scenarios
 
@@ -61,6 +62,37 @@ def test_a_page_receives_the_mission_and_ends_with_it(
     assert (head["namespace"], head["seed"], head["world"]["name"]) == ("/uav1", 7, "small")
     assert len(news) >= 10, "while it flew"
     assert missions[-1]["now"]["over"]
+
+
+SLOW_VIEW = """
+import sys
+from uav_dc_ros.nodes import web_view
+from uav_dc_ros.nodes.framework import node_main
+web_view.WebViewNode.pause_s = 2.0
+node_main.main(web_view.WebViewNode)
+"""
+
+
+def test_a_page_receives_the_steps_that_the_view_had_not_handled(
+    ros: Ros, small_scenario: Path, small_policy: Path
+) -> None:
+    """A mission passes while the view pauses, and then it is stopped."""
+    arguments = ("--ros-args", "-p", f"scenario:={small_scenario}", "-p", "port:=0")
+    with python(ros, SLOW_VIEW, *arguments, stderr=subprocess.PIPE) as view:
+        assert view.stderr is not None
+        match = LINE.search(wait_for(view.stderr, "live view: "))
+        assert match is not None
+        connection = http.client.HTTPConnection("127.0.0.1", int(match[1]), timeout=PATIENCE_S)
+        connection.request("GET", "/news")
+        response = connection.getresponse()
+        given = ("--scenario", small_scenario, "--policy", small_policy, "--pace", "lockstep", "--no-record")
+        status, output = ros.run_all(*given)
+        view.terminate()
+        lines = response.read().decode().split("\n")
+    assert status == 0, output
+    shown = [one for line in lines if line.startswith("data: {") for one in json.loads(line[6:])["missions"]]
+    assert shown[-1]["now"]["over"]
+    assert [step["step"] for one in shown for step in one.get("steps", [])][-1] == STEPS
 
 
 class Opened:
