@@ -57,6 +57,22 @@ class _Numpy:
         return values.argmax(axis=axis)
 
     @staticmethod
+    def round(values: Array) -> Array:
+        return values.round()
+
+    @staticmethod
+    def sort(values: Array, axis: int) -> Array:
+        found = values.copy()
+        found.sort(axis=axis)
+        return found
+
+    @staticmethod
+    def full_like(values: Array, number: float) -> Array:
+        found = np.empty(values.shape, values.dtype)
+        found.fill(number)
+        return found
+
+    @staticmethod
     def zeros_like(values: Array) -> Array:
         return np.zeros(values.shape, values.dtype)
 
@@ -74,6 +90,14 @@ def array_namespace(*arrays: Array) -> Any:
         if type(array) is not np.ndarray and not isinstance(array, np.generic):
             return array_api_compat.array_namespace(*arrays)
     return _NUMPY
+
+
+class Numbers(tuple[Any, ...]):
+    """Fixed numbers that are found by their identity: `constant` need not hash each of them."""
+
+    __slots__ = ()
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
 
 
 def constant(values: tuple[Any, ...] | range, like: Array) -> Array:

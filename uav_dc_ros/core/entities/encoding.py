@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from uav_dc_ros.core.arrays import Array, array_namespace, constant
+from uav_dc_ros.core.arrays import Array, Numbers, array_namespace, constant
 from uav_dc_ros.core.entities.numbers import rows, squashed
 from uav_dc_ros.core.entities.plan import best_plan
 from uav_dc_ros.core.entities.tables import FAR, EntityTables
 from uav_dc_ros.core.grid import MOVES, Action
-from uav_dc_ros.core.mobility import GaussMarkov, RandomWaypoint
 from uav_dc_ros.core.objective import DEFAULT_WEIGHT
 from uav_dc_ros.core.users.clusters import cluster_means
 
@@ -75,15 +74,15 @@ _LEAST_STEP = 0.01  # of what a user is worth in J: what a step costs at least
 class _Scales(NamedTuple):
     """How the numbers of a mission or of a cluster are scaled, a number for each column."""
 
-    squashed: tuple[float, ...]  # 1: it is squashed; 0: it is not
-    low: tuple[float, ...]  # minimum
-    high: tuple[float, ...]  # maximum
+    squashed: Numbers  # 1: it is squashed; 0: it is not
+    low: Numbers  # minimum
+    high: Numbers  # maximum
 
 
 def _scales(names: tuple[str, ...]) -> _Scales:
     of_columns = [name for name in names for _ in range(N_ACTIONS if name.endswith("_a") else 1)]
     low, high = zip(*(_LIMITS.get(name, (MIN, MAX)) for name in of_columns), strict=True)
-    return _Scales(tuple(float(name in _SQUASHED) for name in of_columns), low, high)
+    return _Scales(Numbers(float(name in _SQUASHED) for name in of_columns), Numbers(low), Numbers(high))
 
 
 _OF_MISSION, _OF_CLUSTER = _scales(GLOBAL_NAMES), _scales(CLUSTER_NAMES)
@@ -158,13 +157,13 @@ def encode(
         xp.astype((given > 0.0) & ~collected, xp.float32),
         xp.astype(last, xp.float32),
     ]
-    means = cluster_means(scenario, xp.stack(of_users))  # [5, N, M]
+    means = cluster_means(scenario, xp.concat([each[None] for each in of_users]))  # [5, N, M]
     done, data_of_all, given_mean, reached, nearly = (means[i] for i in range(5))
     open_share = 1.0 - done
     data_of_open = (data_of_all - done) / open_share.clip(1e-3)  # those collected have all of it
     data_of_open = data_of_open.clip(0.0, 1.0)
     # Steps over the cluster that its users still need.
-    hovers = ((1.0 - data_of_open) / tables.best.clip(1e-2)).clip(0.0, 100.0)
+    hovers = ((1.0 - data_of_open) / tables.rate).clip(0.0, 100.0)
     reached = reached / open_share.clip(1e-3)  # share of the open users
     open_users = tables.sizes * open_share / scenario.n_users  # share of all users
     detour = ways + tables.home - home[:, None]
@@ -213,11 +212,7 @@ def encode(
         user_data.sum(axis=-1) / scenario.n_users,
         cell_f[:, 2] / max(grid.n_z - 1, 1),
         (grid.altitude_min_m + cell_f[:, 2] * grid.altitude_step_m) / limits.d_cons_m,
-        squashed(grid.altitude_step_m / limits.d_cons_m),
-        squashed(1.0 / reach),
-        squashed(4.0 * _speed_mps(scenario) * limits.step_s / limits.d_cons_m),
-        squashed(n_clusters / 4.0),
-        squashed(scenario.n_users / 32.0),
+        *tables.fixed,
         plan.steps / left,
         plan.clusters.sum(axis=-1) / n_clusters,
         float(limited),
@@ -251,13 +246,13 @@ def encode(
         hovers / 4.0,
         value / (value + cost).clip(1e-9),
         plan.clusters,
-        squashed(tables.radii),
+        tables.radii,
         xp.exp(-0.5 * (to_clusters * to_clusters).sum(axis=-1) / (reach * reach)),
         nearly,
         given_mean,
         reached,
     ]
-    by_action = xp.moveaxis(progress_after, -2, -1)  # [N, M, 7]
+    by_action = progress_after.swapaxes(-2, -1)  # [N, M, 7]
     numbers = _vector(one, of_mission, of_actions, _OF_MISSION)
     clusters = _vector(ways, of_clusters, [by_action], _OF_CLUSTER)
     numbers = xp.concat([numbers, clusters.reshape((len(numbers), -1))], axis=-1)
@@ -343,16 +338,6 @@ def _budget(
             safe = safe & (left_j[:, None] - constant(action_j, left_j) >= home_after * home_j)
             left = xp.minimum(left, xp.floor(left_j / max(energies_j)))
             most = min(most, settings.battery_j / max(energies_j))
-    nearest = xp.min(xp.where(valid, home_after, 0.0 * home_after + 2.0 * FAR), axis=-1, keepdims=True)
+    nearest = xp.min(xp.where(valid, home_after, constant((2.0 * FAR,), left)), axis=-1, keepdims=True)
     any_safe = xp.any(safe, axis=-1, keepdims=True)
     return _Budget(left, most, charge, safe, xp.where(any_safe, safe, valid & (home_after <= nearest)))
-
-
-def _speed_mps(scenario: "Scenario") -> float:
-    """Mean speed of a user, m/s."""
-    model = scenario.users.moves
-    if isinstance(model, GaussMarkov):
-        return model.mean_speed_mps
-    if isinstance(model, RandomWaypoint):
-        return (model.v_min_mps + model.v_max_mps) / 2.0
-    return (scenario.users.v_max_mps or 0.0) / 2.0

@@ -76,7 +76,7 @@ def best_plan(
     is_open = missing > _DONE
     n_new = xp.astype(~collected[:, None] & ~is_open, xp.float32).sum(axis=-1)
     # Steps over its cluster of those that wait, in the order of collection, `[N, 7, M, largest size]`.
-    needs = missing / (pace * xp.take(tables.best.clip(1e-2), tables.cluster_of, axis=0))[:, None]
+    needs = missing / (pace * tables.rate_of_user)[:, None]
     needs = xp.round(xp.where(is_open, needs, constant((FAR,), needs)) * _PARTS) / _PARTS
     needs = xp.sort(in_sets(xp, needs, tables.users, FAR), axis=-1)
     # A plan waits for as many of them as are worth it.

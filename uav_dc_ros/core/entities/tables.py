@@ -13,6 +13,7 @@ import numpy as np
 
 from uav_dc_ros.core import mobility
 from uav_dc_ros.core.arrays import Array, array_namespace
+from uav_dc_ros.core.entities.numbers import squashed
 from uav_dc_ros.core.grid import Action
 from uav_dc_ros.core.obstacles.moves import UNREACHABLE
 from uav_dc_ros.core.users.clusters import cluster_means
@@ -53,6 +54,9 @@ class EntityTables:
         self.over: Array = reached >= OVER * np.where(free[:, None], reached, 0.0).max(axis=0)
         best = np.where(free[:, None], progress, 0.0).max(axis=0)
         self.best: Array = best.astype(np.float32)  # progress of each cluster in its best cell, [M]
+        # The same, but not zero: of each cluster, [M], and of each user's cluster, [U].
+        self.rate: Array = self.best.clip(1e-2)
+        self.rate_of_user: Array = self.rate[np.asarray(scenario.user_cluster)]
         good = free[:, None] & (progress >= GOOD * best)
         centres_m = np.asarray(scenario.cluster_centres_m)
         away_m = np.linalg.norm((cells[:, :2] * grid.cell_m)[:, None] - centres_m, axis=-1)
@@ -94,7 +98,9 @@ class EntityTables:
         # Users of each cluster, [M, largest size]; the number of all users where a cluster has fewer.
         self.users: Array = _padded(np.asarray(scenario.users.sizes), np.arange(scenario.n_users))
         radii_m = np.asarray([disc.radius_m for disc in scenario.users.clusters])
-        self.radii: Array = (radii_m / scenario.mission.d_cons_m).astype(np.float32)  # units of d_cons, [M]
+        # Radius of each cluster in units of d_cons, squashed, [M].
+        self.radii: Array = squashed((radii_m / scenario.mission.d_cons_m).astype(np.float32))
+        self.fixed = _fixed(scenario)  # numbers of the observation that a scenario always has
         self.goals_cells: Array = np.asarray(scenario.goals_cells, np.float32)  # [M + 1, 2]
         self._on_device: dict[Any, EntityTables] = {}
 
@@ -109,6 +115,24 @@ class EntityTables:
                     setattr(made, name, xp.asarray(values, device=like.device))
             self._on_device[like.device] = made
         return self._on_device[like.device]
+
+
+def _fixed(scenario: "Scenario") -> tuple[float, ...]:
+    """The observation's `layer`, `cell`, `speed`, `clusters` and `users`."""
+    limits, grid, model = scenario.mission, scenario.grid, scenario.users.moves
+    speed_mps = (scenario.users.v_max_mps or 0.0) / 2.0  # mean
+    if isinstance(model, mobility.GaussMarkov):
+        speed_mps = model.mean_speed_mps
+    elif isinstance(model, mobility.RandomWaypoint):
+        speed_mps = (model.v_min_mps + model.v_max_mps) / 2.0
+    numbers = (
+        grid.altitude_step_m / limits.d_cons_m,
+        1.0 / (limits.d_cons_m / grid.cell_m),
+        4.0 * speed_mps * limits.step_s / limits.d_cons_m,
+        scenario.n_clusters / 4.0,
+        scenario.n_users / 32.0,
+    )
+    return tuple(map(squashed, numbers))
 
 
 def expected_users_m(scenario: "Scenario") -> Array:
