@@ -192,7 +192,7 @@ def test_a_model_that_does_not_fit_is_refused(folder, arrays, message):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"format": 3}, r"Invalid enum value 3.*format"),
+        ({"format": 4}, r"Invalid enum value 4.*format"),
         ({"learns": True}, "unknown field `learns`"),
         ({"algorithm": "sarsa"}, r"'sarsa'.*algorithm"),
         ({"observation": "radar"}, r"'radar'.*observation"),

@@ -43,11 +43,11 @@ def q_values(rows, dtype=np.float64):
     return set_network.q_values(SIZES, {name: v.astype(dtype) for name, v in trained().items()}, rows)
 
 
-def test_an_untrained_network_decides_as_the_plan_does():
+def test_where_the_network_prefers_no_action_the_plan_decides():
     rows = observations(4)
     rows[:, LOSS : LOSS + 7] = np.random.default_rng(0).permuted(np.tile(np.arange(7) / 7, (5, 1)), axis=1)
-    parameters = set_network.initial(SIZES, np.random.default_rng(0))
-    found = set_network.q_values(SIZES, parameters, rows.astype(np.float32))
+    untrained = set_network.initial(SIZES, np.random.default_rng(0))
+    found = set_network.preferences(SIZES, untrained, rows.astype(np.float32))
     np.testing.assert_array_equal(found.argsort(axis=-1), (-rows[:, LOSS : LOSS + 7]).argsort(axis=-1))
 
 
@@ -122,7 +122,9 @@ def test_a_field_or_a_file_that_it_cannot_read_is_an_error(tmp_path):
     assert "features = 2; expected 3" in refused(folder)
     edit_config(folder, features=3, width=8)
     assert "tensor 'advantage.cluster.bias' is float32 (16,); expected float32 (8,)" in refused(folder)
-    edit_config(folder, width=16, format=3)
+    edit_config(folder, width=16, format=2)
+    assert "format = 2; expected 3" in refused(folder)
+    edit_config(folder, format=4)
     assert "$.format" in refused(folder)
 
 

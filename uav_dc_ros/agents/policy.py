@@ -148,8 +148,8 @@ class Policy:
         observation `entities` it is the best one of those that the observation names, see
         `core.entities.encoding.allowed`.
         """
-        # The order of the advantages is that of Q, and V is a network of its own, which takes as long.
-        values = self._of_actions(observation, set_network.advantages)
+        # V of a network for sets decides nothing, and takes as long as the rest.
+        values = self._of_actions(observation, set_network.preferences)
         if self.config.observation == "entities":
             mask = allowed(observation)
         return (values if mask is None else np.where(mask, values, -np.inf)).argmax(axis=-1)
@@ -202,7 +202,7 @@ def load(name_or_path: str | Path) -> Policy:
     path, model_path = folder / CONFIG, folder / MODEL
     config_bytes, model_bytes = _read(path), _read(model_path)
     try:
-        config = _config(config_bytes)
+        config = _config(config_bytes, path)
         scenario = scenarios.as_shipped(from_values(config.scenario, f"{path}: scenario"))
         if (problem := observations.problem(config.observation, scenario)) is not None:
             raise PolicyError(f"{path}: {problem}")
@@ -265,9 +265,12 @@ class _Format(msgspec.Struct):
     format: Any = 1
 
 
-def _config(text: bytes) -> PolicyConfig | SetPolicyConfig:
+def _config(text: bytes, path: Path) -> PolicyConfig | SetPolicyConfig:
     """The config in a file; `format` names its type."""
-    if msgspec.json.decode(text, type=_Format).format == 2:
+    number = msgspec.json.decode(text, type=_Format).format
+    if number == 2:  # of a development version, whose networks added to the plan
+        raise PolicyError(f"{path}: format = 2; expected 3, which `train --scenario random` writes")
+    if number == 3:
         return msgspec.json.decode(text, type=SetPolicyConfig)
     return msgspec.json.decode(text, type=PolicyConfig)
 

@@ -7,15 +7,15 @@ Each of them has layers shared by all clusters, pooled:
                                                    NeurIPS 2017)
     z   = relu(LN([mean(k), max(k), g] W))         and further layers
 
-The duel (eq. 30 of the paper) is between them, and begins with the plan of the observation (see
-`core.entities.encoding`): what it is worth, and what each action loses of that:
+The duel (eq. 30 of the paper) is between them:
 
-    V   = worth + z w_v / 10
-    A_a = z w_a - loss_a / price                   in steps: `price` is what a step costs in J
+    V   = z w_v / 10
+    A_a = z w_a                                    in steps: `price` is what a step costs in J
     Q_a = V + price (A_a - mean(A))
 
-An untrained network (w = 0) decides as the plan does. V and A share no layer: errors of V, which are many
-times what a step costs, would change decisions.
+V and A share no layer: errors of V, which are many times what a step costs, would change decisions. The plan
+of the observation (see `core.entities.encoding`) enters as its numbers, since a network that adds to the plan
+learns less. A decision weighs half of what the plan loses with an action beside A, see `preferences`.
 
 LN is layer normalisation without parameters (Ba et al., 2016). Clusters that pad a batch have zeros only and
 count nowhere. As functions over a dict of arrays it runs on numpy and on torch, as `network` does.
@@ -30,9 +30,10 @@ import numpy as np
 
 from uav_dc_ros.agents.network import Parameters, Width
 from uav_dc_ros.core.arrays import Array, array_namespace
-from uav_dc_ros.core.entities.encoding import CLUSTER, GLOBAL, LOSS, PRICE, WORTH
+from uav_dc_ros.core.entities.encoding import CLUSTER, GLOBAL, LOSS, PRICE
 
 _EPSILON = 1e-5  # of the variance
+PLAN_SHARE = 0.5  # of what an action loses of the plan, in a decision
 VALUE_SCALE = 10.0  # V lies in [-1, 1], and its errors of a tenth of that are large
 
 
@@ -111,8 +112,7 @@ def values(
     active: Callable[[Array], Array] = activation,
 ) -> Array:
     """V(s) in J, `[B]`; arguments as of `q_values`."""
-    learnt = stream("value", architecture, parameters, observation, active)[:, 0]
-    return observation[:, WORTH] + learnt / VALUE_SCALE
+    return stream("value", architecture, parameters, observation, active)[:, 0] / VALUE_SCALE
 
 
 def advantages(
@@ -122,13 +122,21 @@ def advantages(
     active: Callable[[Array], Array] = activation,
 ) -> Array:
     """A(s, a) of every action in steps, plus a number of the state, `[B, A]`; arguments as of `q_values`."""
-    learnt = stream("advantage", architecture, parameters, observation, active)
-    return learnt - plan_loss(architecture, observation)
+    return stream("advantage", architecture, parameters, observation, active)
 
 
-def plan_loss(architecture: SetArchitecture, observation: Array) -> Array:
-    """Steps that the plan loses with each action, `[B, A]`."""
-    return observation[:, LOSS : LOSS + architecture.n_actions] / observation[:, PRICE, None]
+def preferences(
+    architecture: SetArchitecture,
+    parameters: Parameters,
+    observation: Array,
+    active: Callable[[Array], Array] = activation,
+) -> Array:
+    """What decides, `[B, A]` in steps: A less a share of what the plan loses; arguments as of `q_values`.
+
+    In a field unlike those of the training A may prefer to go to and fro, and the plan then decides.
+    """
+    lost = observation[:, LOSS : LOSS + architecture.n_actions] / observation[:, PRICE, None]
+    return advantages(architecture, parameters, observation, active) - PLAN_SHARE * lost
 
 
 def stream(
@@ -138,7 +146,7 @@ def stream(
     observation: Array,
     active: Callable[[Array], Array],
 ) -> Array:
-    """What the network "value", `[B, 1]`, or "advantage", `[B, A]`, adds to the plan; as in `q_values`."""
+    """Outputs of the network "value", `[B, 1]`, or "advantage", `[B, A]`; arguments as of `q_values`."""
     xp = array_namespace(observation)
     mission = observation[:, : architecture.n_global]
     clusters = observation[:, architecture.n_global :].reshape((len(mission), -1, architecture.n_cluster))

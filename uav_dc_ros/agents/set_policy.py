@@ -66,9 +66,9 @@ class PqnSettings(FlyingSettings, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class SetPolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A policy for any field without its parameters: format 2 of `config.json`."""
+    """A policy for any field without its parameters: format 3 of `config.json`."""
 
-    format: Literal[2] = 2
+    format: Literal[3] = 3
     name: Annotated[str, Meta(pattern=NAME)]  # the policy's name
     observation: Literal["entities"] = "entities"  # see `core.entities`
     features: int = FEATURES  # version of that encoding

@@ -45,8 +45,8 @@ def card(
 
 One policy for fields that it has not seen, with the `entities` observation: two networks, of V and of the
 advantages, each with shared layers of {config.width} units for each cluster and hidden layers of {hidden}
-units; {len(config.actions)} actions. They begin with the plan of the observation. The weight w of the
-objective J is an input: it is chosen when the policy flies.
+units; {len(config.actions)} actions. The weight w of the objective J is an input: it is chosen when the
+policy flies.
 
 ## How it was made
 

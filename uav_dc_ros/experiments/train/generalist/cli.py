@@ -130,7 +130,7 @@ def train(options: argparse.Namespace, command: str, prog: str) -> int:
     try:
         if not progress.baselines:
             progress.baselines = {name: training.baseline(name) for name in BASELINES}
-            progress.baselines["the plan alone"] = training.validate()
+            progress.baselines["the plan alone"] = training.plan()
             others = ", ".join(f"{name} {value:.4f}" for name, value in progress.baselines.items())
             print(f"J in the layouts that select: {others}", flush=True)
         while training.n_done < total:
@@ -192,7 +192,6 @@ def _config(options: argparse.Namespace) -> SetPolicyConfig:
     try:
         return msgspec.convert(
             {
-                "format": 2,
                 "name": options.out.name,
                 "width": options.width,
                 "hidden": options.hidden,

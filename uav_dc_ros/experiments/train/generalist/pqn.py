@@ -45,7 +45,7 @@ class Batch(NamedTuple):
 class PqnLearner(SetLearner):
     """One Q-network for sets and its optimiser."""
 
-    def preferences(self, observation: Array) -> Array:
+    def q_values(self, observation: Array) -> Array:
         """Q(s, a) in tenths of J, `[B, D]` to `[B, A]`, float32."""
         with torch.inference_mode():
             return self._q(torch.from_numpy(observation)).numpy()
@@ -97,7 +97,7 @@ class PqnTraining(GeneralistTraining):
         steps: list[tuple[Array, ...]] = []
         while not flown.all_over:
             observed = flown.observe()
-            mask, q_values = self.choices(*observed)
+            mask, q_values = self.choices(*observed, of=self.learner.q_values)
             drawn_action = (rng.random(mask.shape, np.float32) * mask).argmax(axis=-1)
             explore = rng.random(len(mask), np.float32) >= epsilon
             action = np.where(explore, drawn_action, q_values.argmax(axis=-1))

@@ -49,11 +49,6 @@ class RolloutLearner(SetLearner):
         super().__init__(architecture, parameters, (VALUE, ADVANTAGE))
         self._settings = settings
 
-    def preferences(self, observation: Array) -> Array:
-        """A(s, a) in steps, `[B, D]` to `[B, A]`, float32."""
-        with torch.inference_mode():
-            return self._advantages(torch.from_numpy(observation)).numpy()
-
     def _advantages(self, observation: Tensor) -> Tensor:
         return set_network.advantages(self.architecture, self.theta, observation, active)
 
@@ -68,7 +63,7 @@ class RolloutLearner(SetLearner):
         loss = (error * error).mean()
         self.descend(loss, VALUE)
         # In steps, against the plan's action. The mean counts: a loss that grows linearly would make little
-        # of users that are rarely lost. By how much an action is worse than the limit is left to the plan.
+        # of users that are rarely lost.
         steps = (decisions.values - own) / decisions.observation[:, PRICE, None] - settings.caution
         np.put_along_axis(steps, planned, 0.0, axis=-1)
         steps = torch.from_numpy(turned.of_actions(steps.clip(-settings.steps_max, settings.steps_max)))

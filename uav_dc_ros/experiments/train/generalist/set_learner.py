@@ -7,8 +7,10 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim import Optimizer
 
+from uav_dc_ros.agents import set_network
 from uav_dc_ros.agents.network import Parameters
 from uav_dc_ros.agents.set_network import SetArchitecture
+from uav_dc_ros.core.arrays import Array
 
 GRADIENT_MAX = 10.0  # norm
 FALL = 0.02  # share of a learning rate at the end
@@ -42,6 +44,13 @@ class SetLearner:
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self._groups[group], GRADIENT_MAX)
         optimiser.step()
+
+    def preferences(self, observation: Array) -> Array:
+        """See `set_network.preferences`; `[B, D]` to `[B, A]`, float32."""
+        with torch.inference_mode():
+            rows = torch.from_numpy(observation)
+            found: Array = set_network.preferences(self.architecture, self.theta, rows, active).numpy()
+            return found
 
     def parameters(self) -> Parameters:
         """A copy of the parameters, numpy, as `set_network.shapes` names them."""

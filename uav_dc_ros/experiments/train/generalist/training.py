@@ -15,7 +15,7 @@ from uav_dc_ros import planners
 from uav_dc_ros.agents.network import Parameters
 from uav_dc_ros.agents.set_policy import FlyingSettings
 from uav_dc_ros.core.arrays import Array
-from uav_dc_ros.core.entities.encoding import N_ACTIONS, allowed
+from uav_dc_ros.core.entities.encoding import N_ACTIONS, allowed, planned_action
 from uav_dc_ros.core.scenario import Scenario
 from uav_dc_ros.experiments.train.generalist import layouts
 from uav_dc_ros.experiments.train.generalist.layouts import SELECTION_LAYOUTS, SELECTION_MISSIONS
@@ -104,6 +104,10 @@ class GeneralistTraining(ABC):
         acts = [planners.PLANNERS[name](layout) for layout in self._layouts()]
         return self._fly(lambda flown: np.stack([act(s) for act, s in zip(acts, flown.states, strict=True)]))
 
+    def plan(self) -> float:
+        """Mean J of the plan of the observation in the same missions."""
+        return self._fly(lambda flown: planned_action(flown.observe().observation))
+
     def _fly(self, act: Callable[[LayoutMissions], Array]) -> float:
         places = (np.arange(SELECTION_MISSIONS) + 0.5) / SELECTION_MISSIONS
         weights = np.tile(1.0 - places**2, (SELECTION_LAYOUTS, 1))
@@ -117,14 +121,18 @@ class GeneralistTraining(ABC):
             self._selection = [layouts.draw(seed) for seed in layouts.SELECTION_SEEDS[:SELECTION_LAYOUTS]]
         return self._selection
 
-    def choices(self, observation: Array, flying: Array) -> tuple[Array, Array]:
+    def choices(
+        self, observation: Array, flying: Array, of: Callable[[Array], Array] | None = None
+    ) -> tuple[Array, Array]:
         """The allowed actions, bool `[R, A]`, and the preferences, minus infinity for others.
 
-        For a mission that is over, all actions are allowed, and their preferences are 0.
+        For a mission that is over, all actions are allowed, and their preferences are 0. `of` gives other
+        numbers than `preferences`.
         """
+        of = of or self.learner.preferences
         mask, preferences = allowed(observation), np.zeros((len(flying), N_ACTIONS), np.float32)
         mask[~flying] = True
-        preferences[flying] = self.learner.preferences(observation[flying])
+        preferences[flying] = of(observation[flying])
         return mask, np.where(mask, preferences, -np.inf)
 
     def generator(self, *key: int) -> np.random.Generator:
