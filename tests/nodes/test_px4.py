@@ -846,15 +846,17 @@ def test_without_a_position_it_holds_until_px4_gives_up(
 
 def test_a_bridge_that_is_started_again_in_the_air_goes_on(flight: Flight) -> None:
     flight.until(lambda: flight.bridge.step == 2)
-    flight.do("speed 0.2")  # PX4 waits a second of its time, and no more
+    flight.do("speed 0.1")  # PX4 waits a second of its time, and no more
     standing, place = flight.bridge.checkpoint, Enu(7.0, 7.0, 7.0)
     grid_origin = flight.vehicle.telemetry().grid_origin
     flight.vehicle.close()
     flight.bridge = MissionController(flight.bridge.scenario, flight.bridge.settings, flight.note, standing)
     flight.vehicle = px4.Px4Vehicle(flight.spun.nodes[0], start=place, grid_origin=grid_origin)
+    opened_s = time.monotonic()
     flight.vehicle.open()
     flight.until(lambda: flight.bridge.phase is not Phase.CONNECTING)
-    flight.spun.pass_time(1.0, flight.tick)  # until PX4 has found the new publishers
+    while flight.fake.all("obeyed")[-1]["streamed_wall_s"] < opened_s:
+        flight.do("speed 0.1")  # until PX4 has found the new publishers
     flight.do(f"speed {SPEED}")
     flight.finish()
     assert flight.bridge.phase is Phase.LANDED, flight.log[-3:]

@@ -10,7 +10,7 @@ Imitated, from PX4's sources: names of topics with the version of their definiti
 time, and of the agent's clock once they agree; OFFBOARD only after a second of `offboard_control_mode` for
 positions at more than 2 Hz, lost a second after it ended, then a return; commands for another system,
 and answers; taking off by setpoint; landing and disarming. Not imitated: attitude, wind, noise, limits of
-acceleration, what is not in fmu/. Unlike any real one, its time waits 0.8 s of ours at most for a
+acceleration, what is not in fmu/. Unlike any real one, its time waits 2 s of ours at most for a
 stream that was there lately: the machine that tests run on has other work to do.
 """
 
@@ -34,7 +34,7 @@ State = px4.VehicleStatus
 WALL_S, TICK_S = 0.01, 0.02
 ACROSS_MPS, UP_MPS, DOWN_MPS = 20.0, 10.0, 10.0
 GAP_S, PROOF_S, LOSS_S, DISARM_S = 0.5, 1.0, 1.0, 2.0
-PATIENCE_S, AHEAD_S = 0.8, 0.4  # wall, simulated
+PATIENCE_S, AHEAD_S = 2.0, 0.4  # wall, simulated
 STATUS_S, LEAP_S = 0.5, 3.0
 AGENT_US = 1_700_000_000_000_000
 HOME, SYSTEM, COPTER = (47.397742, 8.545594, 488.0), 1, 2
@@ -160,7 +160,7 @@ class Px4:
                 self.speed = value
             case "mode":
                 self.switch(int(value), "pilot")
-        emit("obeyed", self.t_s, line=line)
+        emit("obeyed", self.t_s, line=line, streamed_wall_s=self.heard_wall_s)
 
     # What it does.
 
